@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.clock import read_clock
+from runner.recording.description import has_environment
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
 
@@ -114,12 +115,12 @@ def positions(recording: Recording, axis: Axis) -> Positions:
         RunnerError: there is none of this name.
     """
     steps, values = np.empty(0), np.empty(0)
-    if axis is UPDATES and recording.has_reports:  # each training step of a job updates its tables
+    if axis is UPDATES and recording.eval.has_metrics:  # each training step of a job updates its tables
         return Positions(STEPS, steps, values)
     if axis in (EPISODES, STEPS):
-        if not recording.has_environment:
+        if not has_environment(recording.config):
             axis = LOGGED_STEPS
-        elif axis is EPISODES and not recording.has_reports and not any(recording.done().values()):
+        elif axis is EPISODES and not recording.eval.has_metrics and not any(recording.done().values()):
             axis = STEPS  # of values that were logged before the first step
     elif axis is TIME:
         steps, values = _times(recording)

@@ -136,7 +136,7 @@ class Evaluation:
 
 def evaluations_of(recording: Recording) -> list[Evaluation]:
     """Return a run's evaluations: those with metrics; of a loop, its trials between training episodes."""
-    if recording.has_reports:
+    if recording.eval.has_metrics:
         return [
             Evaluation(
                 after=int(metrics["episode"]),
@@ -145,7 +145,7 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
                 stop=int((metrics["evaluation"] + 1) * metrics["trials"]),
                 number=int(metrics["evaluation"]),
             )
-            for metrics in recording.metrics("eval")
+            for metrics in recording.eval.all_metrics()
         ]
     trained, tested = (
         np.concatenate([np.empty(0, np.uint64), *(block["log_time"] for block in phase.episodes.blocks())])
@@ -181,9 +181,9 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     The evaluations of a loop are its evaluation episodes between two training episodes; values that are not
     finite are left out of their means.
     """
-    agents, events = recording.agents, recording.event_names
-    if recording.has_reports:
-        return [evaluation_record(metrics, agents, events) for metrics in recording.metrics("eval")]
+    agents, events = recording.agents, recording.environment["event_names"]
+    if recording.eval.has_metrics:
+        return [evaluation_record(metrics, agents, events) for metrics in recording.eval.all_metrics()]
     trials = recording.eval.episodes.array()
     return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]
 
@@ -228,7 +228,7 @@ def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[n
         successes=int(trials["success"].sum()) if environment["success_events"] else None,
         values=values,
         terminations=int(trials["terminated"].sum()),
-        events=dict(zip(recording.event_names, counts, strict=True)),
+        events=dict(zip(recording.environment["event_names"], counts, strict=True)),
         not_finite=sum(int((~is_usable(each)).sum()) for each in own.values()),
     )
 
@@ -236,7 +236,7 @@ def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[n
 def training_records(recording: Recording) -> list[TrainingRecord]:
     """Return the reports of training of a job, in order."""
     agents = recording.agents
-    return [_training_record(metrics, agents) for metrics in recording.metrics("train")]
+    return [_training_record(metrics, agents) for metrics in recording.train.all_metrics()]
 
 
 def _training_record(metrics: Message, agents: Sequence[str]) -> TrainingRecord:
@@ -268,7 +268,7 @@ def loop_summary(recording: Recording) -> Summary:
         if "logged" in recording.result
         else {one["name"]: finite(one["value"]) for one in recording.table(schema.SCALAR_TOPIC).decoded()}
     )
-    return Summary(last_evaluation=last, recent_training=recording.recent_training(), logged=logged)
+    return Summary(last_evaluation=last, recent_training=recording.train.recent_means(), logged=logged)
 
 
 def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False) -> dict[str, list[str]]:
@@ -296,7 +296,7 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
 def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord]) -> Section:
     """Return evaluations of a recording, one at least, as a table; a loop's leaves out unknown metrics."""
     columns = list(metric_columns(records).items())
-    for name in recording.event_names:
+    for name in recording.environment["event_names"]:
         agent, dot, _ = name.rpartition(".")
         words = event_in_words(name)
         heading = f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words
@@ -307,7 +307,7 @@ def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord
     explanation = (
         f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
         "episodes. Events are counted over all trials."
-        if recording.has_reports
+        if recording.eval.has_metrics
         else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "
         "are counted over all of them."
     )

@@ -173,7 +173,7 @@ def episode_columns(
     columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
     columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
-    return columns | _by_name(records["events"], recording.event_names)
+    return columns | _by_name(records["events"], recording.environment["event_names"])
 
 
 def logged_columns(recording: Recording) -> dict[str, Sequence[object]]:

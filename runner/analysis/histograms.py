@@ -242,7 +242,7 @@ def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
         names = tuple(numbered_actions(recording.mdp)[agents.index(part) if part else 0])
     else:
         agent = part if part in recording.agents else ""
-        names = recording.action_names("train", agent) if agent or not part else ()
+        names = recording.train.action_names(agent) if agent or not part else ()
         space = recording.spaces["action"]
         start = int(space.get("start", 0)) if not recording.has_states else 0
     names_by_number = {float(start + i): spoken(name) for i, name in enumerate(names)}

@@ -142,7 +142,7 @@ def _describe_snapshots(
             for block in recording.train.steps.blocks(0, stop):
                 counts += np.bincount(block["action"][block["state"] == number], minlength=shape[1])
             taken = counts.tolist()
-        names = recording.action_names("train") or tuple(map(str, range(shape[1])))
+        names = recording.train.action_names() or tuple(map(str, range(shape[1])))
         description["state"], description["state_in_words"] = number, str(states[number])
         description["visits"] = None if taken is None else sum(taken)
         description["values"] = [

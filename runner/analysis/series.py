@@ -21,6 +21,7 @@ from runner.analysis.evaluations import (
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RunnerError, shortened
 from runner.recording import schema
+from runner.recording.description import has_environment
 from runner.recording.messages import Message
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording, open_recording
@@ -188,7 +189,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     """
     not_finite: Counter[str] = Counter()
     places = positions(recording, axis)
-    axis = axis if recording.has_reports else places.axis
+    axis = axis if recording.eval.has_metrics else places.axis
     averaged = ""
     names = dict.fromkeys(each.removeprefix(LOGGED) for each in metrics if each.startswith(LOGGED))
     room = 0 if metrics else _MAX_NAMES
@@ -196,9 +197,12 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     config = recording.config
     recent: Readings = {}
     recent_episodes, is_unended = 0, False
-    if recording.has_reports:
+    if recording.eval.has_metrics:
         agents = recording.agents
-        exact = {each["evaluation"]: exact_readings(each, agents) for each in recording.optimality()}
+        exact = {
+            each["evaluation"]: exact_readings(each, agents)
+            for each in recording.table(schema.OPTIMALITY_TOPIC).decoded()
+        }
         readings = [evaluation_readings(each) | exact.get(each.number, {}) for each in evaluations]
         reports = [*training_records(recording), *(each.training for each in evaluations if each.training)]
         training = [(places.one(each.episode, each.step), training_readings(each)) for each in reports]
@@ -237,7 +241,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
 
 
 def _environment(recording: Recording) -> str:
-    if not recording.has_environment:
+    if not has_environment(recording.config):
         return ""
     kwargs = recording.config.get("env", {}).get("kwargs", {})
     name = recording.environment["env_id"].rpartition(":")[2]
@@ -322,7 +326,7 @@ def _loop_training(
 
 def _edges(recording: Recording, places: Positions) -> tuple[NDArray[np.float64], str]:
     """Return the edges of stretches, and a sentence on them if not each position has one of its own."""
-    if recording.has_environment:
+    if has_environment(recording.config):
         done = recording.done()
         last = float(places.at(done["episodes"], done["train_steps"]))
         first = 0.0
@@ -397,7 +401,7 @@ def _unfinished_episodes(recording: Recording) -> Readings:
 
 def _recent_training(recording: Recording) -> tuple[Readings, int]:
     """Return mean length and return of the last training episodes of a loop, and how many these are."""
-    episodes, agents = recording.recent_episodes(), recording.agents
+    episodes, agents = recording.train.recent_episodes(), recording.agents
     if not len(episodes):
         return {}, 0
     lines = agents if len(agents) > 1 else [""]

@@ -137,7 +137,7 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     config if config == recording.config else recording.config,  # the former in better order
                     **done,
                     environment=composition_of(recording),
-                    bytes=recording.size,
+                    bytes=recording.file.size,
                     shards=recording.shards,
                     clock=read_clock(recording),
                     provenance=recording.provenance,
@@ -146,10 +146,10 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     evaluations=tuple(evaluation_records(recording)),
                     optimality=tuple(
                         {key: value for key, value in measures.items() if key != "log_time"}
-                        for measures in recording.optimality()
+                        for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
                     ),
                     training=tuple(training_records(recording)),
-                    loop=None if recording.has_reports else loop_summary(recording),
+                    loop=None if recording.eval.has_metrics else loop_summary(recording),
                     extras=_extras(recording),
                     checkpoints=tuple(read_checkpoints(recording, run.folder.parent)),
                 )
@@ -201,7 +201,7 @@ def _tables(recording: Recording) -> tuple[TableFill, ...]:
     """Return the fill of each table; nothing of a loop, whose learning is its own."""
     if not recording.has_tables:
         return ()
-    reports = [*recording.metrics("train"), *recording.metrics("eval")]
+    reports = [*recording.train.all_metrics(), *recording.eval.all_metrics()]
     last = max(reports, key=lambda report: report["step"], default=None)
     if last is None:
         return tuple(map(TableFill, recording.agents))

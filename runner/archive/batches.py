@@ -15,7 +15,7 @@ from runner.archive.rows import batch_of, bytes_of, records_of, whole
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
-from runner.recording.reader import Recording
+from runner.recording.reader import Recording, extra_layouts
 from runner.recording.schema import Topic
 from runner.util.arrays import Records
 
@@ -28,7 +28,7 @@ class Batches:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self.shape = Shape(recording, recording.extra_layouts)
+        self.shape = Shape(recording, extra_layouts(recording))
         self._hashes = {topic.name: blake3() for topic in recording.topics}
         self._counts = dict.fromkeys(self._hashes, 0)
 

@@ -13,6 +13,8 @@ from runner.archive.columns import Shape
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
+from runner.recording.description import recorded_facts
+from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording
 
 _RUN_TYPES: Final = {
@@ -26,22 +28,23 @@ _RUN_TYPES: Final = {
 
 def run_table(recording: Recording) -> pa.Table:
     """Return the table with one row that describes a run."""
-    facts = recording.run_facts()
+    facts = recorded_facts(recording)
     summary = facts["summary"]
+    result = recording.file.metadata("result") if "result" in recording.file.metadata_names else {}
     columns = {
         "run_id": facts["run_id"],
         "name": recording.name,
         "seed": facts["seed"],
-        "job": recording.job,
+        "job": recording.run["job"],
         "status": facts["status"],
-        "created": recording.began,
+        "created": recording.created,
         **{key: summary.get(key) for key in ("content_digest", "episodes", "train_steps", "eval_steps")},
-        "kind": recording.kind,
+        "kind": kind_of(recording.run),
         "env_id": str(recording.environment.get("env_id")),
         "environments": recording.environments,
         "spaces": recording.run.get("spaces"),
         "config": json.dumps(recording.config),
-        "result": json.dumps(recording.raw_result),
+        "result": result["json"] if result else "{}",
         "provenance": json.dumps(recording.provenance),
     }
     try:

@@ -47,7 +47,7 @@ class Archive(RunDescription):
     """An archive in a folder."""
 
     def __init__(self, folder: Path) -> None:
-        super().__init__(folder)
+        super().__init__(folder, self)
         self.folder = folder
         path = folder / layout.MANIFEST
         try:

@@ -18,6 +18,7 @@ from runner.archive.restoring import restore
 from runner.archive.store import Store, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
+from runner.recording.description import recorded_facts
 from runner.recording.integrity import may_be_cut, survey
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
@@ -72,7 +73,7 @@ def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool
     place, existing = store.place(run.run_id), store.manifest(run.run_id)
     is_new = existing is None
     with _undamaged(run) as recording:
-        size, done = recording.size, recording.done()
+        size, done = recording.file.size, recording.done()
         if dry_run or existing is None:
             with temporary_folder() if dry_run else store.writing(run.run_id) as folder:
                 manifest = write_archive(recording, folder, report)
@@ -121,7 +122,7 @@ def _undamaged(run: Run) -> Iterator[Recording]:
     """Open the recording of a run; the error for damage suggests a repair."""
     try:
         with open_recording(run.recording) as recording:
-            if not recording.finished:
+            if not recording.file.finished:
                 contents = survey(run.recording)
                 if not may_be_cut(run.recording, contents):
                     raise RecordingError(f"{run.recording}: {contents.reason}: it is damaged.")
@@ -190,8 +191,8 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
             restore_to(archive, folder / RECORDING_FILE, manifest.digest, report)
             _restore_contents(archive, folder)
         with open_recording(folder / RECORDING_FILE) as recording:
-            facts = recording.run_facts() | {"name": manifest.run["name"]}  # it may have been renamed
-            facts["summary"] |= {"bytes": recording.size}
+            facts = recorded_facts(recording) | {"name": manifest.run["name"]}  # it may have been renamed
+            facts["summary"] |= {"bytes": recording.file.size}
         return Run(folder, facts).update()
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)

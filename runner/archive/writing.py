@@ -25,6 +25,7 @@ from runner.archive.manifest import Entry, Manifest, entries_of, is_inside
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
+from runner.recording.description import recorded_facts
 from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.reader import Recording
 from runner.replay.snapshots import DerivedTables
@@ -134,7 +135,7 @@ class _ArchiveWriter:
         self._copy_contents()
         topics = self._batches.entries
         self._compare(topics)
-        facts = self._recording.run_facts() | {"name": self._recording.name}
+        facts = recorded_facts(self._recording) | {"name": self._recording.name}
         run = {key: facts[key] for key in ("run_id", "name", "seed", "created", "status")}
         run |= {"content_digest": self._recording.result.content_digest, "lost": self._recording.lost}
         return Manifest(run, topics, entries_of(self._folder))
@@ -155,7 +156,7 @@ class _ArchiveWriter:
 
     def _write_descriptions(self) -> None:
         recording, attachments = self._recording, []
-        for name, media_type, data in recording.attachments():
+        for name, media_type, data in recording.file.attachments():
             if not is_inside(name):
                 raise RecordingError(
                     f"{self._where}: found an attachment {name!r}, whose name is not a relative path."
@@ -164,7 +165,7 @@ class _ArchiveWriter:
             path = self._folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)
-        metadata = [[name, recording.metadata(name)] for name in recording.metadata_names]
+        metadata = [[name, recording.file.metadata(name)] for name in recording.file.metadata_names]
         description = {"metadata": metadata, "attachments": attachments}
         (self._folder / layout.METADATA).write_text(json.dumps(description, indent=1), encoding="utf-8")
         tables = {layout.RUN: run_table(recording)}

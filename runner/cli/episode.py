@@ -116,7 +116,7 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
     """Return a function that gives the action of a step, by name where it has one, and the observation."""
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     in_words = step_actions_in_words(recording, phase)
-    has_names = [agent for agent in agents if recording.action_names(phase, agent)]
+    has_names = [agent for agent in agents if recording.phase(phase).action_names(agent)]
 
     def describe(row: Step) -> dict[str, object]:
         if recording.has_states:

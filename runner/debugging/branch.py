@@ -251,14 +251,14 @@ class _Player:
     def begin(self, stepper: RowStepper, actions: Iterator[Value]) -> None:
         """Record the environment from now on."""
         env, task, recording = stepper.env, self._task, self._recording
-        maker = recording.maker_of(self.phase)
+        maker = recording.phase(self.phase).maker_of()
         assert maker is not None  # or `why_not_redone` gave a reason
         self._is_game, self._actions = maker.kind == "pettingzoo", actions
         self._space = copy.deepcopy(stepper.action_space)
         self._space.seed(task.seed)
-        names: Names = recording.action_names(self.phase) or action_names(env, self._space)
+        names: Names = recording.phase(self.phase).action_names() or action_names(env, self._space)
         if self._is_game:
-            names = {agent: recording.action_names(self.phase, agent) for agent in recording.agents}
+            names = {agent: recording.phase(self.phase).action_names(agent) for agent in recording.agents}
         recorded = next(actions)
         self._action = parsed_action(self._space, task.action, recorded, names)
         self.is_recorded_action = _text(self._action) == _text(recorded)

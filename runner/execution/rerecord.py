@@ -23,6 +23,7 @@ from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.actions import ACTION_TOPICS, after_step
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
+from runner.recording.description import recorded_facts
 from runner.recording.metadata import write_result
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
@@ -113,8 +114,7 @@ def rerecord(
         finally:
             fresh.unlink(missing_ok=True)
         with open_recording(current.recording) as recording:
-            config, summary = recording.config, recording.raw_result
-        summary = {key: value for key, value in summary.items() if key != "status"}
+            config, summary = recording.config, recorded_facts(recording)["summary"]
         seconds, size = round(time.monotonic() - started, 3), current.recording.stat().st_size
         return current.update(config=config, summary=summary | {"seconds": seconds, "bytes": size})
 
@@ -194,14 +194,14 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
     mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
     with open_recording(run.recording) as recording:
         learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
-        expected, made_by = recording.result["content_digest"], recording.metadata("provenance")
+        expected, made_by = recording.result["content_digest"], recording.file.metadata("provenance")
         metadata = {
-            name: recording.metadata(name)
-            for name in recording.metadata_names
+            name: recording.file.metadata(name)
+            for name in recording.file.metadata_names
             if name == CODE_RECORD or name.startswith("resume/")
         }
         circumstances = {topic: list(recording.table(topic).messages()) for topic in schema.MACHINE_TOPICS}
-        code = [entry for entry in recording.attachments() if entry[0] == CODE_ATTACHMENT]
+        code = [entry for entry in recording.file.attachments() if entry[0] == CODE_ATTACHMENT]
     with RecordingFile(fresh) as file:
         describe(file, job, run, learner, made_by)
         for attachment in code:

@@ -29,6 +29,7 @@ from runner.execution.verify import differing_environment
 from runner.learning.learner import Learner, NamedTables
 from runner.recording import schema
 from runner.recording.code import CODE_RECORD
+from runner.recording.description import recorded_facts
 from runner.recording.index import Index
 from runner.recording.integrity import may_be_cut, survey
 from runner.recording.liveness import owner
@@ -61,7 +62,7 @@ def is_finished(run: Run) -> bool:
     """Return whether a run's recording says that it is finished."""
     try:
         with open_recording(run.recording) as recording:
-            return recording.finished and recording.status == "finished"
+            return recording.file.finished and recording.status == "finished"
     except RecordingError:
         return False
 
@@ -109,8 +110,8 @@ def _with_finished_status(run: Run) -> Run:
     if run.status == "finished":
         return run
     with open_recording(run.recording) as recording:
-        facts = recording.run_facts()
-        return run.update(status="finished", summary=facts["summary"] | {"bytes": recording.size})
+        facts = recorded_facts(recording)
+        return run.update(status="finished", summary=facts["summary"] | {"bytes": recording.file.size})
 
 
 def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop, trust: bool) -> Run:
@@ -178,7 +179,7 @@ def _job(run: Run) -> tuple[Job, bool]:
     try:
         with open_recording(run.recording) as recording:
             recorded = Job(from_mapping(recording.config), recording.seed or 0)
-            claimed = recording.job
+            claimed = recording.run["job"]
     except (RecordingError, ConfigError, KeyError, ValueError):
         return stated, False
     if claimed == recorded.identity:
@@ -252,7 +253,7 @@ class _ResumedSession(Session):
         if self._reference.exhausted:
             return summary
         counts = {topic.name: recording.table(topic).count() for topic in schema.TOPICS}
-        evaluations = recording.metrics("eval")
+        evaluations = recording.eval.all_metrics()
         return summary | {
             "content_digest": None,
             "topic_digests": {},

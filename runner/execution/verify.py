@@ -177,8 +177,10 @@ def _check_content(recording: Recording, installed: bool, report: Report, trust:
     if not recording.can_train_again:
         return verify_loop(recording)
     job = Job(from_mapping(recording.config), recording.seed or 0)
-    if recording.job != job.identity:
-        return with_difference(verification, Diverged("metadata run", "job", recording.job, job.identity))
+    if recording.run["job"] != job.identity:
+        return with_difference(
+            verification, Diverged("metadata run", "job", recording.run["job"], job.identity)
+        )
     return _retrain(recording, job, installed, report, trust)
 
 

@@ -15,6 +15,7 @@ from runner.execution.verification import (
 )
 from runner.recording import schema
 from runner.recording.consistency import Findings, Inconsistent, check_extras, check_phase
+from runner.recording.description import has_environment
 from runner.recording.digest import combined_digest
 from runner.recording.reader import Recording
 from runner.recording.rewriting import content_hash
@@ -37,7 +38,7 @@ def verify_loop(recording: Recording) -> Verification:
         verdict="consistent" if is_over else "interrupted",
         train_steps=recording.train.steps.total(),
         eval_steps=recording.eval.steps.total(),
-        not_compared=LOOP_NOT_COMPARED if recording.has_environment else "",
+        not_compared=LOOP_NOT_COMPARED if has_environment(recording.config) else "",
         is_loop=True,
     )
     try:

@@ -10,6 +10,7 @@ import numpy as np
 
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
+from runner.recording.description import has_environment
 from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
@@ -56,7 +57,7 @@ def require_steps(recording: Recording, purpose: str, may_redo: bool = False) ->
     Raises:
         RecordingError: it has none.
     """
-    if not (recording.has_steps or (may_redo and recording.has_actions)):
+    if not (any(phase.steps for phase in recording.phases) or (may_redo and recording.has_actions)):
         raise RecordingError(f"{recording.path}: found no steps to {purpose}: {why_no_steps(recording)}.")
 
 
@@ -71,7 +72,7 @@ def why_no_steps(recording: Recording) -> str:
             f"they were left out (steps: {recording.config['recording']['steps']}); "
             f"`dualtaxi rerecord {recording.run_id}` records them"
         )
-    if not recording.has_environment:
+    if not has_environment(recording.config):
         return "values were logged, and no environment was recorded"
     return "it ended before one was recorded"
 

@@ -138,7 +138,7 @@ def default_trial(recording: Recording) -> tuple[int, int] | None:
     It is the typical trial of the last whole evaluation. In a loop, where the number of trials of an
     evaluation is unknown, it is the first trial after the last training. None if there is no such trial.
     """
-    if recording.has_reports:
+    if recording.eval.has_metrics:
         return typical_trial(recording) if last_whole_evaluation(recording) is not None else None
     evaluations = evaluations_of(recording)
     return (evaluations[-1].after, 0) if evaluations else None

@@ -20,6 +20,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.series import training_step
+from runner.recording import schema
 from runner.recording.clock import read_clock
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
@@ -64,7 +65,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
     """Yield reports of training, evaluations, their exact metrics, and the values that a loop logged."""
     agents, exact_values = recording.agents, {f"exact/{name}": field for name, field in _EXACT.items()}
     for phase in PHASES:
-        for row in recording.iter_metrics(phase):
+        for row in recording.phase(phase).metrics.decoded():
             values = _named(row, {name: name for name in _TRAINING}, agents)
             rewards = zip(row["rewards"], row["reward_counts"], strict=True)
             values |= {f"reward_counts/{reward:g}": float(count) for reward, count in rewards}
@@ -73,10 +74,10 @@ def measures(recording: Recording) -> Iterator[Measures]:
                 names = dict(_EVALUATION)
                 if row["successes"] < 0:  # the environment does not define success
                     del names["successes"]
-                events = _named(row, {"events": "events"}, recording.event_names)
+                events = _named(row, {"events": "events"}, recording.environment["event_names"])
                 values = _named(row, names, agents) | events | training
             yield _measures(phase, row, values)
-    for row in recording.optimality():
+    for row in recording.table(schema.OPTIMALITY_TOPIC).decoded():
         yield _measures("eval", row, _named(row, exact_values, agents))
     for scalar in recording.table(SCALAR_TOPIC).decoded():
         if math.isfinite(scalar["value"]):
@@ -115,7 +116,7 @@ def times(recording: Recording) -> Callable[[int], float]:
 
     Where no clock was recorded, logical time is added to the time at which the run was created.
     """
-    began = recording.began.timestamp()
+    began = recording.created.timestamp()
     passed = wall_clock(recording) or (lambda position: position * STEP_NANOSECONDS / 1e9)
     return lambda position: began + passed(position)
 

@@ -155,7 +155,7 @@ def _action_in_words(recording: Recording, phase: str, agent: str) -> Callable[[
     """Return how to put an agent's action in words; a single agent has no name."""
     space = recording.spaces["action"]
     least = least_number(space["spaces"][agent] if agent else space)
-    names = [spoken(name) for name in recording.action_names(phase, agent)]
+    names = [spoken(name) for name in recording.phase(phase).action_names(agent)]
 
     def in_words(action: Value) -> str:
         if not names and not recording.has_states:

@@ -41,7 +41,7 @@ from runner.recording.messages import (
     frame_place,
     log_level,
 )
-from runner.recording.metadata import dtypes_of, json_object, write_result
+from runner.recording.metadata import dtypes_of, json_object, kind_of, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -105,7 +105,7 @@ def _fold(run: Run, report: Report) -> Run:
                 raise RecordingError(" ".join(unusable.values()))
             return run
         if sources[0].recording.shards:  # it was folded by a process that was killed before it said so
-            text = sources[0].recording.metadata("result").get("json")
+            text = sources[0].recording.file.metadata("result").get("json")
             summary = json_object(text, f"{run.recording}: the result")
         else:
             fold = _Fold(run, sources, unusable, report)
@@ -166,14 +166,14 @@ class _Fold:
         facts = self._facts()
         dtypes, packing = dtypes_of(facts, str(fresh)), recorded_packing(first.config)
         self.content = Content(dtypes)
-        with create_recording(fresh, schema.KINDS[first.kind]) as file:
+        with create_recording(fresh, schema.KINDS[kind_of(first.run)]) as file:
             file.add_metadata("run", facts)
-            for name in first.metadata_names:
+            for name in first.file.metadata_names:
                 if name not in _NOT_COPIED:
-                    file.add_metadata(name, first.metadata(name))
+                    file.add_metadata(name, first.file.metadata(name))
             for name, maker in self._own_makers().items():
                 file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
-            for name, media_type, data in first.attachments():
+            for name, media_type, data in first.file.attachments():
                 file.add_attachment(name, media_type, data)
             recorder = Recorder(
                 file,
@@ -244,7 +244,7 @@ class _Fold:
         for source in self._sources[1:]:
             maker = source.recording.maker
             phases = [phase for phase in PHASES if source.stops[phase]]
-            others = [self._first.maker_of(phase) for phase in phases]
+            others = [self._first.phase(phase).maker_of() for phase in phases]
             if maker is not None and any(other is None or not maker.is_like(other) for other in others):
                 makers[source.name] = maker
         return makers
@@ -297,7 +297,7 @@ class _Fold:
     def _copy_units(self) -> int:
         """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
         recorder, first = self._recorder, self._first
-        copied = Copied(first.kind, self._mdp)
+        copied = Copied(kind_of(first.run), self._mdp)
         rows = {phase: CopiedRows(recorder, copied, phase) for phase in PHASES}
         extras = CopiedExtras(recorder, self._sources)
         active, copied_steps, total = rows["train"], 0, sum(self._totals.values())

@@ -87,7 +87,7 @@ def play_checkpoint(
         CannotRedo: the environment cannot be made again.
     """
     with open_recording(run.recording) as recording:
-        maker = recording.maker_of("eval")
+        maker = recording.eval.maker_of()
     if maker is None or (reason := why_not_alone(maker)):
         raise CannotRedo(reason if maker else why_not_made(None, trust))
     with trusting(run.recording, maker, trust) as is_trusted:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.integrity import check_up_to_cut
+from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording, open_recording
 from runner.recording.repair import can_be_repaired
 from runner.recording.schema import STEP_NANOSECONDS
@@ -219,7 +220,7 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
             if any(stated.values()):
                 left_out[name] = f"found no messages, expected {sum(stated.values()):,}."
             continue
-        if name and not recording.finished and not (folder / RUN_FILE).is_file():
+        if name and not recording.file.finished and not (folder / RUN_FILE).is_file():
             left_out[name] = "was cut off, and its run.json is missing, which states how much there was."
         is_placed = part is not None and part.facts.get("placed") is True
         sources.append(Source(name, recording, len(sources), first, is_placed, stated))
@@ -240,7 +241,7 @@ def _open_whole(path: Path) -> Recording:
 def _difference(recording: Recording, first: Recording) -> str:
     """Return why a recording cannot be put together with the first one; empty if it can."""
     found, expected = (
-        {"kind": one.kind, "agents": list(one.agents), **_comparable(one.spaces)}
+        {"kind": kind_of(one.run), "agents": list(one.agents), **_comparable(one.spaces)}
         for one in (recording, first)
     )
     if found == expected:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import encode
+from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.recording.topic_reader import TopicReader
 
 SAMPLE_SECONDS: Final = 1.0
 _SAMPLES_A_DURATION: Final = 3600
@@ -120,7 +120,7 @@ class Clock:
         return seconds + [self.earlier.get(each, 0.0) for each in started.tolist()]
 
 
-def read_clock(recording: TopicReader) -> Clock | None:
+def read_clock(recording: Recording) -> Clock | None:
     """Return the clock of a recording; None if it has no samples, as those of earlier versions.
 
     Raises:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from runner.errors import shortened
-from runner.recording.description import RunDescription
+from runner.recording.description import has_environment
+from runner.recording.reader import Recording
 from runner.util.values import JsonView, is_whole
 
 _CHANGE_NOTHING: Final = frozenset(
@@ -58,15 +59,15 @@ class Composition:
         return vars(self) | {"arguments": dict(self.arguments), "wrappers": wrappers}
 
 
-def composition_of(recording: RunDescription) -> Composition | None:
+def composition_of(recording: Recording) -> Composition | None:
     """Return what the environment consists of, as far as the recording states it; None if it has none.
 
     Raises:
         RecordingError: the recording is damaged.
     """
-    if not recording.has_environment:
+    if not has_environment(recording.config):
         return None
-    stated, maker = recording.environment, recording.maker_of("train")
+    stated, maker = recording.environment, recording.train.maker_of()
     name, limit = str(stated["env_id"]).rpartition(":")[2], stated["step_limit"] or None
     if maker is None:
         return Composition(name, stated["kwargs"], limit)

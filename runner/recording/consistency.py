@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import step_counts
 from runner.recording import schema
+from runner.recording.description import environment_count
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
@@ -99,7 +100,7 @@ def check_extras(recording: Recording, phase: str, complete: bool) -> None:
         Inconsistent: one does not.
     """
     extras, last = recording.phase(phase).extras, -1
-    steps, topic = recording.phase(phase).steps, schema.topics_of(recording.kind, phase).extras
+    steps, topic = recording.phase(phase).steps, recording.phase(phase).topics.extras
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
     total = recording.phase(phase).steps.total() if extras else 0
     if recording.leaves_out_steps and not recording.phase(phase).steps.are_known:
@@ -206,7 +207,7 @@ class _PhaseCheck:
     def _block(self, first: int, rows: NDArray[np.void]) -> _Block:
         resets, was_reset = np.zeros(rows.shape, self._resets.left.dtype), np.zeros(rows.shape, np.bool_)
         for own in self._resets.before(first + rows.size):
-            step, is_unknown = own["step"], own["environment"] >= self._recording.own_environments
+            step, is_unknown = own["step"], own["environment"] >= environment_count(self._recording)
             if (is_unknown | (step % self._n != 0) | (step < first)).any():
                 raise self._out_of_order()
             at = self._places(first, own)
@@ -347,7 +348,7 @@ class _PhaseCheck:
         """Check the resets after the last step, and that there is nothing else."""
         for resets in self._resets.before(steps + 1):
             environment = resets["environment"].astype(np.int64)
-            if (environment >= self._recording.own_environments).any() or (resets["step"] != steps).any():
+            if (environment >= environment_count(self._recording)).any() or (resets["step"] != steps).any():
                 raise self._out_of_order()
             environment %= self._n
             first_of_each = np.sort(np.unique(environment, return_index=True)[1])

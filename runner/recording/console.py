@@ -22,7 +22,7 @@ import numpy as np
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock
-from runner.recording.topic_reader import TopicReader
+from runner.recording.reader import Recording
 
 STREAMS: Final = ("", "stdout", "stderr")
 """The streams by number; 0 is the recorder's own note."""
@@ -250,7 +250,7 @@ class ConsoleLine:
     text: str
 
 
-def read_console(recording: TopicReader, clock: Clock | None) -> list[ConsoleLine]:
+def read_console(recording: Recording, clock: Clock | None) -> list[ConsoleLine]:
     """Return the recorded output of a run, in the order in which lines began.
 
     Raises:

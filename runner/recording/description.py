@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from runner.environments.mdp import Mdp
-from runner.environments.naming import action_names, actions_in_words
 from runner.errors import RecordingError, RunnerError
-from runner.recording import schema
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, Code, parse_code
 from runner.recording.maker import (
     MAKER_RECORD,
-    SHARD_MAKER,
     EnvironmentMaker,
     Shard,
     parse_maker,
@@ -34,7 +30,7 @@ from runner.recording.metadata import (
     unpacked_provenance,
 )
 from runner.recording.run_file import Summary, parse_result
-from runner.recording.schema import Topic
+from runner.recording.schema import KINDS, Q_TABLE_TOPIC, Topic
 from runner.util.values import Json, JsonView
 
 NO_ENVIRONMENT: Final = "none"
@@ -46,13 +42,17 @@ def has_environment(config: JsonView) -> bool:
     return config.get("env") != {"id": NO_ENVIRONMENT, "kwargs": {}}
 
 
-class RunDescription(ABC):
-    """What is recorded about a run besides its messages; raises a `RecordingError` where it is damaged."""
+class Records(Protocol):
+    """What describes a run in a file: metadata records and attachments, each by name."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    @property
+    def metadata_names(self) -> list[str]:
+        """The names of the metadata records, in order."""
 
-    @abstractmethod
+    @property
+    def attachment_names(self) -> list[str]:
+        """The names of the attachments, in order."""
+
     def metadata(self, name: str) -> dict[str, str]:
         """Return a metadata record's entries.
 
@@ -60,17 +60,6 @@ class RunDescription(ABC):
             RecordingError: there is none of that name, or it cannot be read.
         """
 
-    @property
-    @abstractmethod
-    def metadata_names(self) -> list[str]:
-        """The names of the metadata records, in order."""
-
-    @property
-    @abstractmethod
-    def attachment_names(self) -> list[str]:
-        """The names of the attachments, in order."""
-
-    @abstractmethod
     def attachment(self, name: str) -> bytes:
         """Return an attachment's data, after comparing its checksum.
 
@@ -78,10 +67,18 @@ class RunDescription(ABC):
             RecordingError: there is none of that name, or it is damaged.
         """
 
+
+class RunDescription:
+    """What is recorded about a run besides its messages; raises a `RecordingError` where it is damaged."""
+
+    def __init__(self, path: Path, records: Records) -> None:
+        self.path = path
+        self._records = records
+
     @cached_property
     def run(self) -> dict[str, str]:
         """The metadata record `run`: id, name, seed, job, creation, agents and more, as texts."""
-        return self.metadata("run")
+        return self._records.metadata("run")
 
     @property
     def run_id(self) -> str:
@@ -89,27 +86,17 @@ class RunDescription(ABC):
         return self.run["run_id"]
 
     @property
-    def job(self) -> str:
-        """The identity of the run's job."""
-        return self.run["job"]
-
-    @property
-    def created(self) -> str:
-        """When the run began, in ISO format."""
-        return self.run["created"]
-
-    @property
-    def began(self) -> datetime:
+    def created(self) -> datetime:
         """When the run began, in UTC.
 
         Raises:
             RecordingError: the recording does not state a time.
         """
         try:
-            return datetime.fromisoformat(self.created).astimezone(UTC)
+            return datetime.fromisoformat(self.run["created"]).astimezone(UTC)
         except (ValueError, OverflowError) as error:
             raise RecordingError(
-                f"{self.path}: found {self.created!r}, expected the time at which it was created."
+                f"{self.path}: found {self.run['created']!r}, expected the time at which it was created."
             ) from error
 
     @property
@@ -130,8 +117,8 @@ class RunDescription(ABC):
     @cached_property
     def provenance(self) -> dict[str, str]:
         """Where and by what it was made, with the commit of the user's code where it is recorded."""
-        first = unpacked_provenance(self.metadata("provenance"), str(self.path))
-        code = self.metadata(CODE_RECORD) if CODE_RECORD in self.metadata_names else {}
+        first = unpacked_provenance(self._records.metadata("provenance"), str(self.path))
+        code = self._records.metadata(CODE_RECORD) if CODE_RECORD in self._records.metadata_names else {}
         return first | code | first  # no entry of the first is replaced
 
     @cached_property
@@ -141,18 +128,15 @@ class RunDescription(ABC):
         Raises:
             RecordingError: it is damaged.
         """
-        if CODE_RECORD not in self.metadata_names or CODE_ATTACHMENT not in self.attachment_names:
+        records = self._records
+        if CODE_RECORD not in records.metadata_names or CODE_ATTACHMENT not in records.attachment_names:
             return Code()
-        return parse_code(self.attachment(CODE_ATTACHMENT), str(self.path))
+        return parse_code(records.attachment(CODE_ATTACHMENT), str(self.path))
 
     @cached_property
-    def raw_result(self) -> dict[str, object]:
-        """The result as it was written, unchecked; empty if the run ended without one.
-
-        Raises:
-            RecordingError: it is no JSON object.
-        """
-        return self._json("result") if "result" in self.metadata_names else {}
+    def _stated_result(self) -> dict[str, object]:
+        """The result as it was written, unchecked; empty if the run ended without one."""
+        return self._json("result") if "result" in self._records.metadata_names else {}
 
     @cached_property
     def result(self) -> Summary:
@@ -162,57 +146,27 @@ class RunDescription(ABC):
             RecordingError: it has a value that is not possible.
         """
         problems: list[str] = []
-        result = parse_result(self.raw_result, problems)
+        result = parse_result(self._stated_result, problems)
         if problems:
             raise RecordingError(f"{self.path}: its result is damaged: {'; '.join(problems)}.")
         return result
 
-    def run_facts(self) -> Json:
-        """Return the contents of `run.json`, from the recording alone; the result in it is unchecked."""
-        result = self.raw_result
-        return {
-            "run_id": self.run_id,
-            "name": self.run["name"],
-            "seed": self.seed or 0,
-            **({"seeded": False} if self.seed is None else {}),
-            "created": self.created,
-            "status": result.get("status", "interrupted"),
-            "config": self.config,
-            "summary": {key: value for key, value in result.items() if key != "status"},
-        }
-
     @cached_property
     def lost(self) -> dict[str, list[list[int]]]:
         """Messages that a repair could not save, by topic: ranges (first, stop) of their numbers."""
-        return lost_ranges(self._json("repair"), str(self.path)) if "repair" in self.metadata_names else {}
-
-    @property
-    def kind(self) -> str:
-        """`job` if the runner learned it; else how the steps of a recorded loop are stored.
-
-        `step`: both spaces are `Discrete`; `transition`: all values have one size; `variable`: they have not.
-        """
-        return kind_of(self.run)
+        if "repair" not in self._records.metadata_names:
+            return {}
+        return lost_ranges(self._json("repair"), str(self.path))
 
     @property
     def has_tables(self) -> bool:
         """Whether the Q-tables at any step are known: each update of them follows from the recorded steps."""
-        return self.kind == "job"
-
-    @property
-    def has_reports(self) -> bool:
-        """Whether training and evaluations are reported in messages; else they follow from the episodes."""
-        return self.kind == "job"
-
-    @property
-    def has_varying_values(self) -> bool:
-        """Whether observations or actions vary in size, so that steps are read one by one."""
-        return self.kind == "variable"
+        return Q_TABLE_TOPIC in self.topics
 
     @property
     def can_train_again(self) -> bool:
         """Whether training the configuration again gives the same content."""
-        return self.kind == "job"
+        return kind_of(self.run) == "job"
 
     def require_job(self, purpose: str, instead: str) -> None:
         """Refuse the recording of a loop.
@@ -228,13 +182,13 @@ class RunDescription(ABC):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        """The topics that a recording of its kind has."""
-        return schema.KINDS[self.kind]
+        """The topics that the recording has, some of them perhaps empty."""
+        return KINDS[kind_of(self.run)]
 
     @cached_property
     def environment(self) -> RecordedEnvironment:
         """The environment's description without its arrays: agents, events, scene; not to be changed."""
-        return environment_description(self.attachment("environment.json"), str(self.path))
+        return environment_description(self._records.attachment("environment.json"), str(self.path))
 
     @cached_property
     def maker(self) -> EnvironmentMaker | None:
@@ -245,64 +199,10 @@ class RunDescription(ABC):
         """
         return self._maker(MAKER_RECORD)
 
-    def maker_of(self, phase: str, environment: int = 0) -> EnvironmentMaker | None:
-        """Return how the environment of a phase was made; `maker` unless it is another environment.
-
-        Args:
-            phase: `train` or `eval`.
-            environment: its number among those of all shards.
-
-        Raises:
-            RecordingError: it is damaged.
-        """
-        last = 0
-        for shard in self.shards:
-            last += shard.environments
-            if environment < last:
-                if (own := self._maker(f"{SHARD_MAKER}/{shard.name}")) is not None:
-                    return own
-                break
-        return self._maker(f"{MAKER_RECORD}/{phase}") or self.maker
-
-    def action_names(self, phase: str, agent: str = "") -> tuple[str, ...]:
-        """Return the names of the discrete actions of a phase, the least action's first; empty if unknown.
-
-        Args:
-            phase: `train` or `eval`.
-            agent: of a game of several agents, which may have different actions.
-
-        Raises:
-            RecordingError: they are damaged.
-        """
-        if self.tabular:
-            return () if action_names(self.mdp) is None else tuple(map(str, actions_in_words(self.mdp)))
-        maker = self.maker_of(phase)
-        if maker is None:
-            return ()
-        names = maker.agent_action_names.get(agent, ()) if agent else maker.action_names
-        space = self.spaces["action"] if names else {}
-        if names and agent:
-            space = space["spaces"][agent] if agent in space.get("spaces", ()) else {"type": "?"}
-        if names and (space["type"], space.get("n")) != ("Discrete", len(names)):
-            raise RecordingError(
-                f"{self.path}: its {MAKER_RECORD} is damaged: found {len(names)} action_names, expected one "
-                f"for each action of a {space['type']} space of {space.get('n', 'no')} actions."
-            )
-        return names
-
-    def has_own_maker(self, phase: str) -> bool:
-        """Return whether a phase has its own environment, which was recorded into the run of another."""
-        return f"{MAKER_RECORD}/{phase}" in self.metadata_names
-
     def _maker(self, name: str) -> EnvironmentMaker | None:
-        if name not in self.metadata_names:
+        if name not in self._records.metadata_names:
             return None
         return parse_maker(self._json(name), str(self.path))
-
-    @property
-    def event_names(self) -> tuple[str, ...]:
-        """The names of the environment's events, which episodes count."""
-        return tuple(self.environment["event_names"])
 
     @property
     def tabular(self) -> bool:
@@ -312,12 +212,12 @@ class RunDescription(ABC):
     @cached_property
     def mdp(self) -> Mdp:
         """The environment: arrays, agents, events, scene."""
-        return environment_of(self.environment, self.attachment, str(self.path))
+        return environment_of(self.environment, self._records.attachment, str(self.path))
 
     @property
     def has_states(self) -> bool:
         """Whether its steps have states and actions by number, from 0; else values of the spaces."""
-        return self.kind in ("job", "step")
+        return kind_of(self.run) in ("job", "step")
 
     @cached_property
     def spaces(self) -> Json:
@@ -346,20 +246,34 @@ class RunDescription(ABC):
         return parse_shards(self.run.get("shards"), str(self.path))
 
     @property
-    def own_environments(self) -> int:
-        """How many environments resets name: those of all shards, or those that took turns."""
-        return sum(shard.environments for shard in self.shards) or self.environments
-
-    @property
-    def has_environment(self) -> bool:
-        """Whether it is about an environment, and not logged values alone."""
-        return has_environment(self.config)
-
-    @property
     def leaves_out_steps(self) -> bool:
         """Whether the configuration leaves whole steps out of the recording (`recording.steps`)."""
         plan = self.config.get("recording")
         return isinstance(plan, Mapping) and plan.get("steps", "all") != "all"
 
     def _json(self, name: str) -> dict[str, object]:
-        return json_object(self.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
+        return json_object(self._records.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
+
+
+def recorded_facts(run: RunDescription) -> Json:
+    """Return the contents of `run.json`, from the recording alone; the result in it is unchecked.
+
+    Raises:
+        RecordingError: the result is no JSON object.
+    """
+    result = run._stated_result
+    return {
+        "run_id": run.run_id,
+        "name": run.run["name"],
+        "seed": run.seed or 0,
+        **({"seeded": False} if run.seed is None else {}),
+        "created": run.run["created"],
+        "status": result.get("status", "interrupted"),
+        "config": run.config,
+        "summary": {key: value for key, value in result.items() if key != "status"},
+    }
+
+
+def environment_count(run: RunDescription) -> int:
+    """Return how many environments resets name: those of all shards, or those that took turns."""
+    return sum(shard.environments for shard in run.shards) or run.environments

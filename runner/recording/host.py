@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import MAX_SAMPLES, Clock
+from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.recording.topic_reader import TopicReader
 
 if TYPE_CHECKING:
     import psutil
@@ -166,7 +166,7 @@ class HostMetrics:
         return np.where(rate < 0, np.nan, rate)
 
 
-def read_host(recording: TopicReader, clock: Clock | None) -> HostMetrics | None:
+def read_host(recording: Recording, clock: Clock | None) -> HostMetrics | None:
     """Return what a run used of its machine; None if that was not recorded.
 
     Raises:

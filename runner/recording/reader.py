@@ -12,35 +12,49 @@ from __future__ import annotations
 import math
 import os
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
+from runner.environments.naming import action_names, actions_in_words
+from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
+from runner.recording.description import RunDescription
+from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
+from runner.recording.maker import MAKER_RECORD, SHARD_MAKER, EnvironmentMaker
 from runner.recording.messages import (
     Message,
     QTable,
+    Scalars,
     Snapshot,
     decode_array,
     decode_q_table,
+    decode_scalars,
     unknown_measures,
 )
+from runner.recording.metadata import check_file, dtypes_of, kind_of
 from runner.recording.metrics import RECENT_EPISODES, finite_mean
-from runner.recording.phases import Phase
+from runner.recording.record_store import RecordStore
+from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.run_file import RecentTraining, run_title
-from runner.recording.topic_chunks import FOREVER, TopicChunks
-from runner.recording.topic_reader import TopicReader
+from runner.recording.schema import STEP_MESSAGES, Topic, topics_of
+from runner.recording.spaces import decode as decode_value
+from runner.recording.steps import Steps
+from runner.recording.topic_chunks import FOREVER, ChunkFile, TopicChunks, chunks_by_topic
 
 MAX_METRICS: Final = 1 << 17
-"""The most that `metrics` returns as one list."""
+"""The most that `Phase.all_metrics` returns as one list."""
 _METRICS_BYTES: Final = 1 << 20
+_MAX_SCALARS: Final = 8_192
+MAX_EPISODE_BYTES: Final = 128 << 20
+"""The most that `Phase.episode_steps` returns as one array: some 1.5 million steps."""
 
 
 def open_recording(path: str | os.PathLike[str]) -> Recording:
@@ -52,8 +66,80 @@ def open_recording(path: str | os.PathLike[str]) -> Recording:
     return Recording(Path(path))
 
 
-class Recording(TopicReader):
-    """A recording, opened; a context manager."""
+class Recording(RunDescription):
+    """A recording, opened; a context manager.
+
+    A block is the file's own bytes seen through the dtype of `dtypes`: no message is parsed by itself.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.file = RecordStore(path)
+        super().__init__(path, self.file)
+        try:
+            check_file(self.run, self.file.index, str(path))
+        except BaseException as error:
+            self.close()
+            if isinstance(error, OSError):
+                raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+            raise
+        self._tables: dict[Topic, TopicChunks] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    @cached_property
+    def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
+        """The dtype of each fixed-width topic's message records in this recording."""
+        return dtypes_of(self.run, str(self.path))
+
+    def table(self, topic: Topic | str) -> TopicChunks:
+        """Return the messages of a topic, or of this recording's own topic of that name: the kinds differ.
+
+        Raises:
+            RecordingError: the recording has no topic of that name.
+        """
+        name = topic if isinstance(topic, str) else topic.name
+        own = self._topics_by_name.get(name, topic)
+        if isinstance(own, str):
+            raise RecordingError(
+                f"{self.path}: has no topic {name!r}: it is of the kind {kind_of(self.run)!r}."
+            )
+        if own not in self._tables:
+            chunks = self._file, own, self._places[own], self.dtypes.get(own), self.lost.get(own.name, [])
+            if own.message in STEP_MESSAGES:
+                actions = self.table(topics_of(kind_of(self.run), own.phase).actions)
+                self._tables[own] = Steps(*chunks, actions=actions)
+            elif own.message in (schema.TRAIN_METRICS, schema.EVAL_METRICS, schema.OPTIMALITY):
+                channel = self.file.index.channels.get(own.channel)
+                recorded = self.file.index.schemas.get(channel.schema_id, b"") if channel else b""
+                unknown = dict.fromkeys(unknown_measures(own.message, recorded), math.nan)
+                self._tables[own] = TopicChunks(*chunks, _METRICS_BYTES, unknown)
+            else:
+                self._tables[own] = TopicChunks(*chunks)
+        return self._tables[own]
+
+    @cached_property
+    def _file(self) -> ChunkFile:
+        return ChunkFile(
+            str(self.path), self.file.index.chunks, self.file, len(self.agents), self.environments
+        )
+
+    @cached_property
+    def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
+        """The numbers of the chunks of the file that hold each topic."""
+        return chunks_by_topic(self.file.index, self.file, str(self.path))
+
+    @cached_property
+    def _topics_by_name(self) -> Mapping[str, Topic]:
+        """The topics that a recording of its kind has, by name."""
+        return {topic.name: topic for topic in self.topics}
 
     @cached_property
     def train(self) -> Phase:
@@ -81,22 +167,9 @@ class Recording(TopicReader):
         return self.train, self.eval
 
     @property
-    def has_steps(self) -> bool:
-        """Whether any whole step was recorded."""
-        return any(phase.steps for phase in self.phases)
-
-    @property
     def has_actions(self) -> bool:
         """Whether any action was recorded, with its step or alone."""
         return any(phase.steps.are_known for phase in self.phases)
-
-    @property
-    def last_step_time(self) -> int:
-        """The `log_time` of the last step in a recording that was cut: later resets lost their steps."""
-        steps = [phase.steps for phase in self.phases]
-        if "content_digest" in self.result or any(each.are_actions for each in steps):
-            return FOREVER
-        return max((each.entry(len(each) - 1).end_time for each in steps if each), default=0)
 
     @property
     def status(self) -> str:
@@ -130,54 +203,25 @@ class Recording(TopicReader):
         recorded = {key: getattr(self.result, key) for key in counts}
         return {key: count() if recorded[key] is None else recorded[key] for key, count in counts.items()}
 
-    def recent_episodes(self) -> NDArray[np.void]:
-        """Return the records of the last `RECENT_EPISODES` training episodes."""
-        return self.train.episodes.array(max(0, self.train.episodes.count() - RECENT_EPISODES))
-
-    def recent_training(self) -> RecentTraining:
-        """Return the means of the last training episodes; None where no value is finite."""
-        recent = self.recent_episodes()
-        length, total = finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
-        return RecentTraining(len(recent), length, total)
-
     def arrays(self) -> Iterator[Snapshot]:
         """Yield the arrays that a loop recorded by `snapshot`, in order."""
         return (array for _, array in self.table(schema.ARRAY_TOPIC).parsed(decode_array))
 
-    def metrics(self, phase: str) -> list[Message]:
-        """Return the metrics of a phase, in order.
+    def scalars(self) -> Iterator[Scalars]:
+        """Yield the values that a loop logged, thousands at a time, as columns.
 
         Raises:
-            RecordingError: they are damaged, or more than 131,072; `iter_metrics` yields them one by one.
-            ValueError: there is no such phase.
+            RecordingError: a message cannot be read.
         """
-        metrics: list[Message] = []
-        for one in self.iter_metrics(phase):
-            if len(metrics) == MAX_METRICS:
-                raise RecordingError(f"{self.path}: has more than {MAX_METRICS:,} {phase} metrics.")
-            metrics.append(one)
-        return metrics
-
-    def iter_metrics(self, phase: str) -> Iterator[Message]:
-        """Yield the metrics of a phase (`train` or `eval`), in order.
-
-        Raises:
-            RecordingError: they are damaged.
-            ValueError: there is no such phase.
-        """
-        return self._measures(self.phase(phase).metrics)
-
-    def optimality(self) -> Iterator[Message]:
-        """Yield the exact measures of the evaluations, in order; none unless `evaluation.exact` was set."""
-        return self._measures(self.table(schema.OPTIMALITY_TOPIC))
-
-    def _measures(self, table: TopicChunks) -> Iterator[dict[str, object]]:
-        """Yield metrics; one that the recording's version did not have is NaN, as unknown ones are."""
-        channel = self._index.channels.get(table.topic.channel)
-        recorded = self._index.schemas.get(channel.schema_id, b"") if channel else b""
-        unknown = dict.fromkeys(unknown_measures(table.topic.message, recorded), math.nan)
-        for fields in table.decoded(_METRICS_BYTES):
-            yield fields | unknown
+        scalars = self.table(schema.SCALAR_TOPIC)
+        messages = scalars.parsed(bytes)
+        while batch := list(islice(messages, _MAX_SCALARS)):
+            try:
+                yield decode_scalars(batch)
+            except RecordingError:
+                for _ in scalars.decoded():  # names the message
+                    pass
+                raise
 
     def snapshots(self, step: int = 0, tables: int = 0) -> Iterator[QTable]:
         """Yield the snapshots in order, without those that are older than needed for `step`.
@@ -201,3 +245,232 @@ class Recording(TopicReader):
         for snapshot in read(chunks):
             if tables or snapshot.table < learners:
                 yield snapshot
+
+
+class Phase:
+    """A phase of an open recording; each of its tables has the messages of a topic."""
+
+    def __init__(self, recording: Recording, name: str) -> None:
+        topics = schema.topics_of(kind_of(recording.run), name)
+        self.name, self.title = name, schema.PHASE_NAMES[name]
+        steps = recording.table(topics.steps)
+        assert isinstance(steps, Steps)
+        self.steps = steps
+        self.episodes, self.resets = recording.table(topics.episodes), recording.table(topics.resets)
+        self.infos, self.frames, self.metrics = map(
+            recording.table, (topics.infos, topics.frames, topics.metrics)
+        )
+        self._recording, self.topics = recording, topics
+
+    def steps_of_episodes(self, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
+        """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
+        end = None if stop is None else self.steps.first_from("episode", stop)
+        return self.steps.blocks(self.steps.first_from("episode", start), end)
+
+    def episode_span(self, episode: int) -> range:
+        """Return the numbers of the steps of one episode, also of one that never ended.
+
+        Where several environments take turns, episodes are numbered as they ended, and only ended ones have
+        a span; its step is the number of environments.
+
+        Raises:
+            RecordingError: the recording has no such episode, or no steps.
+        """
+        stride = self._recording.environments
+        total, ended = self.steps.total(), self.episodes.count()
+        if not total:
+            raise RecordingError(f"{self._recording.path}: has no {self.title} steps.")
+        start = 0
+        stop = 0
+        if 0 <= episode < ended and len(records := self.episodes.array(episode, episode + 1)):
+            stop = int(records[0]["last_step"]) + 1
+            start = stop - (int(records[0]["length"]) - 1) * stride - 1
+        elif episode == ended and stride == 1:
+            last = self.episodes.array(ended - 1, ended)
+            start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
+            for first in self.steps.numbered(range(start, start + 1)):
+                # A vector of one environment may have only reset it at first.
+                start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
+        if not 0 <= start < stop <= total:
+            raise NotInRecording(
+                f"{self._recording.path}: has no {self.title} episode {episode:,}; "
+                f"there are {ended:,}, from 0."
+            )
+        return range(start, stop, stride)
+
+    def episode_steps(self, episode: int) -> NDArray[np.void]:
+        """Return the steps of one episode, as `episode_span` finds them.
+
+        Raises:
+            RecordingError: the recording has no such episode or steps, or they are too large for an array.
+        """
+        span, path = self.episode_span(episode), self._recording.path
+        if (span.stop - span.start) * self._recording.dtypes[self.steps.topic].itemsize > MAX_EPISODE_BYTES:
+            raise RecordingError(
+                f"{path}: {self.title} episode {episode} has {span.stop - span.start:,} steps, too many "
+                f"for an array; read them in blocks, from {span.start}."
+            )
+        steps = self.steps.array(span.start, span.stop)
+        if not len(steps):
+            raise RecordingError(f"{path}: the steps of {self.title} episode {episode} were lost.")
+        return steps[:: span.step]
+
+    def transitions(self) -> Iterator[Any]:
+        """Yield the steps of a loop one by one, with `action` and `next_observation` as values.
+
+        Those of the kind `step` have `state`, `action` and `next_state`, counted from 0. They are NumPy
+        records where values have one size (`steps.blocks` yields many at once), else dictionaries.
+        """
+        return self._values(self.steps, action="action", next_observation="observation")
+
+    def reset_values(self) -> Iterator[Any]:
+        """Yield the resets one by one, as `transitions` yields steps."""
+        return self._values(self.resets, observation="observation")
+
+    def reset_states(self, times: range | None = None) -> Iterator[ResetState]:
+        """Yield what resets of a loop without a seed depend on, in the order of the resets.
+
+        Not every reset has one; jobs have none. `times` as for `TopicChunks.rows`.
+
+        Raises:
+            RecordingError: one is damaged.
+        """
+        states = self._recording.table(self.topics.reset_states)
+        return (state for _, state in states.parsed(decode_reset_state, times=times))
+
+    def _values(self, table: TopicChunks, **spaces: str) -> Iterator[Any]:
+        """Yield messages one by one; `spaces` names the space of each field that is a value."""
+        if table.dtype is not None:
+            for block in table.blocks():
+                yield from block
+            return
+        for fields in table.decoded():
+            where = f"{self._recording.path}: {table.topic.name} at {fields['log_time']} ns"
+            for name, space in spaces.items():
+                fields[name] = decode_value(self._recording.spaces[space], fields[name], where)
+            if "rewards" in fields:
+                fields["rewards"] = np.array(fields["rewards"])
+            yield fields
+
+    def whole_steps(self) -> int:
+        """Return how many steps of a loop are known to have their resets.
+
+        In a recording that was cut off these are the steps up to the first end of an episode after its last
+        reset: what comes later may lack its reset, since topics are written one after the other.
+        """
+        n, total = self._recording.environments, self.steps.total()
+        if "content_digest" in self._recording.result:
+            return total
+        if (last := self.resets.last()) is None:
+            return 0
+        for block in self.steps.rows(range(int(last["log_time"]), FOREVER)):
+            over = (block["terminated"] | block["truncated"]) & (block["step"] >= last["step"])
+            if over.any():
+                return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
+        return total // n * n
+
+    @cached_property
+    def extras(self) -> Extras:
+        """The values that a loop recorded with the steps: names with dtypes, and values; empty for a job.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        table, where = self._recording.table(self.topics.extras), str(self._recording.path)
+        layouts = extra_layouts(self._recording) if table else []
+        # As Python's numbers: a forged chunk may begin at any time
+        starts = [layout.start_time for layout in layouts]
+        times = table.file.chunks.columns["start_time"][table.places].tolist()
+        chosen = np.array([bisect_right(starts, time) - 1 for time in times], np.intp)
+        if (chosen < 0).any():
+            raise RecordingError(f"{where}: {table.topic.name} has values before their names.")
+        parts = [
+            (layout, TopicChunks(table.file, table.topic, table.places[chosen == k], layout.record))
+            for k, layout in enumerate(layouts)
+            if (chosen == k).any()
+        ]
+        return Extras(parts, self.episode_span, where)
+
+    @property
+    def has_metrics(self) -> bool:
+        """Whether metrics are recorded, as by training; else they follow from the episodes."""
+        return self.topics.metrics in self._recording.topics
+
+    def recent_episodes(self) -> NDArray[np.void]:
+        """Return the records of the last `RECENT_EPISODES` episodes."""
+        return self.episodes.array(max(0, self.episodes.count() - RECENT_EPISODES))
+
+    def recent_means(self) -> RecentTraining:
+        """Return the means of the last episodes; None where no value is finite."""
+        recent = self.recent_episodes()
+        length, total = finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
+        return RecentTraining(len(recent), length, total)
+
+    def all_metrics(self) -> list[Message]:
+        """Return the metrics, in order.
+
+        Raises:
+            RecordingError: they are damaged, or more than 131,072; `metrics.decoded` yields them one by one.
+        """
+        metrics = list(islice(self.metrics.decoded(), MAX_METRICS + 1))
+        if len(metrics) > MAX_METRICS:
+            raise RecordingError(
+                f"{self._recording.path}: has more than {MAX_METRICS:,} {self.name} metrics."
+            )
+        return metrics
+
+    def maker_of(self, environment: int = 0) -> EnvironmentMaker | None:
+        """Return how an environment of the phase was made: the recording's `maker` unless it has its own.
+
+        Args:
+            environment: its number among those of all shards.
+
+        Raises:
+            RecordingError: it is damaged.
+        """
+        last = 0
+        for shard in self._recording.shards:
+            last += shard.environments
+            if environment < last:
+                if (own := self._recording._maker(f"{SHARD_MAKER}/{shard.name}")) is not None:
+                    return own
+                break
+        return self.own_maker or self._recording.maker
+
+    @property
+    def own_maker(self) -> EnvironmentMaker | None:
+        """How the environment of this phase was made if it was recorded into the run of another."""
+        return self._recording._maker(f"{MAKER_RECORD}/{self.name}")
+
+    def action_names(self, agent: str = "") -> tuple[str, ...]:
+        """Return the names of the discrete actions, the least action's first; empty if unknown.
+
+        Args:
+            agent: of a game of several agents, which may have different actions.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        recording = self._recording
+        if recording.tabular:
+            mdp = recording.mdp
+            return () if action_names(mdp) is None else tuple(map(str, actions_in_words(mdp)))
+        maker = self.maker_of()
+        if maker is None:
+            return ()
+        names = maker.agent_action_names.get(agent, ()) if agent else maker.action_names
+        space = recording.spaces["action"] if names else {}
+        if names and agent:
+            space = space["spaces"][agent] if agent in space.get("spaces", ()) else {"type": "?"}
+        if names and (space["type"], space.get("n")) != ("Discrete", len(names)):
+            raise RecordingError(
+                f"{recording.path}: its {MAKER_RECORD} is damaged: found {len(names)} action_names, expected "
+                f"one for each action of a {space['type']} space of {space.get('n', 'no')} actions."
+            )
+        return names
+
+
+def extra_layouts(recording: Recording) -> list[ExtraLayout]:
+    """Return the names of extras, from when on; each entry has those of the one before it."""
+    columns = recording.table(schema.EXTRA_COLUMNS_TOPIC).decoded()
+    return read_layouts(((fields["log_time"], fields["json"]) for fields in columns), str(recording.path))

@@ -5,16 +5,19 @@ Reading is safe from several threads, so the next chunks are unpacked while one 
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
-from typing import BinaryIO, Final, TypeVar
+from pathlib import Path
+from typing import Final, TypeVar
 
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, first_channel, unpack_chunk
+from runner.recording.index import read_index
 from runner.recording.records import (
     MAX_METADATA_BYTES,
     AttachmentRecord,
@@ -22,6 +25,7 @@ from runner.recording.records import (
     RawRecord,
     read_record,
 )
+from runner.util.files import open_regular
 
 N = TypeVar("N", MetadataRecord, AttachmentRecord)
 
@@ -33,15 +37,26 @@ _SMALL: Final = 8 << 20
 
 
 class RecordStore:
-    """Reads records by their places.
+    """The file of an open recording: its index, its records by name, its chunks by their entries.
 
-    Args:
-        stream: the file; closed with the store.
+    Raises:
+        RecordingError: it cannot be read, or has no index of a recording.
     """
 
-    def __init__(self, stream: BinaryIO, path: str) -> None:
-        self._stream = stream
-        self._path = path
+    def __init__(self, path: Path) -> None:
+        self._path = str(path)
+        try:
+            self._stream = open_regular(path)
+        except (OSError, ValueError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            raise RecordingError(f"{path}: cannot be read ({reason}).") from error
+        try:
+            self.index = read_index(self._stream, self._path)
+        except BaseException as error:
+            self._stream.close()
+            if isinstance(error, OSError):
+                raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
+            raise
         self._lock = threading.Lock()
         self._cached: OrderedDict[int, bytes] = OrderedDict()
         self._cached_bytes = 0
@@ -52,12 +67,54 @@ class RecordStore:
             self._threads.shutdown(cancel_futures=True)
         self._stream.close()
 
-    def named(self, kind: type[N], name: str, offset: int, length: int) -> N:
-        """Return a metadata record or an attachment, whose checksum is compared.
+    @property
+    def finished(self) -> bool:
+        """Whether the file was closed properly: it has its index and summary."""
+        return self.index.finished
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file."""
+        return os.fstat(self._stream.fileno()).st_size
+
+    @property
+    def metadata_names(self) -> list[str]:
+        """The names of the metadata records, in the order of the file."""
+        return sorted(self.index.metadata, key=self.index.metadata.__getitem__)
+
+    @property
+    def attachment_names(self) -> list[str]:
+        """The names of the attachments, in the order of the file."""
+        return sorted(self.index.attachments, key=self.index.attachments.__getitem__)
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """Return a metadata record's entries.
 
         Raises:
-            RecordingError: it cannot be read, is damaged, or has another name.
+            RecordingError: there is none of that name, or it cannot be read.
         """
+        return self._named(MetadataRecord, "metadata", self.index.metadata, name).entries
+
+    def attachment(self, name: str) -> bytes:
+        """Return an attachment's data, after comparing its checksum.
+
+        Raises:
+            RecordingError: there is none of that name, or it is damaged.
+        """
+        return self._named(AttachmentRecord, "attachment", self.index.attachments, name).data
+
+    def attachments(self) -> Iterator[tuple[str, str, bytes]]:
+        """Yield name, media type and data of each attachment, in the order of the file."""
+        for name in self.attachment_names:
+            yield self._named(AttachmentRecord, "attachment", self.index.attachments, name)
+
+    def _named(self, kind: type[N], what: str, places: Mapping[str, tuple[int, int]], name: str) -> N:
+        """Return a metadata record or an attachment, whose checksum is compared."""
+        if name not in places:
+            raise RecordingError(
+                f"{self._path}: has no {what} {name!r}; it was cut off, or not written by dualtaxi."
+            )
+        offset, length = places[name]
         raw = self._raw(offset, length, MAX_METADATA_BYTES if kind is MetadataRecord else MAX_CHUNK_BYTES)
         try:
             record = read_record(raw)
@@ -66,7 +123,6 @@ class RecordStore:
         if not isinstance(record, kind):
             raise self._another(raw)
         if record.name != name:
-            what = "metadata" if kind is MetadataRecord else "attachment"
             raise RecordingError(
                 f"{self._path}: found {what} {record.name!r} at {offset}, expected {name!r}."
             )

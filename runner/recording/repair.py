@@ -27,7 +27,7 @@ from runner.recording.extras import read_layouts
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
 from runner.recording.metadata import REQUIRED_RECORDS, check_run, dtypes_of, json_object, kind_of
-from runner.recording.reader import open_recording
+from runner.recording.reader import Recording, open_recording
 from runner.recording.records import (
     MetadataRecord,
     RawRecord,
@@ -85,7 +85,7 @@ def repair(path: Path, report: Report = lambda *_: None, stated: Summary | None 
         check_integrity(path, report)
         done = Repair(path, was_whole=True)
         with contextlib.suppress(RecordingError), open_recording(path) as recording:
-            done.lost = recording.lost or _missing(counts, recording.message_counts)
+            done.lost = recording.lost or _missing(counts, _stated_counts(recording))
         return done
     fresh = path.with_suffix(".repairing")
     try:
@@ -142,6 +142,12 @@ def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int])
         return _Salvage(path, DamagedFile(stream, path), described["run"], stated).write(fresh, report)
 
 
+def _stated_counts(recording: Recording) -> dict[str, int]:
+    """Return the number of messages of each topic, as the summary of a finished recording states it."""
+    counts = recording.file.index.message_counts
+    return {topic.name: counts.get(topic.channel, 0) for topic in recording.topics}
+
+
 def _read_back(fresh: Path, done: Repair, report: Report) -> None:
     """Check every byte of the new file, and count its messages.
 
@@ -150,7 +156,7 @@ def _read_back(fresh: Path, done: Repair, report: Report) -> None:
     """
     check_integrity(fresh, report)
     with open_recording(fresh) as recording:
-        for name, found in recording.message_counts.items():
+        for name, found in _stated_counts(recording).items():
             if found != (expected := done.kept.get(name, 0)):
                 raise RecordingError(f"{fresh}: found {found} messages of {name}, expected {expected}.")
 

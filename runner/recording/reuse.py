@@ -53,7 +53,7 @@ class PackedChunks:
         """
         where = f"{self.recording.path}: chunk at {entry.offset}"
         try:
-            body = self.recording.chunk_body(entry)
+            body = self.recording.file.chunk_body(entry)
             head = chunk_head(body, len(body), where)
             if (head.compression, head.uncompressed_size) != (compression, len(records)):
                 return None

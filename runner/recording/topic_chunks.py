@@ -80,6 +80,10 @@ class TopicChunks:
     """Of a message record; None if messages vary in size."""
     lost: Sequence[Sequence[int]] = ()
     """Ranges (first, stop) of the numbers of messages that a repair could not save."""
+    max_bytes: int = MAX_CHUNK_BYTES
+    """The largest message that is parsed unless another limit is given."""
+    unknown: dict[str, float] = field(default_factory=dict)
+    """Fields that the recording's version did not have, with what stands for them."""
     _last: tuple[int, NDArray[np.void]] = field(default=(-1, np.empty(0, np.void)), init=False)
     """The number of a chunk that was checked last, and its messages."""
 
@@ -277,7 +281,7 @@ class TopicChunks:
 
     def decoded(
         self,
-        max_bytes: int = MAX_CHUNK_BYTES,
+        max_bytes: int | None = None,
         times: range | None = None,
         chunks: Sequence[int] | None = None,
     ) -> Iterator[Message]:
@@ -293,12 +297,12 @@ class TopicChunks:
         """
         parse = partial(decode, self.topic.message)
         for time, fields in self.parsed(parse, max_bytes, times, chunks):
-            yield {"log_time": time} | fields
+            yield {"log_time": time} | fields | self.unknown
 
     def parsed(
         self,
         parse: Callable[[bytes], M],
-        max_bytes: int = MAX_CHUNK_BYTES,
+        max_bytes: int | None = None,
         times: range | None = None,
         chunks: Sequence[int] | None = None,
     ) -> Iterator[tuple[int, M]]:
@@ -307,6 +311,7 @@ class TopicChunks:
         Raises:
             RecordingError: one cannot be parsed, or has more than `max_bytes` bytes; it is named.
         """
+        max_bytes = max_bytes or self.max_bytes
         for time, payload in self.messages(times, chunks):
             try:
                 if len(payload) > max_bytes:

@@ -41,7 +41,7 @@ class Checkpoints:
     def __init__(self, recording: Recording) -> None:
         self._folder = cache_folder() / TABLES
         run_id = re.sub(r"[^\w-]", "_", recording.run_id)[:80]  # whatever the file says, a plain name
-        self._prefix = f"{run_id}-{_key(recording)}" if recording.finished else ""
+        self._prefix = f"{run_id}-{_key(recording)}" if recording.file.finished else ""
         self._saved = False
 
     def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[NDArray[np.float64]]]:

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from runner.errors import CannotRedo
 from runner.recording import schema
+from runner.recording.description import environment_count
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
+from runner.recording.topic_chunks import FOREVER
 from runner.replay.comparison import Comparison, Part, parts_of
 from runner.replay.games import as_parallel
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, why_not_made
@@ -65,16 +67,16 @@ class Replay:
         self._recording, self._trust, self._make = recording, trust, make
         self._comparison = Comparison(recording, tolerance)
         self._report, self.render = report, render
-        self._last_step_time = recording.last_step_time
+        self._last_step_time = _last_step_time(recording)
         """When the steps end that were recorded: later resets came after steps that were lost."""
         self._steppers: dict[_Key, Stepper] = {}
         self._known: set[_Key] = set()
         """The environments whose random generators are in the recorded state."""
         self._is_separate = _are_separate(recording)
         """Whether training and evaluation have environments of their own."""
-        self.environments: Sequence[int] = range(recording.own_environments)
+        self.environments: Sequence[int] = range(environment_count(recording))
         """The environments that can be stepped alone; `ALL` where the vector must be stepped as a whole."""
-        makers = (recording.maker_of(phase) for phase in schema.PHASES)
+        makers = (recording.phase(phase).maker_of() for phase in schema.PHASES)
         if not recording.shards and any(maker is not None and is_whole_vector(maker) for maker in makers):
             self.environments = [ALL]
         self._max_rows = 1 if render else 256
@@ -171,7 +173,7 @@ class Replay:
         Raises:
             CannotRedo: it cannot be made, or has other spaces.
         """
-        key, maker = self._key(phase, environment), self._recording.maker_of(phase, environment)
+        key, maker = self._key(phase, environment), self._recording.phase(phase).maker_of(environment)
         if key not in self._steppers:
             env, is_trusted = self._environment(maker, environment)
             try:
@@ -205,13 +207,22 @@ class Replay:
             return make(maker, trust, self.render), trust
 
 
+def _last_step_time(recording: Recording) -> int:
+    """Return the `log_time` of the last step in a recording that was cut: later resets lost their steps."""
+    steps = [phase.steps for phase in recording.phases]
+    if "content_digest" in recording.result or any(each.are_actions for each in steps):
+        return FOREVER
+    return max((each.entry(len(each) - 1).end_time for each in steps if each), default=0)
+
+
 def _are_separate(recording: Recording) -> bool:
     """Return whether training and evaluation have environments of their own.
 
     One that was cut off does not state it: then they have if one continues an episode after the other.
     """
-    if any(map(recording.has_own_maker, schema.PHASES)) or "content_digest" in recording.result:
-        return any(map(recording.has_own_maker, schema.PHASES))
+    have_own_makers = any(phase.own_maker is not None for phase in recording.phases)
+    if have_own_makers or "content_digest" in recording.result:
+        return have_own_makers
     if not all(phase.steps.are_known for phase in recording.phases):
         return False
     phase, changes = "", 0

@@ -342,7 +342,7 @@ def why_not_redone(recording: Recording, trust: bool = False) -> str:
         phases = [
             phase for phase, n in zip(schema.PHASES, (shard.train_steps, shard.eval_steps), strict=True) if n
         ]
-        for maker in (recording.maker_of(phase, first) for phase in phases):
+        for maker in (recording.phase(phase).maker_of(first) for phase in phases):
             if maker is not None and is_whole_vector(maker):
                 return (
                     "A process stepped a vector that cannot be taken apart. As several processes recorded "
@@ -364,7 +364,7 @@ def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust
 def why_uncertain(recording: Recording, trust: bool = False) -> str:
     """Return why a difference shows nothing, as some arguments are not known; empty if all are."""
     firsts = itertools.accumulate((shard.environments for shard in recording.shards), initial=0)
-    makers = [recording.maker_of(phase, first) for first in firsts for phase in schema.PHASES]
+    makers = [recording.phase(phase).maker_of(first) for first in firsts for phase in schema.PHASES]
     known = [maker for maker in makers if maker is not None and maker.assumed]
     made = [one for one in known if not (one.make and (trust or own_mark(recording.path, one)))]
     names = ", ".join(dict.fromkeys(name for maker in made for name in maker.assumed))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
+from runner.recording.description import environment_count
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
@@ -210,7 +211,7 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
         yield from _without_steps(phase, early, nothing)
         here = []
         while waiting is not None and waiting.step < first + len(block):
-            is_known = waiting.environment < recording.own_environments
+            is_known = waiting.environment < environment_count(recording)
             if waiting.step < first or (waiting.step - first) % n or not is_known:
                 raise RecordingError(
                     f"{recording.path}: /{phase}/reset {waiting.number}: out of order, or of no environment."

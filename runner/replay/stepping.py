@@ -271,7 +271,7 @@ class EnvironmentStepper(RowStepper):
         if self._recording.has_states:
             start = int(self.action_space.start)  # type: ignore[attr-defined]
             return (rows["action"].astype(np.int64) + start).tolist()  # type: ignore[no-any-return]
-        if not self._recording.has_varying_values:
+        if self._recording.train.steps.dtype is not None:
             return values_in(self.action_space, np.array(rows["action"]))
         return [keyed(self.action_space, action) for action in self._decoded_actions(rows)]
 
@@ -315,7 +315,7 @@ class GameStepper(RowStepper):
         """Return the actions of recorded steps as the environment takes them."""
         agents = self.env.possible_agents
         own: Any = self.action_space
-        if self._recording.has_varying_values:
+        if self._recording.train.steps.dtype is None:
             return [
                 {
                     agent: keyed(own[agent], action[str(agent)])

@@ -102,7 +102,7 @@ class VectorStepper(Stepper):
     def _actions(self, rows: NDArray[np.void], times: int) -> Sequence[Value]:
         """Return the actions of all environments as the vector takes them, for each of its steps."""
         space, n = self.action_space, self._n
-        if self._recording.has_varying_values:
+        if self._recording.train.steps.dtype is None:
             values = [keyed(space, action) for action in self._decoded_actions(rows)]
             return [batched(space, values[time * n : time * n + n]) for time in range(times)]
         column = np.array(rows["action"])

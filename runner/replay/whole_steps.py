@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.actions import after_step
 from runner.recording.blocks import blank_records
-from runner.recording.phases import MAX_EPISODE_BYTES
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.schema import PHASE_NAMES
 from runner.recording.spaces import least_number
 from runner.replay.redone import RedoneSteps
@@ -34,7 +33,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
             f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to rerun for "
             f"an array; `dualtaxi rerecord {recording.run_id}` records them."
         )
-    return _whole_steps(recording.path, recording.size, phase, episode)
+    return _whole_steps(recording.path, recording.file.size, phase, episode)
 
 
 @lru_cache(4)

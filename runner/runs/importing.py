@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RecordingError, RunnerError, StorageError
+from runner.recording.description import recorded_facts
 from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
@@ -134,7 +135,7 @@ def run_facts(recording: Recording, details: JsonView) -> Json:
     Name, status, duration, error text and the digest of a recording without steps are taken from `details`
     where they are of the right type. Only the recording can say that the run finished.
     """
-    facts = recording.run_facts()
+    facts = recorded_facts(recording)
     summary, given = dict(facts["summary"]), details.get("summary")
     given = given if isinstance(given, dict) else {}
     seconds, error = given.get("seconds"), given.get("error")
@@ -143,7 +144,7 @@ def run_facts(recording: Recording, details: JsonView) -> Json:
     if isinstance(error, str) and len(error) <= MAX_ERROR:
         summary["error"] = error
     if "content_digest" in summary or "bytes" in given:
-        summary["bytes"] = recording.size
+        summary["bytes"] = recording.file.size
     if isinstance(details.get("name"), str):
         facts["name"] = details["name"]
     reached = ("finished",) if facts["status"] == "finished" else ()
@@ -157,10 +158,10 @@ def run_facts(recording: Recording, details: JsonView) -> Json:
 
 def _export_record(recording: Recording) -> dict[str, object]:
     """Return the description of the run in an exported recording; empty for any other recording."""
-    if EXPORT_RECORD not in recording.metadata_names:
+    if EXPORT_RECORD not in recording.file.metadata_names:
         return {}
     try:
-        entries = json.loads(recording.metadata(EXPORT_RECORD)["json"])
+        entries = json.loads(recording.file.metadata(EXPORT_RECORD)["json"])
     except (KeyError, ValueError, RecursionError) as error:
         raise RecordingError(f"{recording.path}: the metadata {EXPORT_RECORD!r} is not JSON.") from error
     return entries if isinstance(entries, dict) else {}

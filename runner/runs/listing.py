@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RecordingError, RunNotFound, StorageError
+from runner.recording.description import recorded_facts
 from runner.recording.run_file import RUN_ID
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, made_by, recordings_folder
 from runner.util.files import read_object
@@ -95,7 +96,7 @@ def _from_recording(path: Path) -> Run:
     from runner.recording.reader import open_recording
 
     with open_recording(path) as recording:
-        facts = {**recording.run_facts(), "recording": path.name}
+        facts = {**recorded_facts(recording), "recording": path.name}
         with contextlib.suppress(RecordingError):
             facts["provenance"] = made_by(recording.provenance)
     if not _is_run(facts):

@@ -42,6 +42,7 @@ from runner.export.plots.style import CurveStyle
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
+from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service.errors import Refused
@@ -207,7 +208,7 @@ def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> 
     """Return evaluations, reports of training or exact measures from `start` to before `stop`, as JSON."""
     with open_recording(path) as recording:
         if kind == "optimality":
-            everything = list(recording.optimality())
+            everything = list(recording.table(schema.OPTIMALITY_TOPIC).decoded())
         elif kind == "evaluations":
             everything = [each.as_json() for each in evaluation_records(recording)]
         else:

@@ -205,7 +205,9 @@ def latest_episode(path: Path) -> bytes:
     """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
     with open_recording(path) as recording:
         ended = recording.train.episodes.count()
-        return f"train/{ended - 1}".encode() if ended and recording.has_steps else b""
+        return (
+            f"train/{ended - 1}".encode() if ended and any(phase.steps for phase in recording.phases) else b""
+        )
 
 
 def maps(path: Path) -> bytes:

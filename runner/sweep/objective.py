@@ -17,6 +17,7 @@ from runner.analysis.series import (
     training_readings,
 )
 from runner.errors import RunnerError, nearest
+from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.sweep.model import Objective
@@ -27,11 +28,13 @@ Curve = dict[int, float]
 
 def curve_of(recording: Recording, metric: str) -> Curve:
     """Return the finite readings of a metric at the evaluations of a recording."""
-    agents, events = recording.agents, recording.event_names
-    exact = {measures["evaluation"]: measures for measures in recording.optimality()}
+    agents, events = recording.agents, recording.environment["event_names"]
+    exact = {
+        measures["evaluation"]: measures for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
+    }
     evaluations = [
         (metrics["episode"], readings(metrics, exact.get(metrics["evaluation"]), agents, events))
-        for metrics in recording.metrics("eval")
+        for metrics in recording.eval.all_metrics()
     ]
     curve = {episode: read[metric] for episode, read in evaluations if metric in read}
     if not curve:

@@ -78,7 +78,7 @@ def _measured_bytes(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
         run = run_job(Job(short, short.seeds[0]), run, mdp=mdp)
         with open_recording(run.recording) as recording:
             curve_of(recording, metric)
-            return recording.size
+            return recording.file.size
 
 
 def _estimated_bytes(config: ExperimentConfig, mdp: Mdp) -> int:

@@ -51,7 +51,7 @@ def expectations(path: Path) -> dict[str, Any]:
             "messages": recording.result["messages"],
             "tables": hashes,
             "evaluations": [
-                [one["success_percent"], one["eval_mean_length"]] for one in recording.metrics("eval")
+                [one["success_percent"], one["eval_mean_length"]] for one in recording.eval.all_metrics()
             ],
         }
 

@@ -29,6 +29,7 @@ from PIL import Image
 
 from runner.recording import schema
 from runner.recording.actions import COLUMNS as KEPT_COLUMNS
+from runner.recording.description import environment_count, has_environment
 from runner.recording.messages import frame_place
 from runner.recording.reader import Recording, open_recording
 
@@ -70,8 +71,8 @@ def _tables(recording: Recording) -> Iterator[tuple[str, Table]]:
         for name, table in _phase_tables(recording, phase):
             yield f"{phase}.{name}", table
     yield "texts", _texts(recording)
-    if recording.has_reports:
-        yield "optimality", _of_messages(recording.optimality())
+    if recording.eval.has_metrics:
+        yield "optimality", _of_messages(recording.table(schema.OPTIMALITY_TOPIC).decoded())
     if recording.has_tables:
         yield "q_tables", _of_messages(map(vars, recording.snapshots(tables=99)))
         return
@@ -86,8 +87,8 @@ def _phase_tables(recording: Recording, phase: str) -> Iterator[tuple[str, Table
     yield "resets", resets
     yield "steps", _steps(recording, phase, resets)
     yield "episodes", _episodes(recording, phase, resets)
-    if recording.has_reports:
-        yield "metrics", _of_messages(recording.iter_metrics(phase))
+    if recording.eval.has_metrics:
+        yield "metrics", _of_messages(recording.phase(phase).metrics.decoded())
         return
     infos = _decoded(recording, f"/{phase}/info")
     parsed = [info | json.loads(info.pop("json")) for info in infos]
@@ -131,12 +132,12 @@ def _with(blocks: Iterable[Column], name: str) -> Iterator[Column]:
 def _run(recording: Recording) -> Table:
     facts = {
         "agents": recording.agents,
-        "spaces": recording.spaces if recording.has_environment else None,
-        "environments": recording.own_environments,
+        "spaces": recording.spaces if has_environment(recording.config) else None,
+        "environments": environment_count(recording),
         "shards": [shard.name for shard in recording.shards],
         "seed": recording.seed,
         "config": _without_parent(recording.config),
-        "event_names": recording.event_names if recording.has_environment else None,
+        "event_names": recording.environment["event_names"] if has_environment(recording.config) else None,
         "status": recording.status,
         "lost": sum(stop - first for ranges in recording.lost.values() for first, stop in ranges),
         **recording.done(),

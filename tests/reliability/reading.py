@@ -10,6 +10,7 @@ from runner.config import from_mapping
 from runner.environments.naming import action_names, states_in_words
 from runner.errors import RunnerError
 from runner.recording import schema
+from runner.recording.description import recorded_facts
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import Recording, open_recording
 from tests.runner.recording.making import LAKE, make_run
@@ -69,7 +70,7 @@ def read_everything(path: Path) -> bool:
 
 def read_description(recording: Recording) -> None:
     """Read the recording's description of its run."""
-    recording.run_facts()
+    recorded_facts(recording)
     assert isinstance(recording.provenance, dict)
     assert isinstance(recording.lost, dict)
     from_mapping(recording.config)
@@ -96,8 +97,8 @@ def reader_of(topic: schema.Topic) -> Any:
 
 def read_measures(recording: Recording) -> None:
     """Read the metrics of both phases."""
-    recording.metrics("train")
-    recording.metrics("eval")
+    recording.train.all_metrics()
+    recording.eval.all_metrics()
 
 
 def read_episodes(recording: Recording) -> None:

@@ -291,7 +291,7 @@ def look(folder: Path, whole: Whole, tally: Tally, killed: Killed) -> None:
         return
     try:
         with open_recording(run.recording) as recording:
-            finished, steps = recording.finished, sum(recording.table(t).count() for t in _STEPS)
+            finished, steps = recording.file.finished, sum(recording.table(t).count() for t in _STEPS)
     except RecordingError:
         if has_chunk(run.recording):
             raise

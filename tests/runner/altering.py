@@ -34,12 +34,12 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
     with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
         contents = survey(source, keep_result=True)
         names = list(contents.metadata)
-        entries = {name: recording.metadata(name) for name in names}
+        entries = {name: recording.file.metadata(name) for name in names}
         entries |= {name: turn(entries[name]) for name, turn in metadata.items()}
         for name in names:
             if name != "result":
                 file.add_metadata(name, entries[name])
-        for name, media_type, data in recording.attachments():
+        for name, media_type, data in recording.file.attachments():
             file.add_attachment(name, media_type, data)
         for one in recording.topics:
             turn = change if one is topic else lambda messages: messages

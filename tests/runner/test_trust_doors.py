@@ -210,7 +210,7 @@ def strangers(tmp_path_factory, pole, lake, maker):
     video = wrapped("gymnasium.wrappers.vector:RecordVideo", "Foo", video_folder="..")
     forged(pole, folder, "writing", with_maker(changed(maker, additional_wrappers=video)), mark="{}")
     with open_recording(lake.recording) as recording:
-        config = json.loads(of_another_job("config", recording.metadata("config"))["json"])
+        config = json.loads(of_another_job("config", recording.file.metadata("config"))["json"])
         job = identity_of(config, recording.seed)
 
     def change(name, entries):

@@ -121,7 +121,7 @@ def diff(
             isinstance(origin, BranchOrigin)
             and origin.run == parent.run_id
             and have_same_spaces(a, b)
-            and not a.has_varying_values
+            and a.train.steps.dtype is not None
         ):
             return _diff_branch(difference, a, b, Cause("branch", f"{names}, {origin}"), origin)
     return _diff_loops(difference, a, b)
@@ -327,7 +327,7 @@ def _costs(recording: Recording) -> dict[str, object]:
         "train_steps": done["train_steps"],
         "eval_steps": done["eval_steps"],
         "episodes": recording.train.episodes.count(),
-        "bytes": recording.size,
+        "bytes": recording.file.size,
     }
 
 

@@ -20,6 +20,7 @@ from runner.analysis.step_reference import StepRef
 from runner.errors import shortened
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
+from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.replay.steps import episode_blocks
@@ -246,7 +247,7 @@ def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
 
 def have_same_spaces(a: Recording, b: Recording) -> bool:
     """Return whether the steps of two recordings, of which one is of a loop, are in the same spaces."""
-    kinds = {a.kind, b.kind}
+    kinds = {kind_of(a.run), kind_of(b.run)}
     return kinds <= {"job", "step"} or (len(kinds) == 1 and a.spaces == b.spaces and a.agents == b.agents)
 
 

@@ -71,7 +71,7 @@ def _values(recording: Recording) -> dict[str, dict[int, float]]:
     """Return metric to episode to value; what is unknown (nan) is left out."""
     agents = recording.agents
     table: dict[str, dict[int, float]] = {}
-    for metrics in recording.iter_metrics("eval"):
+    for metrics in recording.eval.metrics.decoded():
         for metric in _COMPARED:
             value = metrics[metric.field]
             lines = [f"{metric.name}.{agent}" for agent in agents] if metric.per_agent else [metric.name]

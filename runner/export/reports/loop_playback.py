@@ -155,7 +155,9 @@ def _observations_before(
     if reset is None:
         return []
     value = reset["observation"]
-    return [part.column([value] if recording.has_varying_values else np.array([value])) for part in parts]
+    return [
+        part.column([value] if recording.train.steps.dtype is None else np.array([value])) for part in parts
+    ]
 
 
 def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPart]) -> list[Column]:

@@ -146,7 +146,7 @@ def logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[L
     tick = schema.STEP_NANOSECONDS
     times = range(max(0, time[0] - _NEAR) * tick, (time[-1] + _NEAR) * tick + 1)
     entries: Iterator[tuple[str, int, Value]]
-    if recording.has_reports:
+    if recording.eval.has_metrics:
         entries = (
             (name.replace("_", " "), report["log_time"], short(report[name]))
             for report in recording.train.metrics.decoded(times=times)

@@ -29,6 +29,7 @@ from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, embedded, render, templates
 from runner.recording.composition import composition_of
+from runner.recording.description import has_environment
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import RecentTraining
@@ -144,14 +145,14 @@ def _run(
         seed=recording.seed,
         title=recording.title,
         status=recording.status,
-        environment=environment["env_id"].rpartition(":")[2] if recording.has_environment else "",
+        environment=environment["env_id"].rpartition(":")[2] if has_environment(recording.config) else "",
         agents=[spoken(agent) for agent in environment["agents"]],
         is_random=recording.has_tables and recording.config["algorithm"] == "random",
         made_by="" if recording.can_train_again else recording.config["made_by"],
         last=evaluations[-1] if evaluations else None,
-        recent=recording.recent_training(),
+        recent=recording.train.recent_means(),
         random_policy=random_policy_sentence(recording),
-        has_steps=recording.has_steps,
+        has_steps=any(phase.steps for phase in recording.phases),
         evaluations=evaluations_section(recording, evaluations) if evaluations else None,
         broad=drawing is not None and drawing.width > svg.BROAD,
         facts=_facts(recording),
@@ -187,9 +188,9 @@ def _facts(recording: Recording) -> dict[str, str]:
             "Tables": f"{spoken(config['tables'])}, reward: {config['rewards']}",
             "Training": f"{episodes:,} of {config['episodes']:,} episodes, {steps:,} steps recorded",
             "Evaluation": f"{trial_steps:,} steps recorded",
-            "Job": recording.job,
+            "Job": recording.run["job"],
         }
-    elif not recording.has_environment:
+    elif not has_environment(recording.config):
         facts = {"Recorded": f"logged values, by {config['made_by']}"}
     else:
         spaces = {name: space["type"] for name, space in recording.spaces.items()}
@@ -201,7 +202,7 @@ def _facts(recording: Recording) -> dict[str, str]:
             "Training": f"{episodes:,} episodes, {steps:,} steps",
             "Evaluation": f"{trial_steps:,} steps",
         }
-    facts["Begun"] = recording.created
+    facts["Begun"] = recording.run["created"]
     facts["Content digest"] = recording.result.content_digest or f"none ({recording.status})"
     return {key: str(value) for key, value in facts.items()}
 

@@ -239,7 +239,7 @@ class LoopReader:
         if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
             style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
         tab, title = OVERVIEW, quantity.removeprefix("extra/")
-        actions = self._recording.action_names(phase, member.agent) if quantity == "action" else ()
+        actions = self._recording.phase(phase).action_names(member.agent) if quantity == "action" else ()
         if 0 < len(actions) <= FEW:
             space = self._recording.spaces["action"]
             least = least_number(space["spaces"][member.agent] if member.agent else space)
@@ -334,7 +334,7 @@ class LoopReader:
 def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:
     """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
     parts = {}
-    for quantity in OBSERVED if not recording.has_varying_values else ():
+    for quantity in OBSERVED if recording.train.steps.dtype is not None else ():
         leaves = [
             leaf
             for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")

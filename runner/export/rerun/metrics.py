@@ -37,8 +37,8 @@ Lines = tuple[str, Times, Array, Sequence[str]]
 
 def metric_tracks(source: Source) -> Iterator[Track]:
     """Yield the tracks of all metrics of a job."""
-    recording, evaluations = source.recording, source.recording.metrics("eval")
-    reports = sorted([*recording.metrics("train"), *evaluations], key=lambda row: int(row["log_time"]))
+    recording, evaluations = source.recording, source.recording.eval.all_metrics()
+    reports = sorted([*recording.train.all_metrics(), *evaluations], key=lambda row: int(row["log_time"]))
     learners, events = [spoken(name) for name in recording.agents], list(recording.mdp.event_names)
     for path, times, values, names in itertools.chain(
         _training_lines(reports, learners),

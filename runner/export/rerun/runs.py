@@ -39,7 +39,7 @@ class JobReader:
         recording = self._recording = source.recording
         self._mdp, self._scene = recording.mdp, scene_of(recording.mdp)
         steps = sum(recording.table(topic).count() for topic in (schema.TRAIN_STEP, schema.EVAL_STEP))
-        reports = [*recording.metrics("train")[-1:], *recording.metrics("eval")[-1:]]
+        reports = [*recording.train.all_metrics()[-1:], *recording.eval.all_metrics()[-1:]]
         self.last = max([steps, *(row["log_time"] // schema.STEP_NANOSECONDS for row in reports)])
         """Steps executed in the whole run."""
         low = high = 0.0

@@ -123,14 +123,14 @@ def select(recording: Recording, request: Request) -> Selection:
         selection.warnings.append("--frames draws loops only: the run was trained here.")
     if is_job and (recording.mdp.scene is None or recording.mdp.scene_cells is None):
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
-    if is_job and not recording.has_steps:
+    if is_job and not any(phase.steps for phase in recording.phases):
         if not request.is_default:
             require_steps(recording, "export")
         selection.warnings.append(
             f"Only metrics are exported, as there are no steps: {why_no_steps(recording)}."
         )
         return selection
-    if recording.has_varying_values:
+    if recording.train.steps.dtype is None:
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     available = evaluations_with_steps(recording, train, evals)
@@ -187,7 +187,7 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
 
 def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
     """Return the evaluations that have steps; of a job including an incomplete one."""
-    if not recording.has_reports:
+    if not recording.eval.has_metrics:
         return evaluations_of(recording)
     evaluations = []
     trials = int(recording.config["evaluation"]["trials"]) if evals.count else 1

@@ -120,7 +120,7 @@ def _recorded(run: Run) -> Mapping[str, Any]:
         with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
             done = recording.done()
             is_loop = not run.can_train_again and not done["eval_steps"]
-            return {**done, "recent_training": recording.recent_training()} if is_loop else done
+            return {**done, "recent_training": recording.train.recent_means()} if is_loop else done
     return {}
 
 

@@ -148,9 +148,9 @@ async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisName
 @router.get("/evaluations")
 def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the last evaluations."""
-    agents, events = recording.agents, recording.event_names
-    if recording.has_reports:
-        last = deque(recording.iter_metrics("eval"), MAX_EVALUATIONS)
+    agents, events = recording.agents, recording.environment["event_names"]
+    if recording.eval.has_metrics:
+        last = deque(recording.eval.metrics.decoded(), MAX_EVALUATIONS)
         records = [evaluation_record(metrics, agents, events) for metrics in last]
         total = recording.eval.metrics.count()
     else:
@@ -215,7 +215,7 @@ def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
 def _done_by(run: Run) -> Json:
     """Return what a loop that is being recorded has done so far."""
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return {**recording.done(), "bytes": recording.size}
+        return {**recording.done(), "bytes": recording.file.size}
     return {}
 
 

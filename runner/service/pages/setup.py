@@ -70,7 +70,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     log: list[LogLine] = []
     try:
         with open_recording(run.recording) as recording:
-            facts |= {"Job hash": recording.job, "Size": humanize.size(recording.size)}
+            facts |= {"Job hash": recording.run["job"], "Size": humanize.size(recording.file.size)}
             provenance = brief_provenance(recording.provenance)
             log = [
                 LogLine(

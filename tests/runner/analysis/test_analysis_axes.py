@@ -87,7 +87,7 @@ def test_logged_values_are_at_their_steps_and_updates(folder):
 
 def test_evaluations_of_a_job_are_at_the_steps_recorded_with_them(taxis):
     with open_recording(taxis.recording) as recording:
-        metrics = recording.metrics("eval")
+        metrics = recording.eval.all_metrics()
         over_steps, over_episodes = read_series(recording, STEPS), read_series(recording)
         assert read_series(recording, UPDATES).training == over_steps.training
     assert [place for place, _ in over_steps.evaluation] == [one["step"] for one in metrics]
@@ -158,7 +158,7 @@ def test_an_evaluation_is_at_the_time_at_which_it_began(taxis):
         over_time = read_series(recording, TIME)
         began = [
             recording.train.episodes.array(e - 1, e)["log_time"][0] if e else 0
-            for e in (one["episode"] for one in recording.metrics("eval"))
+            for e in (one["episode"] for one in recording.eval.all_metrics())
         ]
     times = clock.seconds_at(np.array(began, np.int64) // schema.STEP_NANOSECONDS)
     assert [place for place, _ in over_time.evaluation] == pytest.approx(times.tolist(), abs=1e-3)

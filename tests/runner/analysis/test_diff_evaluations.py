@@ -40,7 +40,7 @@ def test_an_evaluation_after_a_lost_one_is_compared_with_its_own_tables(lossy, r
         difference = diff(damaged, other)
     divergence, cause = difference.evaluation_divergence, difference.evaluation_cause
     assert (divergence.evaluation, divergence.after, divergence.episode, divergence.t) == (2, 120, 4, 0)
-    trained = damaged.metrics("eval")[-1]["step"]
+    trained = damaged.eval.all_metrics()[-1]["step"]
     state = int(divergence.a_step["state"])
     assert cause.rows[0].a == tables_at(damaged, trained)[0][state].tolist()
 

@@ -102,7 +102,7 @@ def test_a_run_may_be_a_path_or_open(run):
     assert frames.evaluations(str(run.recording)).equals(expected)
     with runner.open_recording(run.recording) as recording:
         assert frames.evaluations(recording).equals(expected)
-        assert recording.finished  # and still open
+        assert recording.file.finished  # and still open
 
 
 def test_where_success_is_unknown(corridor_run):

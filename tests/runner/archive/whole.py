@@ -25,5 +25,5 @@ def contents(path):
             for topic in recording.topics
             if topic not in recording.dtypes
         }
-        metadata = {name: recording.metadata(name) for name in recording.metadata_names}
-        return blocks, messages, metadata, list(recording.attachments())
+        metadata = {name: recording.file.metadata(name) for name in recording.file.metadata_names}
+        return blocks, messages, metadata, list(recording.file.attachments())

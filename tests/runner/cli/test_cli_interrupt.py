@@ -62,7 +62,7 @@ def test_a_signal_ends_a_run_properly(tiny, tmp_path, number):
     assert "Traceback" not in err
     assert run.status == values["status"] == "interrupted"
     with runner.open_recording(run.recording) as recording:
-        assert recording.finished
+        assert recording.file.finished
         assert recording.result["content_digest"] == values["content_digest"]
         assert len(recording.train.episodes.array()) == values["episodes"] > 0
 

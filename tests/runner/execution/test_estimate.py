@@ -18,7 +18,7 @@ def test_evaluations_and_snapshots_are_counted_as_they_are_made(tmp_path, episod
     }
     one = estimate(experiment(LAKE, **changes), 20)
     with open_recording(make_run(tmp_path, LAKE, **changes).recording) as recording:
-        assert one.evaluations == len(recording.metrics("eval"))
+        assert one.evaluations == len(recording.eval.all_metrics())
         assert one.snapshots == len(list(recording.snapshots()))
         trials = one.evaluations * 2
         assert one.max_steps == 20 * (episodes + trials)

@@ -131,7 +131,7 @@ def test_a_stop_while_it_catches_up_loses_nothing(whole, tmp_path):
     assert stopped.summary["train_steps"] == steps > 0
     assert stopped.summary["content_digest"] is None
     with open_recording(run.recording) as recording:
-        assert recording.finished
+        assert recording.file.finished
         assert recording.train.steps.count() == steps == recording.result["train_steps"]
     assert_same(resume(stopped), whole)
 
@@ -295,7 +295,7 @@ def test_other_versions_are_refused_with_what_differs(whole, tmp_path, monkeypat
     assert "host" not in str(refused.value)
     done = resume(run, accept_changes=True)
     with open_recording(done.recording) as recording:
-        accepted = json.loads(recording.metadata("resume/1")["accepted_changes"])
+        accepted = json.loads(recording.file.metadata("resume/1")["accepted_changes"])
     assert accepted == {"package.numpy": f"{here['package.numpy']} -> 1.0"}
     assert_same(done, whole)
 

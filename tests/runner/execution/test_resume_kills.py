@@ -46,7 +46,7 @@ def test_killed_again_and_again(tmp_path, mode, config, sizes):
         assert run.status == "interrupted"
         words = ("resume", run.run_id)
     with open_recording(run.recording) as recording:
-        assert not recording.finished
+        assert not recording.file.finished
         for topic in BLOCK_TOPICS:
             assert recording.table(topic).count() == sum(
                 len(block) for block in recording.table(topic).blocks()

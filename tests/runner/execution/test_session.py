@@ -18,6 +18,7 @@ from runner.environments.loading import load_mdp
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution.session import run_job
 from runner.recording import schema
+from runner.recording.description import recorded_facts
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import message_class
 from runner.recording.reader import open_recording
@@ -32,8 +33,8 @@ def positions(run) -> dict[str, list[tuple[int, int]]]:
     """Return at how many (episodes, steps) of training each kind of measure was taken."""
     with open_recording(run.recording) as recording:
         return {
-            "evaluation": [(each["episode"], each["step"]) for each in recording.metrics("eval")],
-            "log": [(each["episode"], each["step"]) for each in recording.metrics("train")],
+            "evaluation": [(each["episode"], each["step"]) for each in recording.eval.all_metrics()],
+            "log": [(each["episode"], each["step"]) for each in recording.train.all_metrics()],
             "snapshot": [(each.episode, each.step) for each in recording.snapshots()],
         }
 
@@ -94,9 +95,9 @@ def test_one_run_is_what_the_twin_does_from_beginning_to_end(tmp_path):
                 twin.evaluate(3)
                 evaluated.append(twin.training_metrics())
         assert len(logged) == 5
-        for found, expected in zip(recording.metrics("train"), logged, strict=True):
+        for found, expected in zip(recording.train.all_metrics(), logged, strict=True):
             assert {key: found[key] for key in expected} == expected
-        for number, (found, expected) in enumerate(zip(recording.metrics("eval"), evaluated, strict=True)):
+        for number, (found, expected) in enumerate(zip(recording.eval.all_metrics(), evaluated, strict=True)):
             trials = twin.evaluation.episodes[3 * number : 3 * number + 3]
             expected |= {
                 "evaluation": number,
@@ -136,10 +137,10 @@ def test_run_json_says_what_was_done(tmp_path):
     with open_recording(run.recording) as recording:
         for topic in schema.TOPICS:
             assert summary["messages"][topic.name] == recording.table(topic).count()
-        last = recording.metrics("eval")[-1]
+        last = recording.eval.all_metrics()[-1]
         assert summary["train_steps"] == recording.train.steps.count() == last["step"]
         assert summary["eval_steps"] == recording.eval.steps.count()
-        assert recording.job == Job(experiment(TAXIS), 9).identity
+        assert recording.run["job"] == Job(experiment(TAXIS), 9).identity
     assert summary["episodes"] == last["episode"] == 60
     assert summary["last_evaluation"] == {
         "episode": 60,
@@ -166,7 +167,7 @@ def test_an_environment_that_names_no_success_reports_none(tmp_path):
     run = make_run(tmp_path, LAKE, env={"id": "Pond-v0"})
     assert run.summary["last_evaluation"]["success_percent"] is None
     with open_recording(run.recording) as recording:
-        metrics = recording.metrics("eval")[-1]
+        metrics = recording.eval.all_metrics()[-1]
     assert metrics["successes"] == -1
     assert np.isnan(metrics["success_percent"])
 
@@ -225,8 +226,8 @@ def test_a_stopped_run_is_interrupted_and_closed_properly(asked, tmp_path):
         times = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
     assert summary.statistics.message_end_time == max(times)
     with open_recording(run.recording) as recording, open_recording(whole.recording) as complete:
-        assert recording.finished
-        assert recording.result["status"] == recording.run_facts()["status"] == "interrupted"
+        assert recording.file.finished
+        assert recording.result["status"] == recorded_facts(recording)["status"] == "interrupted"
         for topic in set(schema.TOPICS) - {schema.LOG_TOPIC}:
             messages = list(recording.table(topic).messages())
             assert messages == list(complete.table(topic).messages())[: len(messages)], topic.name
@@ -252,9 +253,9 @@ def test_a_keyboard_interrupt_leaves_an_interrupted_run_with_what_was_done(tmp_p
         run_job(Job(config, 0), run, report=report)
     assert find_run(run.run_id, tmp_path).status == "interrupted"
     with open_recording(run.recording) as recording:
-        assert recording.run_facts()["status"] == "interrupted"
-        assert [each["episode"] for each in recording.metrics("eval")] == [0, 20]
-        assert recording.finished
+        assert recorded_facts(recording)["status"] == "interrupted"
+        assert [each["episode"] for each in recording.eval.all_metrics()] == [0, 20]
+        assert recording.file.finished
 
 
 def test_an_error_in_a_callback_ends_the_run_as_failed(tmp_path):
@@ -322,7 +323,7 @@ def test_learning_continues_from_a_recorded_run(tmp_path):
         run = make_run(tmp_path, TAXIS, name="second", initial_q=start)
         with open_recording(run.recording) as recording:
             assert [table.values.tobytes() for table in recording.snapshots()][:2] == tables[step]
-            assert recording.metrics("eval")[0]["step"] == 0, "counting starts again"
+            assert recording.eval.all_metrics()[0]["step"] == 0, "counting starts again"
 
 
 def test_learning_continues_from_any_step_of_a_recorded_run(tmp_path):
@@ -384,7 +385,10 @@ def test_exact_measures_are_those_of_a_trial_from_every_start(tmp_path, mode):
     plan = {"every": 100, "trials": starts, "start": "each", "exact": True}
     run = make_run(tmp_path, config.to_mapping(), evaluation=plan)
     with open_recording(run.recording) as recording:
-        sampled, exact = recording.metrics("eval"), list(recording.optimality())
+        sampled, exact = (
+            recording.eval.all_metrics(),
+            list(recording.table(schema.OPTIMALITY_TOPIC).decoded()),
+        )
     assert [each["episode"] for each in exact] == [0, 100, 200]
     for trials, measures in zip(sampled, exact, strict=True):
         assert measures["starts"] == starts

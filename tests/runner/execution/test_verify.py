@@ -207,7 +207,7 @@ def test_an_interrupted_recording_is_compared_to_its_end(run, tmp_path):
     repair(cut)
     with open_recording(cut) as recording:
         assert "result" not in survey(cut, keep_result=True).metadata
-        last = len(recording.metrics("train")) - 1
+        last = len(recording.train.all_metrics()) - 1
         counts = recording.train.steps.count(), recording.eval.steps.count()
     found = verify(cut)
     assert found.sound, found.finding

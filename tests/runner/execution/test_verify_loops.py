@@ -29,7 +29,7 @@ def forged(source, target, topics=None, result=None):
     """Return a recording with topics changed, by name, whose result says what its messages come to."""
     for k, (name, change) in enumerate((topics or {}).items()):
         with open_recording(source) as recording:
-            topic = recording.topic(name)
+            topic = recording.table(name).topic
         source = altered(source, target.with_name(f"{k}-{target.name}"), topic, change)
     with open_recording(source) as recording:
         digest, counts = ContentHash(), {}

@@ -48,10 +48,10 @@ def test_a_rerun_in_another_environment_diverges(tmp_path, monkeypatch):
 def described_as(source, target, change):
     """Rewrite a recording with another description of its environment; return its path."""
     with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
-        for name in recording.metadata_names:
+        for name in recording.file.metadata_names:
             if name != "result":
-                file.add_metadata(name, recording.metadata(name))
-        for name, media_type, data in recording.attachments():
+                file.add_metadata(name, recording.file.metadata(name))
+        for name, media_type, data in recording.file.attachments():
             if name == "environment.json":
                 stored = json.loads(data)
                 change(stored)
@@ -62,7 +62,7 @@ def described_as(source, target, change):
             data = source.read_bytes()[entry.offset :][: entry.length]
             chunk = read_record(RawRecord.of(data, entry.offset, data[9:]))
             file.add_chunk(encode_chunk(chunk.topic, chunk.records, chunk.times, chunk.offsets, Packing()))
-        file.finish("result", recording.metadata("result"))
+        file.finish("result", recording.file.metadata("result"))
     return target
 
 

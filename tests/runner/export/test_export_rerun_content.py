@@ -85,7 +85,7 @@ class TestSteps:
             assert table["episode"] == steps["episode"].tolist()
         else:
             trials = exported.recording.config["evaluation"]["trials"]
-            after = [row["episode"] for row in exported.recording.metrics("eval")]
+            after = [row["episode"] for row in exported.recording.eval.all_metrics()]
             assert table["episode"] == [after[k // trials] for k in steps["episode"].tolist()]
 
     def test_rewards(self, exported, phase):
@@ -177,7 +177,7 @@ class TestSteps:
             happened = events_of(mdp, steps) >> bit & 1
             assert sum(text.startswith("collision") for text in lines) == happened.sum()
         if phase == "eval":
-            results = len(exported.recording.metrics("eval"))
+            results = len(exported.recording.eval.all_metrics())
             assert sum(text.startswith("evaluation after") for text in lines) == results
 
 
@@ -194,7 +194,7 @@ def test_the_labels_of_movers_show_illegal_actions(exported):
 
 
 def test_every_metric_is_there(exported):
-    metrics = exported.recording.metrics("eval")
+    metrics = exported.recording.eval.all_metrics()
     assert exported.table("/eval/metrics/mean_length")["Scalars:scalars"] == [
         [row["eval_mean_length"]] for row in metrics
     ]
@@ -220,7 +220,7 @@ def test_means_between_reports_are_of_the_episodes_that_ended_there(exported):
     recording = exported.recording
     episodes = recording.train.episodes.array()
     reports = sorted(
-        [*recording.metrics("train"), *recording.metrics("eval")], key=lambda row: row["log_time"]
+        [*recording.train.all_metrics(), *recording.eval.all_metrics()], key=lambda row: row["log_time"]
     )
     table = exported.table("/train/metrics/mean_penalties")
     found = dict(zip(table["step"], (value for (value,) in table["Scalars:scalars"]), strict=True))

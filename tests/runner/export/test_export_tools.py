@@ -104,8 +104,8 @@ def assert_measures(run, metrics):
             for found in measures(recording)
             for name, value in found.values.items()
         ]
-        (last,) = recording.metrics("eval")[-1:]
-        (exact,) = list(recording.optimality())[-1:]
+        (last,) = recording.eval.all_metrics()[-1:]
+        (exact,) = list(recording.table(schema.OPTIMALITY_TOPIC).decoded())[-1:]
     assert (
         list(zip(*(metrics[c] for c in ("phase", "step", "episode", "metric", "value")), strict=True))
         == expected

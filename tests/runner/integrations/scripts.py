@@ -53,5 +53,5 @@ def arrays(run):
 
 def images(run):
     with runner.open_recording(run.recording) as recording:
-        topic = recording.topic("/image")
+        topic = recording.table("/image").topic
         return [(each["frame_id"], each["format"], each["data"]) for each in recording.table(topic).decoded()]

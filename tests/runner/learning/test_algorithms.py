@@ -168,8 +168,8 @@ def test_a_policy_that_draws_is_measured_exactly(algorithm, tmp_path):
     evaluation = {"every": 20, "trials": 400, "exact": True}
     done = make_run(tmp_path, values, seed=2, evaluation=evaluation, recording={"steps": "none"})
     with open_recording(done.recording) as recording:
-        exact = list(recording.optimality())[-1]
-        sampled = list(recording.metrics("eval"))[-1]
+        exact = list(recording.table(schema.OPTIMALITY_TOPIC).decoded())[-1]
+        sampled = list(recording.eval.all_metrics())[-1]
     assert exact["success_percent"] == pytest.approx(sampled["success_percent"], abs=7.5)
     gains = [best - own for own, best in zip(exact["values"], exact["best_responses"], strict=True)]
     assert min(gains) > -1e-9

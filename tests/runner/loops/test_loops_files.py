@@ -18,6 +18,7 @@ import runner
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.metadata import kind_of
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
@@ -53,7 +54,7 @@ def test_the_official_reader_reads_every_message(whole):
             if message.channel.topic == "/train/step" and first is None:
                 first = message.decoded_message
     with open_recording(path) as recording:
-        assert recording.kind == KINDS[name]
+        assert kind_of(recording.run) == KINDS[name]
         assert counts.pop("/clock") >= 2  # where it began, and where it ended
         counts.pop("/host", None)  # of a loop that takes over a second
         assert dict(counts) == recording.result["messages"]
@@ -75,7 +76,7 @@ def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     damaged = tmp_path / "recording.mcap"
     data = bytearray(path.read_bytes())
     with open_recording(path) as recording:
-        topic = recording.topic("/train/step")
+        topic = recording.table("/train/step").topic
         before = recording.table(topic).count()
         entry = recording.table(topic).entry(1 if KINDS[name] != "variable" else 0)
     at = entry.offset + entry.length - 40

@@ -102,7 +102,7 @@ def make_pole() -> Any:
 def maker_of(rec: Any, phase: str = "train") -> EnvironmentMaker:
     rec.close()
     with open_recording(rec.run.recording) as recording:
-        found = recording.maker_of(phase)
+        found = recording.phase(phase).maker_of()
     assert found is not None
     return found
 
@@ -348,7 +348,7 @@ def test_actions_are_named_as_long_as_they_are_the_environments_own(env, names, 
     with runner.record(env(), tmp_path) as rec:
         pass
     with open_recording(rec.run.recording) as recording:
-        assert recording.action_names("train") == names
+        assert recording.train.action_names() == names
 
 
 def test_the_environments_of_a_vector_have_names_of_actions(tmp_path):
@@ -366,7 +366,7 @@ def test_the_agents_of_a_game_have_names_of_actions(tmp_path):
             rec.step(dict(zip(rec.agents, (0, 2, 4), strict=True)))
     with open_recording(rec.run.recording) as recording:
         assert recording.action_names("train", "agent_1") == ("no action", "left", "right", "down", "up")
-        assert recording.action_names("train") == ()
+        assert recording.train.action_names() == ()
         described, _ = describer(recording, "train")(next(recording.train.transitions()))
         (first, *_) = Episode(recording, named_episode(recording, "train", 0), "").steps()
     assert described == "agent 0 no action, agent 1 right, agent 2 up"

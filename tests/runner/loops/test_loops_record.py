@@ -23,6 +23,7 @@ from runner.errors import ConfigError, EnvironmentNotUsable, RecordingError, Run
 from runner.loops.media import Histogram, Image
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
+from runner.recording.metadata import kind_of
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
@@ -79,7 +80,7 @@ def test_steps_have_the_values_of_the_loop(loop):
     steps = [entry for entry in seen if entry[0] == "step"]
     with open_recording(path) as recording:
         found = list(recording.train.transitions())
-        after = "next_state" if recording.kind == "step" else "next_observation"
+        after = "next_state" if kind_of(recording.run) == "step" else "next_observation"
     assert len(found) == len(steps) == STEPS
     for one, (_, action, observation, reward, terminated, truncated, _) in zip(found, steps, strict=True):
         assert agree(one["action"], action)
@@ -294,7 +295,7 @@ def test_a_killed_loop_leaves_its_steps(tmp_path, end, status):
         assert len(steps) == (3000 if killed else 3001)
         assert [int(one["step"]) for one in steps] == list(range(len(steps)))
         assert sum(1 for _ in recording.table(schema.SCALAR_TOPIC).decoded()) == 3000
-        assert recording.finished != killed
+        assert recording.file.finished != killed
     if killed:
         from runner.recording.repair import repair
 

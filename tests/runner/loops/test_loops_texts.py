@@ -14,6 +14,7 @@ import runner
 from runner.cli import cli
 from runner.errors import ConfigError, RecordingError
 from runner.execution.verify import check_integrity, verify
+from runner.recording.description import environment_count
 from runner.recording.reader import open_recording
 from runner.recording.spaces import decode
 from runner.replay.environment import redo
@@ -113,7 +114,7 @@ def test_vectors_of_texts_share_a_run(tmp_path):
     outcome = verify(envs.run.recording)
     assert outcome.sound, outcome.reason
     with open_recording(envs.run.recording) as recording:
-        assert recording.own_environments == 2 * ENVIRONMENTS
+        assert environment_count(recording) == 2 * ENVIRONMENTS
 
 
 @pytest.mark.parametrize("name", SPACES)

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from runner.analysis.evaluations import evaluation_records
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.description import recorded_facts
 from runner.recording.reader import open_recording
 from runner.recording.record_store import RecordStore
 from tests.runner.recording.making import LAKE, make_run
@@ -88,23 +89,23 @@ def test_an_episode_that_is_not_there_is_refused(number, recording):
 
 
 def test_the_recording_describes_itself(recording, taxis):
-    facts = recording.run_facts()
+    facts = recorded_facts(recording)
     for key in ("run_id", "name", "seed", "status", "created", "config"):
         assert facts[key] == taxis.facts[key], key
     assert facts["summary"] == {
         key: value for key, value in taxis.summary.items() if key not in ("seconds", "bytes")
     }
-    assert recording.finished
-    assert recording.size == taxis.recording.stat().st_size == taxis.summary["bytes"]
+    assert recording.file.finished
+    assert recording.file.size == taxis.recording.stat().st_size == taxis.summary["bytes"]
     assert recording.mdp.agents == ("taxi_1", "taxi_2")
 
 
-def test_metrics_of_no_phase_are_refused(tmp_path):
+def test_no_other_phase_is_read(tmp_path):
     with (
         open_recording(make_run(tmp_path, LAKE).recording) as opened,
         pytest.raises(ValueError, match="found phase 'bogus', expected one of: train, eval"),
     ):
-        opened.metrics("bogus")
+        opened.phase("bogus")
 
 
 def test_a_metric_that_the_recording_was_made_without_is_unknown(taxis, tmp_path):
@@ -114,7 +115,7 @@ def test_a_metric_that_the_recording_was_made_without_is_unknown(taxis, tmp_path
     assert name_and_number in data
     old.write_bytes(data.replace(name_and_number, b"mean_penalties\x18\x63"))
     with open_recording(taxis.recording) as now, open_recording(old) as then:
-        for expected, found in zip(now.metrics("eval"), then.metrics("eval"), strict=True):
+        for expected, found in zip(now.eval.all_metrics(), then.eval.all_metrics(), strict=True):
             assert np.isnan(found.pop("mean_penalties"))
             assert expected.pop("mean_penalties") >= 0
             assert repr(found) == repr(expected)  # as NaN is not equal to itself

@@ -16,6 +16,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.recording import schema
+from runner.recording.description import recorded_facts
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
@@ -51,12 +52,12 @@ def all_messages(recording) -> dict[str, list]:
 def everything(path: Path) -> dict[str, list]:
     """Read all there is in a recording, and return its messages."""
     with open_recording(path) as recording:
-        recording.run_facts()
+        recorded_facts(recording)
         assert recording.config
         assert recording.provenance
         assert recording.mdp.states
-        recording.metrics("train")
-        recording.metrics("eval")
+        recording.train.all_metrics()
+        recording.eval.all_metrics()
         list(recording.snapshots())
         return all_messages(recording)
 
@@ -90,7 +91,7 @@ def test_a_file_cut_off_at_any_byte_gives_the_messages_before_the_cut(cuttable, 
             unusable.remove(cut)  # raises ValueError, and fails, if what is described there should open
             continue
         with recording:
-            assert not recording.finished
+            assert not recording.file.finished
             found = all_messages(recording)
         for topic, expected in messages.items():
             assert found[topic] == expected[: len(found[topic])], f"{topic} of a file cut at {cut}"
@@ -109,7 +110,7 @@ def test_a_cut_file_has_the_status_interrupted(lake, tmp_path):
     last_chunk = max(start for opcode, start, _ in records_of(data) if opcode == CHUNK)
     path.write_bytes(data[: last_chunk + 5])
     with open_recording(path) as recording:
-        facts = recording.run_facts()
+        facts = recorded_facts(recording)
         assert (facts["status"], facts["summary"]) == ("interrupted", {})
         assert (facts["run_id"], facts["config"]) == (lake.run_id, lake.facts["config"])
         assert recording.result == {}

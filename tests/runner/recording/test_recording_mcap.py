@@ -68,7 +68,7 @@ def test_the_official_reader_gives_every_message_as_ours_does(run):
                 assert found == ours[field.name].tolist(), f"{topic.name} {field.name}"
         kinds = {topic.name: topic for topic in schema.KINDS["job"]}
         for phase, name in (("train", "/train/metrics"), ("eval", "/eval/metrics")):
-            ours = recording.metrics(phase)
+            ours = recording.phase(phase).all_metrics()
             assert len(ours) == len(messages[name])
             for mine, (message, decoded) in zip(ours, messages[name], strict=True):
                 assert mine.pop("log_time") == message.log_time
@@ -169,9 +169,9 @@ def test_attachments_and_metadata_are_found_by_the_official_reader(taxis):
         attachments = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
         metadata = {record.name: record.metadata for record in reader.iter_metadata()}
         assert {"environment.json", "environment/next_state.npy.zst"} <= set(attachments)
-        assert attachments == {name: recording.attachment(name) for name in attachments}
+        assert attachments == {name: recording.file.attachment(name) for name in attachments}
         assert set(metadata) == {"run", "config", "provenance", "result"}
-        assert metadata == {name: recording.metadata(name) for name in metadata}
+        assert metadata == {name: recording.file.metadata(name) for name in metadata}
 
 
 @pytest.mark.skipif(not RERUN.exists(), reason="the rerun command is not installed")

@@ -63,10 +63,10 @@ def test_measures_and_tables_have_the_time_of_the_last_step_before_them(recordin
     training = all_of(recording, schema.TRAIN_STEP)
     evaluated = all_of(recording, schema.EVAL_STEP) if recording.eval.steps.count() else training[:0]
     times = np.sort(np.concatenate([training["log_time"], evaluated["log_time"]]))
-    assert recording.metrics("train"), "the case must have measures of training"
-    for metrics in recording.metrics("train"):
+    assert recording.train.all_metrics(), "the case must have measures of training"
+    for metrics in recording.train.all_metrics():
         assert metrics["log_time"] == training["log_time"][metrics["step"] - 1]
-    for number, metrics in enumerate(recording.metrics("eval")):
+    for number, metrics in enumerate(recording.eval.all_metrics()):
         trials = evaluated["episode"] // metrics["trials"]
         assert metrics["evaluation"] == number
         assert metrics["log_time"] == evaluated["log_time"][trials == number][-1]

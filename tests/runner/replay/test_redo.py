@@ -300,7 +300,7 @@ def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp
             time.sleep(0.5)  # the loop is flushed twice a second
             shutil.copy(env.run.recording, killed)
             with contextlib.suppress(RecordingError), open_recording(killed) as recording:
-                recorded, has_maker = counted(killed), recording.has_own_maker("eval")
+                recorded, has_maker = counted(killed), recording.eval.own_maker is not None
     steps, difference = redone(killed)
     assert difference is None
     assert sum(recorded) - 60 < steps <= sum(recorded)

@@ -158,7 +158,7 @@ def test_a_recording_that_was_cut_by_a_kill_is_done_again_as_far_as_it_goes(pole
         cut = tmp_path / f"{share}.mcap"
         cut.write_bytes(data[: int(share * len(data))])
         with open_recording(cut) as recording:
-            if recording.has_steps:
+            if any(phase.steps for phase in recording.phases):
                 done.append(redone(cut))
     assert done
     assert all(difference is None for _, difference in done)

@@ -84,8 +84,8 @@ def dualtaxi(folder: Path, *words: str) -> str:
 
 def code_of(path: Path) -> tuple[dict[str, str], Code]:
     with open_recording(path) as recording:
-        assert "provenance" in recording.metadata_names
-        return recording.metadata(CODE_RECORD), recording.code
+        assert "provenance" in recording.file.metadata_names
+        return recording.file.metadata(CODE_RECORD), recording.code
 
 
 # --- jobs --------------------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_the_code_does_not_change_the_content(project):
     runs = [job_in(project), job_in(project, recording={"code": False})]
     assert len({run.summary["content_digest"] for run in runs}) == 1
     with open_recording(runs[1].recording) as recording:
-        assert CODE_RECORD not in recording.metadata_names
+        assert CODE_RECORD not in recording.file.metadata_names
         assert recording.code == Code()
         assert "command" not in recording.provenance
 
@@ -148,8 +148,8 @@ def test_an_anonymous_file_has_no_code(project, tmp_path):
     run = job_in(project)
     there = export_mcap(run, tmp_path / "one.mcap", anonymous=True).path
     with open_recording(there) as recording:
-        assert CODE_RECORD not in recording.metadata_names
-        assert CODE_ATTACHMENT not in recording.attachment_names
+        assert CODE_RECORD not in recording.file.metadata_names
+        assert CODE_ATTACHMENT not in recording.file.attachment_names
         assert not any(key.startswith("git") for key in recording.provenance)
         assert recording.provenance["package.numpy"]
     assert b"example.org:ann" not in there.read_bytes()

@@ -118,7 +118,7 @@ def test_no_mark_is_in_the_recording_and_the_key_is_for_its_user_alone(own):
     key = Path(os.environ["XDG_DATA_HOME"], "dualtaxi", KEY_FILE)
     assert (key.stat().st_mode & 0o777, key.stat().st_size) == (0o600, 32)
     with open_recording(own / "recording.mcap") as recording:
-        assert not [name for name in recording.metadata_names if "trust" in name]
+        assert not [name for name in recording.file.metadata_names if "trust" in name]
 
 
 def test_processes_that_make_a_key_at_once_have_the_same_one(tmp_path):

@@ -108,7 +108,7 @@ def test_a_range_after_the_end_is_empty_and_a_too_long_one_refused(client):
 def test_metrics_are_complete_or_marked_as_thinned(client, recording):
     curves = client.get(f"{RUN}/metrics").json()["curves"]
     finish = next(curve for curve in curves if curve["metric"] == "success_percent")
-    recorded = [record["success_percent"] for record in recording.metrics("eval")]
+    recorded = [record["success_percent"] for record in recording.eval.all_metrics()]
     assert finish["values"] == recorded
     assert not finish["thinned"]
     params = {"points": 2, "metric": "success_percent"}
@@ -126,7 +126,7 @@ def test_metrics_are_read_over_any_axis_that_the_run_has(client, recording):
     over_steps = client.get(f"{RUN}/metrics", params={"axis": "steps", "metric": "success_percent"}).json()
     assert [axis["name"] for axis in over_steps["axes"]] == ["episodes", "steps", "updates", "time"]
     (curve,) = over_steps["curves"]
-    assert curve["positions"] == [record["step"] for record in recording.metrics("eval")]
+    assert curve["positions"] == [record["step"] for record in recording.eval.all_metrics()]
     refused = client.get(f"{RUN}/metrics", params={"axis": "stops"})
     assert refused.status_code == 400
     assert "Did you mean 'steps'" in refused.json()["error"]["message"]
