@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.clock import read_clock
-from runner.recording.description import has_environment
 from runner.recording.reader import Recording
+from runner.recording.run_file import has_environment
 from runner.recording.schema import STEP_NANOSECONDS
 
 Values = NDArray[np.float64]

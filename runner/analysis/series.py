@@ -21,10 +21,10 @@ from runner.analysis.evaluations import (
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import RunnerError, shortened
 from runner.recording import schema
-from runner.recording.description import has_environment
 from runner.recording.messages import Message
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording, open_recording
+from runner.recording.run_file import has_environment
 from runner.util.humanize import counted
 from runner.util.values import JsonView
 

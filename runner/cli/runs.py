@@ -14,7 +14,7 @@ from runner.archive.places import at_hand
 from runner.cli.output import draw, facts, print_json, say
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import RecordingError, RunnerError, RunNotFound
-from runner.recording.description import has_environment
+from runner.recording.run_file import has_environment
 from runner.runs.resolve import find_run, find_runs
 from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, recordings_folder
 from runner.runs.shards import are_over, shards_in_words

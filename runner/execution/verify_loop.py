@@ -15,10 +15,10 @@ from runner.execution.verification import (
 )
 from runner.recording import schema
 from runner.recording.consistency import Findings, Inconsistent, check_extras, check_phase
-from runner.recording.description import has_environment
 from runner.recording.digest import combined_digest
 from runner.recording.reader import Recording
 from runner.recording.rewriting import content_hash
+from runner.recording.run_file import has_environment
 from runner.runs.checkpoints import read_checkpoints
 
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
-from runner.recording.description import has_environment
 from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
+from runner.recording.run_file import has_environment
 from runner.util.values import flatten, is_whole
 
 ENDINGS: Final = {

@@ -10,8 +10,8 @@ from gymnasium.spaces import Discrete
 from runner.loops.description import Described
 from runner.loops.loop import Loop
 from runner.loops.options import PACKING, options_of
-from runner.recording.description import NO_ENVIRONMENT
 from runner.recording.maker import EnvironmentMaker
+from runner.recording.run_file import NO_ENVIRONMENT
 
 _NO_ENVIRONMENT: Final = Described("step", Discrete(1), Discrete(1), env_id=NO_ENVIRONMENT)
 _NOT_MADE: Final = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")

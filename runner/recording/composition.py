@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from runner.errors import shortened
-from runner.recording.description import has_environment
 from runner.recording.reader import Recording
+from runner.recording.run_file import has_environment
 from runner.util.values import JsonView, is_whole
 
 _CHANGE_NOTHING: Final = frozenset(

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Protocol
 
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
@@ -31,15 +31,7 @@ from runner.recording.metadata import (
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.schema import KINDS, Q_TABLE_TOPIC, Topic
-from runner.util.values import Json, JsonView
-
-NO_ENVIRONMENT: Final = "none"
-"""The environment's id in the configuration of a run of logged values alone."""
-
-
-def has_environment(config: JsonView) -> bool:
-    """Return whether a run of this configuration has an environment, and not logged values alone."""
-    return config.get("env") != {"id": NO_ENVIRONMENT, "kwargs": {}}
+from runner.util.values import Json
 
 
 class Records(Protocol):

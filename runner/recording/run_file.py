@@ -21,10 +21,17 @@ from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
 """The statuses that a run's owner writes."""
 RUN_ID: Final = re.compile(r"[\w.-]{1,100}")
+NO_ENVIRONMENT: Final = "none"
+"""The environment's id in the configuration of a run of logged values alone."""
 
 _LARGEST: Final = 2**62
 _QUOTED: Final = 60
 """Characters of a wrong value that a problem quotes."""
+
+
+def has_environment(config: JsonView) -> bool:
+    """Return whether a run of this configuration has an environment, and not logged values alone."""
+    return config.get("env") != {"id": NO_ENVIRONMENT, "kwargs": {}}
 
 
 class Check(NamedTuple):

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RecordingError, RunNotFound, StorageError
-from runner.recording.description import recorded_facts
 from runner.recording.run_file import RUN_ID
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, made_by, recordings_folder
 from runner.util.files import read_object
@@ -93,6 +92,7 @@ def _is_run(facts: dict[str, object]) -> bool:
 
 
 def _from_recording(path: Path) -> Run:
+    from runner.recording.description import recorded_facts
     from runner.recording.reader import open_recording
 
     with open_recording(path) as recording:

@@ -29,9 +29,10 @@ from PIL import Image
 
 from runner.recording import schema
 from runner.recording.actions import COLUMNS as KEPT_COLUMNS
-from runner.recording.description import environment_count, has_environment
+from runner.recording.description import environment_count
 from runner.recording.messages import frame_place
 from runner.recording.reader import Recording, open_recording
+from runner.recording.run_file import has_environment
 
 Column = NDArray[Any]
 """The values of a column, [rows, ...]; texts as objects."""

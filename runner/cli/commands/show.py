@@ -116,8 +116,8 @@ def _print_code(run: Run, as_json: bool) -> None:
 def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:
     from runner.analysis.summary import brief_provenance
     from runner.cli.evaluations import evaluation_table
-    from runner.recording.description import has_environment
     from runner.recording.reader import open_recording
+    from runner.recording.run_file import has_environment
 
     run = details.run
     parts: list[RenderableType] = [facts(_head(details))]
@@ -173,7 +173,7 @@ def _draw_random_policy(run: Run) -> None:
 
 
 def _head(details: RunDetails) -> dict[str, str]:
-    from runner.recording.description import has_environment
+    from runner.recording.run_file import has_environment
 
     run, summary, origin = details.run, details.run.summary, origin_in(details.config)
     took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"

@@ -29,10 +29,9 @@ from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, embedded, render, templates
 from runner.recording.composition import composition_of
-from runner.recording.description import has_environment
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
-from runner.recording.run_file import RecentTraining
+from runner.recording.run_file import RecentTraining, has_environment
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,9 @@ from runner.analysis.qtable import recorded_tables
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.composition import composition_of
-from runner.recording.description import has_environment
 from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics, Summary
+from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
 from runner.runs.run import Run
 from runner.service.pages.rendering import page
 from runner.util import humanize

@@ -19,11 +19,10 @@ from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
 from runner.client.jobs import RunProgress
 from runner.errors import RecordingError, RunnerError
-from runner.recording.description import has_environment
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics, RecentTraining
+from runner.recording.run_file import EvaluationMetrics, RecentTraining, has_environment
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
 from runner.service import fragments

@@ -141,7 +141,7 @@ def test_a_restored_loop_has_chunks_like_those_of_the_recorder(loop, tmp_path):
     back = tmp_path / "back.mcap"
     restore(folder, back)
     with open_recording(back) as restored, open_recording(path) as recording:
-        assert len(restored._index.chunks) <= len(recording._index.chunks)
+        assert len(restored.file.index.chunks) <= len(recording.file.index.chunks)
 
 
 def test_every_table_is_read_by_others(loop):
@@ -255,7 +255,7 @@ def test_agents_have_columns_of_their_own(tmp_path):
 def test_what_a_killed_loop_left_comes_back(tmp_path):
     path = LOOPS["texts"](tmp_path)
     with open_recording(path) as recording:
-        chunks = recording._index.chunks
+        chunks = recording.file.index.chunks
         cut = sum(chunks[len(chunks) - 3][:2])
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(path.read_bytes()[: cut + 11])

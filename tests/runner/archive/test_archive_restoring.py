@@ -69,7 +69,7 @@ def test_another_environment_without_scene_or_events_comes_back(tmp_path):
 
 def test_what_a_killed_run_left_comes_back(run, tmp_path):
     with open_recording(run.recording) as recording:
-        chunks = recording._index.chunks
+        chunks = recording.file.index.chunks
         cut = sum(chunks[len(chunks) - 6][:2])
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(run.recording.read_bytes()[: cut + 11])

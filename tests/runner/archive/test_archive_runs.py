@@ -209,7 +209,7 @@ def test_a_killed_run_is_archived_and_restored(run, recordings, command):
     """Its `run.json` says for ever that it is running, by a process that is gone."""
     folder = recordings / run.run_id
     with open_recording(folder / "recording.mcap") as recording:
-        chunks = recording._index.chunks
+        chunks = recording.file.index.chunks
         cut = sum(chunks[len(chunks) - 6][:2])
     left = (folder / "recording.mcap").read_bytes()[: cut + 11]
     (folder / "recording.mcap").write_bytes(left)
