@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import NO_LIMIT, blocks, tutorial_learner
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, record_dtype
+from runner.recording.blocks import HEADER_BYTES
+from runner.recording.layout import layout_of
 from runner.recording.messages import file_descriptor_set
 from runner.recording.recorder import Recorder
 from runner.recording.writer import RecordingFile
@@ -83,8 +84,8 @@ def wire_messages(records: NDArray[Any]) -> list[tuple[int, bytes]]:
 def record(path: Path, records: NDArray[Any], packing: Packing) -> None:
     """Hand step records to the recorder, block by block, as a learner does."""
     raw, size = records.view(np.uint8), records.itemsize
-    with RecordingFile(path) as file:
-        recorder = Recorder(file, {schema.TRAIN_STEP: record_dtype(schema.STEP, 1)}, packing)
+    with RecordingFile(path, layout_of("job", 1, 0)) as file:
+        recorder = Recorder(file, layout_of("job", 1, 0), packing)
         done = 0
         while done < len(records):
             block = recorder.block(schema.TRAIN_STEP)

@@ -12,7 +12,8 @@ from runner.config import load
 from runner.environments.loading import load_mdp
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_dtype
+from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 
 BLOCK_STEPS = 16_384
 """The default of `recording.chunk_steps`."""
@@ -31,7 +32,7 @@ def blocks(learner: Learner, phase: str, steps: int = BLOCK_STEPS) -> tuple[NDAr
     topics = [topic for topic in schema.BLOCK_TOPICS if topic.phase == phase]
     learners, events = len(learner.agents), len(learner.mdp.event_names)
     step_block, episode_block = (
-        blank_records(topic, topic_dtype(topic, learners, events), n).view(np.recarray)
+        blank_records(topic, layout_of("job", learners, events).message(topic), n).view(np.recarray)
         for topic, n in zip(topics, (steps, BLOCK_EPISODES), strict=True)
     )
     return step_block, episode_block

@@ -207,7 +207,7 @@ def step_columns(
         )
     if episode is None:
         blocks = [block.copy() for block in steps.blocks(start, stop)]
-        records = np.concatenate([np.empty(0, steps.dtype), *blocks])
+        records = np.concatenate([np.empty(0, steps.row_dtype), *blocks])
     else:
         records = steps_of(recording, phase, episode)
     names = records.dtype.names or ()

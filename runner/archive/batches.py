@@ -73,7 +73,7 @@ class Batches:
         if topic.message is schema.EXTRA:
             yield from self._recording.phase(topic.phase).extras.blocks()
         elif not self.shape.dtypes[topic].hasobject:
-            yield from self._recording.table(topic).blocks()
+            yield from self._recording.table(topic).stored()
         else:
             messages, size = [], 0
             for time, payload in self._recording.table(topic).messages():

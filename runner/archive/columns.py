@@ -16,10 +16,10 @@ from runner.archive.layout import TEXT
 from runner.archive.values import Column, SpaceColumns, nullable, numbers, stored
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import FIXED
+from runner.recording.blocks import record_dtype
 from runner.recording.description import RunDescription
 from runner.recording.extras import ExtraLayout
-from runner.recording.metadata import dtypes_of
+from runner.recording.layout import NUMBERS
 from runner.recording.schema import Field, MessageType, Topic
 from runner.util.arrays import Array, Records
 
@@ -80,12 +80,15 @@ class Shape:
         if not run.can_train_again:
             for name in ("action", "next_observation", "observation"):
                 self.spaces[name] = SpaceColumns(run.spaces[name.removeprefix("next_")], name, where)
-        self.dtypes = {topic: self._varying(topic.message) for topic in run.topics} | dtypes_of(
-            run.run, where
-        )
-        """The dtype of each topic's records: message records, or those of `_varying`."""
+        self.messages = {topic: run.layout.message(topic) for topic in run.topics}
+        """The type of each topic's messages; of extras, the last one."""
         if extras:
-            self.dtypes |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].record)
+            self.messages |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].message)
+        self.dtypes = {
+            topic: dtype if (dtype := record_dtype(message)) is not None else self._varying(message)
+            for topic, message in self.messages.items()
+        }
+        """The dtype of each topic's records: message records, or those of `_varying`."""
 
     def _varying(self, message: MessageType) -> np.dtype[np.void]:
         """Return the dtype of messages of varying size: time, bytes of the message record, and fields."""
@@ -93,9 +96,9 @@ class Shape:
         def held(field: Field) -> object:
             if field.name in self.spaces:
                 return self.spaces[field.name].dtype
-            if field.repeated:
-                return ("<f8", len(self.learners)) if message is schema.TRANSITION else object
-            return FIXED[field.kind][0] if field.kind in FIXED else object
+            if field.dtype is not None:
+                return field.dtype
+            return object if field.repeated else NUMBERS.get(field.kind, object)
 
         head = [("log_time", "<u8"), ("publish_time", "<u8"), ("record", object)]
         return np.dtype([*head, *((field.name, held(field)) for field in message.fields)])
@@ -107,7 +110,7 @@ class Shape:
         for name, topic_names in layout.TOPICS.items():
             topics = tuple(topic for topic in self._topics if topic.name in topic_names)
             if topics and (name != layout.EXTRAS or self.extras):
-                tables[name] = Table(name, topics, tuple(self._columns_of(topics[0].message)))
+                tables[name] = Table(name, topics, tuple(self._columns_of(topics[0])))
         return tables
 
     def per_learner(self, name: str) -> list[str]:
@@ -124,12 +127,13 @@ class Shape:
         """The columns that count events, such as `n_taxi_1_drop_off`."""
         return _names("n_", self._events)
 
-    def _columns_of(self, message: MessageType) -> list[Column]:
-        fields = {field.name: field for field in message.fields}
+    def _columns_of(self, topic: Topic) -> list[Column]:
+        fields = {field.name: field for field in self.messages[topic].fields}
         return [
             column
-            for name in layout.FIELDS.get(message, fields)
-            for column in self._columns_of_field(message, fields[name])
+            for name in layout.FIELDS.get(topic.message, fields)
+            if name in fields
+            for column in self._columns_of_field(topic.message, fields[name])
         ]
 
     def _columns_of_field(self, message: MessageType, field: Field) -> list[Column]:
@@ -140,9 +144,9 @@ class Shape:
             return [stored(event, _INT32, _item(name, i)) for i, event in enumerate(self.event_columns)]
         if name == "explored":
             return self._explored()
-        if field.kind == Pb.TYPE_BYTES and name in self.spaces:
+        if field.is_value or (message is schema.EXTRA and name in self.spaces):
             return self.spaces[name].columns
-        column = stored(field.stored_name, _type_of(field), lambda records: records[name])
+        column = stored(name, _type_of(field), lambda records: records[name])
         if name == "seed":
             column = nullable(column, lambda records: records["seeded"])
         own = self.own_actions if message is schema.STEP and name == "action" else []

@@ -76,18 +76,9 @@ FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
         "state",
         "action",
         "next_state",
-        "rewards",
-        "explored",
-        "terminated",
-        "truncated",
-    ),
-    schema.TRANSITION: (
-        "step",
-        "episode",
-        "t",
-        "action",
         "next_observation",
         "rewards",
+        "explored",
         "terminated",
         "truncated",
         "acted",
@@ -111,7 +102,7 @@ FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
     schema.SCALAR: ("phase", "name", "step", "episode", "value"),
     schema.IMAGE: ("format", "data", FRAME_ID),
 }
-"""The fields of messages in the order of their columns; those of other messages stand in their own."""
+"""The fields that messages may have, in the order of their columns; other messages keep their own order."""
 Q_TABLE_COLUMNS: Final = pa.schema(
     [
         ("run_id", TEXT),

@@ -55,7 +55,7 @@ def restore(
         _Restorer(archive, None, report).restore()
         return archive.manifest
     try:
-        with storage_errors(path), RecordingFile(path, archive.topics) as file:
+        with storage_errors(path), RecordingFile(path, archive.layout) as file:
             _Restorer(archive, file, report).restore()
         with open_recording(path):  # raises if it cannot be read
             pass
@@ -127,7 +127,7 @@ class _Restorer:
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
         archive, topics = self._archive, table.topics
-        rows = capacity_of(topics[0], self._shape.dtypes[topics[0]], self._chunk_steps)
+        rows = capacity_of(topics[0], self._shape.messages[topics[0]], self._chunk_steps)
         if self._shape.dtypes[topics[0]].hasobject:
             has_bytes = any(map(pa.types.is_binary, table.columns.types))
             rows = 1 if has_bytes else min(rows, _ROWS_AT_ONCE)

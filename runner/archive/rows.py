@@ -19,7 +19,7 @@ from runner.archive.values import numbers
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, blank_records, message_record
 from runner.recording.messages import Message, decode, encode, encode_image, encode_log, log_level
-from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 from runner.util.arrays import Records
 
 _TICK: Final = np.uint64(STEP_NANOSECONDS)
@@ -54,15 +54,20 @@ def records_of(table: Table, topic: Topic, batch: pa.RecordBatch, shape: Shape) 
     if len(positions) and not 0 <= positions.min() <= positions.max() < _MAX_POSITION:
         raise ValueError(f"after {positions.min()} to {positions.max()} steps")
     times = positions.astype(np.uint64) * _TICK
-    layouts = [(0, shape.dtypes[topic])]
+    layouts = [(0, shape.messages[topic])]
     if topic.message is schema.EXTRA:
-        layouts = [(layout.start_time, layout.record) for layout in shape.extras]
+        layouts = [(layout.start_time, layout.message) for layout in shape.extras]
     starts = np.array([start for start, _ in layouts], np.uint64)
     numbers_of_layouts = np.searchsorted(starts, times, "right") - 1
     for k in np.unique(numbers_of_layouts).tolist():
         mine = numbers_of_layouts == k
         rows = batch if mine.all() else batch.filter(pa.array(mine))
-        records = blank_records(topic, layouts[k][1], rows.num_rows)
+        dtype = shape.dtypes[topic]
+        records = (
+            np.zeros(rows.num_rows, dtype)
+            if dtype.hasobject
+            else blank_records(topic, layouts[k][1], rows.num_rows)
+        )
         records["log_time"] = records["publish_time"] = times[mine]
         for column in table.messages:
             if column.write is not None:
@@ -90,7 +95,7 @@ def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
     """Return records with the fields of their messages."""
     rows = []
     for time, record in records[["log_time", "record"]].tolist():
-        values = decode(topic.message, record[HEADER_BYTES:])
+        values = decode(shape.messages[topic], record[HEADER_BYTES:])
         if topic.message is schema.LOG:
             values["level"] = log_level(values["level"])
         for name in values.keys() & shape.spaces.keys():
@@ -101,22 +106,22 @@ def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
 
 def _encode(topic: Topic, records: Records, shape: Shape) -> None:
     """Set the messages of records to those of their fields."""
-    columns = {field.name: records[field.name].tolist() for field in topic.message.fields}
+    columns = {field.name: records[field.name].tolist() for field in shape.messages[topic].fields}
     for name in columns.keys() & shape.spaces.keys():
         columns[name] = shape.spaces[name].pack(records[name])
     rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
     records["record"] = [
-        message_record(topic, time, _payload(topic, time, row))
+        message_record(topic, time, _payload(topic, shape.messages[topic], time, row))
         for time, row in zip(records["log_time"].tolist(), rows, strict=True)
     ]
 
 
-def _payload(topic: Topic, time: int, row: Message) -> bytes:
+def _payload(topic: Topic, message: MessageType, time: int, row: Message) -> bytes:
     if topic.message is schema.LOG:
         return encode_log(row["message"], time / 1e9, row["level"], row["name"])
     if topic.message is schema.IMAGE:
         return encode_image(row["data"], row["format"], time // STEP_NANOSECONDS, row["frame_id"])
-    return encode(topic.message, row)
+    return encode(message, row)
 
 
 def _constant(code: int, n: int, names: tuple[str, ...]) -> pa.DictionaryArray:

@@ -32,7 +32,8 @@ from runner.execution.session import evaluation_metrics
 from runner.learning.learner import Learner
 from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_dtype
+from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 from runner.sweep.local import Workers
 from runner.sweep.objective import readings
 from runner.util import __version__
@@ -105,8 +106,9 @@ def measure(
     assert plan is not None
     mdp = load_once(config.env.id, config.env.kwargs, config.rewards)
     learner = Learner(config, mdp, seed, tables_of(config, mdp, recordings))
+    layout = layout_of("job", len(learner.agents), len(mdp.event_names))
     steps, episodes = (
-        blank_records(topic, topic_dtype(topic, len(learner.agents), len(mdp.event_names)), _BLOCK_STEPS)
+        blank_records(topic, layout.message(topic), _BLOCK_STEPS)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
     while learner.episode < config.episodes:

@@ -179,7 +179,7 @@ class _Branches:
         recording, place, t = self._recording, self._place, self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
         blocks = [
-            blank_records(topic, recording.dtypes[topic], count).view(np.recarray)
+            blank_records(topic, recording.layout.message(topic), count).view(np.recarray)
             for topic, count in zip(schema.PHASES[place.phase], (limit, 1), strict=True)
         ]
         steps: NDArray[np.void] = blocks[0][: self._playing.play(action, *blocks)]

@@ -282,17 +282,17 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
         Diverged: they differ from the recorded ones.
     """
     topics = {phase: recording.phase(phase).steps.topic for phase in schema.PHASES}
-    dtypes = {topic: recording.dtypes[topic] for topic in topics.values()}
     packing = recorded_packing(recording.config)
-    recorder = Recorder(file, dtypes, packing)
+    recorder = Recorder(file, recording.layout, packing)
     try:
         with closing(Replay(recording, trust)) as replay:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}
             for piece in pieces(recording, schema.PHASES):
                 records = _whole_records(recording, replay, piece, states[piece.phase])
                 positions = records["log_time"] // schema.STEP_NANOSECONDS
-                for block, part in recorder.fill(topics[piece.phase], positions):
-                    block[:] = records[part]
+                topic = topics[piece.phase]
+                names = (field.name for field in recording.layout.message(topic).fields)
+                recorder.put(topic, {name: records[name] for name in names}, positions)
                 report_progress(replay.taken)
         if replay.skipped:
             raise CannotRedo(f"The states of the generators before {replay.skipped:,} steps are not known.")

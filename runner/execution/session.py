@@ -20,7 +20,7 @@ from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Learner, NamedTables
 from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
-from runner.recording.blocks import topic_dtype
+from runner.recording.layout import layout_of
 from runner.recording.messages import Message, QTable, encode, encode_log, encode_q_table
 from runner.recording.metadata import (
     Attachments,
@@ -331,7 +331,7 @@ def recorder_for(
     options, learners, events = job.config.recording, len(learner.agents), len(learner.mdp.event_names)
     return Recorder(
         file,
-        {topic: topic_dtype(topic, learners, events) for topic in schema.BLOCK_TOPICS},
+        layout_of("job", learners, events),
         packing=options.packing,
         record_steps=options.steps == "all",
         reference=reference,

@@ -27,7 +27,7 @@ from runner.loops.options import CallbackOptions, options_of, settings_in
 from runner.loops.parallel import described_game, record_parallel
 from runner.loops.recorded import Recorded
 from runner.loops.rows import Rows
-from runner.loops.single_rows import ROWS
+from runner.loops.single_rows import single_rows
 from runner.loops.values import warn_user
 from runner.loops.vector import (
     autoreset_mode_of,
@@ -189,7 +189,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             },
             valid=CallbackOptions.__annotations__,
         )
-        return _Run(Loop(described, options, maker, ROWS[described.kind]))
+        return _Run(Loop(described, options, maker, single_rows(described)))
 
     def _joining(self, is_evaluation: bool) -> Callable[[object], str]:
         """Return what has an env runner record its environments; it is sent to the process of each."""

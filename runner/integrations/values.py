@@ -13,7 +13,7 @@ from runner.loops.options import PACKING, options_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.run_file import NO_ENVIRONMENT
 
-_NO_ENVIRONMENT: Final = Described("step", Discrete(1), Discrete(1), env_id=NO_ENVIRONMENT)
+_NO_ENVIRONMENT: Final = Described(Discrete(1), Discrete(1), env_id=NO_ENVIRONMENT)
 _NOT_MADE: Final = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
 _ARGUMENTS: Final = {*PACKING, "name", "on_error", "seed", "config", "run_id"}
 """The arguments of `record` that need no environment."""

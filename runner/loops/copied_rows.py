@@ -18,20 +18,28 @@ from runner.loops.single_rows import SingleRows
 from runner.recording.episode_log import Columns, Flags
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
 from runner.recording.gym_values import Put
+from runner.recording.layout import Layout
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.util.arrays import Array
 
-_STEP_FIELDS: Final = ("state", "action", "next_state")
-_TRANSITION_FIELDS: Final = ("action", "next_observation", "acted", "agents_terminated", "agents_truncated")
+_FIELDS: Final = frozenset(
+    {"state", "action", "next_state", "next_observation", "acted", "agents_terminated", "agents_truncated"}
+)
+"""The fields of steps that are copied as they are."""
 
 
 @dataclass(frozen=True)
 class Copied:
     """What rows need to know of the recording that they are copied into."""
 
-    kind: str
+    layout: Layout
     mdp: Mdp | None
     environments: int = 1
+
+    @property
+    def kind(self) -> str:
+        """The kind of recording."""
+        return self.layout.kind
 
 
 class CopiedRows(SingleRows):
@@ -40,7 +48,7 @@ class CopiedRows(SingleRows):
     def __init__(self, recorder: Recorder, copied: Copied, phase: str) -> None:
         super().__init__(recorder, copied, phase, lambda _: None)  # type: ignore[arg-type]
         steps = recorder.dtype(self._topics.steps)
-        self._fields = {*_STEP_FIELDS, *_TRANSITION_FIELDS} & set(steps.names or ())
+        self._fields = _FIELDS & set(steps.names or ())
         self._room = recorder.capacity(self._topics.steps)
         self._copied = np.zeros(self._room, steps)
         self._scratch = np.zeros(self._room, self._scratch.dtype)

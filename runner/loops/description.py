@@ -8,22 +8,17 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final
 
-import numpy as np
 from gymnasium import spaces
 
 from runner.environments.gym_types import Space
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.recording import schema
-from runner.recording.blocks import with_varying
 from runner.recording.gym_spaces import describe_space, parts_of
-from runner.recording.metadata import Attachments, dtypes_in, environment_attachments
-from runner.recording.schema import Topic
+from runner.recording.layout import Layout, layout_of
+from runner.recording.metadata import Attachments, environment_attachments
 from runner.util.jsonable import as_json
 
-_MAX_STATES: Final = 2**32
-"""Larger `Discrete` spaces are recorded as `Transition`: the numbers of `Step` have 32 bits."""
 _NOT_SETTINGS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "wrappers", "base_path"})
 """What `gymnasium.make_vec` and EnvPool add to an environment's own settings."""
 
@@ -32,8 +27,6 @@ _NOT_SETTINGS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwar
 class Described:
     """An environment and its spaces."""
 
-    kind: str
-    """The kind of recording, a key of `schema.KINDS`."""
     observation: Space
     action: Space
     env_id: str
@@ -46,6 +39,12 @@ class Described:
     """The environment's arrays, if it is tabular."""
     wide_action: Space | None = None
     """The action space in the dtype of the recorded actions, if that is wider than its own."""
+    kind: str = "loop"
+    """The kind of recording, a key of `schema.KINDS`."""
+
+    def __post_init__(self) -> None:
+        parts_of(self.observation, "the observation space")
+        parts_of(self.action, "the action space")
 
     @property
     def recorded_action(self) -> Space:
@@ -65,21 +64,16 @@ class Described:
         return self._spaces | wide
 
     @cached_property
-    def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
-        """The dtypes of the message records of fixed width in its recordings."""
+    def layout(self) -> Layout:
+        """The messages of its recordings."""
         events = len(self.mdp.event_names) if self.mdp else 0
-        return dtypes_in(self.kind, len(self.agents), events, self.recorded_spaces, self.env_id)
-
-    @cached_property
-    def row_dtypes(self) -> dict[Topic, np.dtype[np.void]]:
-        """The dtypes of the rows that are put down: where values vary in size, objects that hold bytes."""
-        return with_varying(self.dtypes, schema.KINDS[self.kind], len(self.agents))
+        return layout_of(self.kind, len(self.agents), events, json.dumps(self.recorded_spaces))
 
     @cached_property
     def common(self) -> str:
-        """What all processes that record one run have in common, as JSON: kind, spaces, agents of a game."""
+        """What all processes that record one run have in common, as JSON: spaces, agents of a game."""
         agents = list(map(str, self.agents)) if len(self.agents) > 1 else 1
-        return json.dumps({"kind": self.kind, **self._spaces, "agents": agents})
+        return json.dumps({**self._spaces, "agents": agents})
 
     def attachments(self) -> Attachments:
         """Return the attachments that describe the environment, with its arrays if it is tabular."""
@@ -102,12 +96,11 @@ class Described:
 def describe(env: object, observation: Space, action: Space) -> Described:
     """Return the description of a Gymnasium environment with these spaces."""
     env_id, kwargs, step_limit = _registration(env)
-    kind = kind_of(observation, action)
-    mdp = _tabular(env, kwargs, observation, action) if kind == "step" else None
+    mdp = _tabular(env, kwargs, observation, action)
     agents: tuple[str, ...] = ("agent",)
     if mdp is not None:
         agents = mdp.agents if len(mdp.agents) == 1 else ("agency",)
-    return Described(kind, observation, action, env_id, kwargs, step_limit, agents, mdp=mdp)
+    return Described(observation, action, env_id, kwargs, step_limit, agents, mdp=mdp)
 
 
 def _registration(env: object) -> tuple[str, dict[str, object], int]:
@@ -134,18 +127,10 @@ def _registration(env: object) -> tuple[str, dict[str, object], int]:
     )
 
 
-def kind_of(observation: Space, action: Space) -> str:
-    """Return the kind of recording of these spaces."""
-    parts = [*parts_of(observation, "the observation space"), *parts_of(action, "the action space")]
-    if type(observation) is type(action) is spaces.Discrete:
-        return "step" if max(int(observation.n), int(action.n)) <= _MAX_STATES else "transition"
-    return "variable" if any(part.dtype is None for part in parts) else "transition"
-
-
 def _tabular(env: object, kwargs: dict[str, object], observation: Space, action: Space) -> Mdp | None:
     """Return the arrays of an environment if it is tabular and its observations are its states."""
-    assert isinstance(observation, spaces.Discrete)
-    assert isinstance(action, spaces.Discrete)
+    if not isinstance(observation, spaces.Discrete) or not isinstance(action, spaces.Discrete):
+        return None
     base = getattr(env, "unwrapped", env)
     if not hasattr(base, "transitions") and not hasattr(base, "P"):
         return None

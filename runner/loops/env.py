@@ -18,7 +18,7 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, maker_of
 from runner.loops.options import PackingOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
-from runner.loops.single_rows import ROWS, SingleRows
+from runner.loops.single_rows import SingleRows, single_rows
 from runner.loops.values import UNCHANGEABLE, as_given, check_phase
 from runner.loops.wrappers import return_name
 from runner.replay.makers import class_name, layers_of
@@ -172,7 +172,7 @@ def record(
     if frames_every:
         require_pictures(env)
     maker = maker_of(env, checked_make(make))
-    loop: Loop[SingleRows] = Loop(described, options_of(recordings, options), maker, ROWS[described.kind])
+    loop: Loop[SingleRows] = Loop(described, options_of(recordings, options), maker, single_rows(described))
     return RecordedEnv(env, loop, phase)
 
 

@@ -278,7 +278,7 @@ def begin_layout(recorder: Recorder, layout: ExtraLayout, position: int) -> None
     payload = encode(schema.EXTRA_COLUMNS, {"json": layout.json})
     recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, position)
     recorder.flush_messages()
-    recorder.set_dtypes(dict.fromkeys(TOPICS.values(), layout.record))
+    recorder.set_messages(dict.fromkeys(TOPICS.values(), layout.message))
 
 
 def _column(base: np.dtype[np.generic], shape: tuple[int, ...], rows: int) -> _Column:

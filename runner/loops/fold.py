@@ -29,7 +29,6 @@ from runner.loops.fold_check import Content, left_out
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source, open_sources
 from runner.recording import schema
-from runner.recording.blocks import with_varying
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
     Message,
@@ -41,7 +40,7 @@ from runner.recording.messages import (
     frame_place,
     log_level,
 )
-from runner.recording.metadata import dtypes_of, json_object, kind_of, write_result
+from runner.recording.metadata import json_object, layout_of_run, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
@@ -164,9 +163,9 @@ class _Fold:
         """Write the new recording; return the summary of the run."""
         first, started = self._first, time.monotonic()
         facts = self._facts()
-        dtypes, packing = dtypes_of(facts, str(fresh)), recorded_packing(first.config)
-        self.content = Content(dtypes)
-        with create_recording(fresh, schema.KINDS[kind_of(first.run)]) as file:
+        layout, packing = layout_of_run(facts, str(fresh)), recorded_packing(first.config)
+        self._layout, self.content = layout, Content(layout)
+        with create_recording(fresh, layout) as file:
             file.add_metadata("run", facts)
             for name in first.file.metadata_names:
                 if name not in _NOT_COPIED:
@@ -177,7 +176,7 @@ class _Fold:
                 file.add_attachment(name, media_type, data)
             recorder = Recorder(
                 file,
-                with_varying(dtypes, first.topics, len(first.agents)),
+                layout,
                 packing=packing,
                 watch=self._outcomes.take_records,
             )
@@ -232,9 +231,7 @@ class _Fold:
         """Return the description of the spaces, with the widest actions that a process recorded."""
 
         def width(source: Source) -> int:
-            topic = source.recording.train.steps.topic
-            dtype = source.recording.dtypes.get(topic)
-            return dtype["action"].itemsize if dtype is not None else 0
+            return source.recording.train.steps.row_dtype["action"].itemsize
 
         return max(self._sources, key=width).recording.run["spaces"]
 
@@ -296,15 +293,15 @@ class _Fold:
 
     def _copy_units(self) -> int:
         """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
-        recorder, first = self._recorder, self._first
-        copied = Copied(kind_of(first.run), self._mdp)
+        recorder = self._recorder
+        copied = Copied(self._layout, self._mdp)
         rows = {phase: CopiedRows(recorder, copied, phase) for phase in PHASES}
         extras = CopiedExtras(recorder, self._sources)
         active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
             own = rows[phase]
-            topics = schema.topics_of(copied.kind, phase)
+            topics = schema.topics_of(self._layout.kind, phase)
             if own is not active:
                 active.commit()
                 active = own
@@ -341,9 +338,7 @@ class _Fold:
 
     def _copy_messages(self, topic: Topic, spool: BinaryIO) -> None:
         """Copy the messages of a topic, but those of steps, in the order of the run."""
-        if topic in schema.UNIFORM_TOPICS or topic.name.endswith(("/step", "/reset", "/episode")):
-            return
-        if topic == schema.EXTRA_COLUMNS_TOPIC:
+        if topic in (*schema.ROW_TOPICS, *schema.EXTRA_TOPICS, schema.EXTRA_COLUMNS_TOPIC):
             return
         spool.seek(0)
         places: list[tuple[int, int, int, int]] = []

@@ -13,6 +13,7 @@ from blake3 import blake3
 from runner.errors import RecordingError
 from runner.loops.shard_sources import Source
 from runner.recording import schema
+from runner.recording.layout import Layout
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of
 from runner.recording.schema import Topic
@@ -27,22 +28,22 @@ class Content:
     """Digests of the values in steps and resets, by topic and field: a fold must not change them.
 
     Args:
-        dtypes: of the folded recording, in which values are compared.
+        layout: the messages of the folded recording, in the dtypes of which values are compared.
     """
 
-    def __init__(self, dtypes: Mapping[Topic, np.dtype[np.void]]) -> None:
-        self._dtypes = dtypes
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
         self.digests: dict[tuple[str, str], Any] = defaultdict(blake3)
 
     def take(self, topic: Topic, rows: Any) -> None:
         """Take the next steps or resets: records, or a record."""
-        for name in {field.name for field in topic.message.fields} - _NEW:
+        for name in {field.name for field in self._layout.message(topic).fields} - _NEW:
             values = np.atleast_1d(rows)[name]
             if values.dtype.hasobject:
                 parts = [len(value).to_bytes(4, "little") + value for value in values.tolist()]
                 data = b"".join(parts)
             else:
-                dtype = self._dtypes[topic][name] if topic in self._dtypes else values.dtype
+                dtype = self._layout.rows(topic)[name]
                 data = np.ascontiguousarray(values, dtype.base).tobytes()
             self.digests[topic.name, name].update(data)
 
@@ -53,7 +54,7 @@ class Content:
             RecordingError: it is damaged, or holds other values.
         """
         content_of(path)
-        found = Content(self._dtypes)
+        found = Content(self._layout)
         with open_recording(path) as recording:
             for topic in recording.topics:
                 if topic.name.endswith(("/step", "/reset")):
@@ -79,7 +80,7 @@ def left_out(source: Source, read: Mapping[str, int]) -> str:
             continue
         found, there = read.get(topic.name, 0), source.stated.get(topic.name, 0)
         there = max([there, *(stop for _, stop in source.recording.lost.get(topic.name, []))])
-        if topic.message in schema.STEP_MESSAGES:
+        if topic.message is schema.STEP:
             found = source.stops[topic.phase]
             there = max(there, source.recording.phase(topic.phase).steps.total())
             if found < there:

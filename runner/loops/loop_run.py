@@ -23,7 +23,6 @@ from runner.loops.description import Described
 from runner.loops.fold import OWNER_WAITS, fold_if_over
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
-from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.actions import ACTION_TOPICS
 from runner.recording.compaction import compacted
@@ -65,14 +64,14 @@ class LoopRun:
         self._code = CodeCollector(self.run.folder.parent, options.packing.code and not is_shard)
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
-            self._file = create_recording(path, schema.KINDS[described.kind])
+            self._file = create_recording(path)
         mark(self.run.folder, maker)
         self._beat_code = self._code.beat(self.run, self._file)
         self._facts = self._run_facts()
         self.outcomes = Outcomes(described.mdp)
         self.recorder = Recorder(
             self._file,
-            described.row_dtypes,
+            described.layout,
             packing=options.packing.packing,
             record_steps=options.steps == "all",
             beat=self._beat,
@@ -170,7 +169,7 @@ class LoopRun:
             return False
         self.described = replace(self.described, wide_action=wide)
         self._facts = self._run_facts()
-        self.recorder.set_dtypes(self.described.row_dtypes)
+        self.recorder.set_layout(self.described.layout)
         return True
 
     def commit(self) -> None:

@@ -149,7 +149,7 @@ class Options:
         Raises:
             ConfigError: the steps of this environment, or of a shard, cannot be left out.
         """
-        if self.steps != "all" and (described.kind == "variable" or self.join is not None):
+        if self.steps != "all" and (described.layout.varies or self.join is not None):
             reason = "a shard has whole steps" if self.join else "the environment's values vary in size"
             raise ConfigError(f"steps: found {self.steps!r}, expected all: {reason}.")
         return {

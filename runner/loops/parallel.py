@@ -10,7 +10,7 @@ from typing import Any, Unpack
 from runner.environments.gym_types import Info, ResetOptions
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
-from runner.loops.description import Described, kind_of
+from runner.loops.description import Described
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of
@@ -207,7 +207,7 @@ def described_game(env: Any) -> Described:
     observation, action = game_spaces(env)
     name = env.metadata.get("name") if isinstance(getattr(env, "metadata", None), Mapping) else None
     return Described(
-        kind=kind_of(observation, action),
+        kind="game",
         observation=observation,
         action=action,
         env_id=str(name or type(env).__name__),

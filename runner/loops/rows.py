@@ -21,7 +21,7 @@ from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.gym_values import Put, leaves_of
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.reset_states import ResetState
-from runner.util.arrays import Array, Ints, Records
+from runner.util.arrays import Array, Ints, Records, zeros
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""
@@ -79,7 +79,7 @@ class Rows:
 
     def reshape(self, described: Described) -> None:
         """Prepare for actions of another dtype, before the first step."""
-        if described.kind == "step":
+        if described.layout.has_states:
             spaces = described.observation, described.action
             self._starts = tuple(int(space.start) for space in spaces)  # type: ignore[attr-defined]
         self._leaves: tuple[Any, Any] = (
@@ -117,8 +117,8 @@ class Rows:
     def _allocate(self) -> None:
         """Make room for rows: actions and observations [rows, N, ...], and what else a step brings."""
         shape, steps = (self._room, self._n), self._recorder.dtype(self._topics.steps)
-        self._actions: Array = np.zeros(shape, np.int64 if self._starts else steps["action"])
-        self._observations: Array = np.zeros(shape, self._resets.dtype["observation"])
+        self._actions = zeros(shape, np.dtype(np.int64) if self._starts else steps["action"])
+        self._observations = zeros(shape, self._resets.dtype["observation"])
         self._scratch = np.zeros(self._room, self._scratch.dtype)
         self._put_observation, self._put_action = map(
             self._filler, self._leaves, (self._observations, self._actions)
@@ -194,9 +194,7 @@ class Rows:
         """
         actions, after = self._actions[:rows], self._observations[:rows]
         if not self._starts:
-            acted, ends = np.ones(after.shape[:2], np.uint32), self._scratch["ends"][:rows]
-            masks = {"acted": acted, "agents_terminated": ends[:, 0], "agents_truncated": ends[:, 1]}
-            return {"action": actions, "next_observation": after, **masks}
+            return {"action": actions, "next_observation": after}
         least_state, least_action = self._starts
         state = np.vstack([self._state, after])
         self._state = state[-1].copy()

@@ -94,7 +94,7 @@ class SingleRows(Rows):
 
 
 class DiscreteRows(SingleRows):
-    """Rows of `dualtaxi.Step`: both spaces are `Discrete`."""
+    """Rows over states: both spaces are `Discrete`."""
 
     def _allocate(self) -> None:
         values = [(name, "<i8", (1,)) for name in ("action", "observation")]
@@ -133,7 +133,7 @@ class DiscreteRows(SingleRows):
 
 
 class AgentRows(SingleRows):
-    """Rows of `dualtaxi.Transition` of all agents of a PettingZoo parallel environment."""
+    """Rows of all agents of a PettingZoo parallel environment."""
 
     @property
     def place(self) -> tuple[int, int]:
@@ -192,9 +192,6 @@ class AgentRows(SingleRows):
         return sum(bool(flags.get(agent)) << i for i, agent in enumerate(self._agents))
 
 
-ROWS: Final[dict[str, type[SingleRows]]] = {
-    "step": DiscreteRows,
-    "transition": SingleRows,
-    "variable": SingleRows,
-}
-"""The rows of one environment by the kind of recording."""
+def single_rows(described: Described) -> type[SingleRows]:
+    """Return the class of the rows of one environment."""
+    return DiscreteRows if described.layout.has_states else SingleRows

@@ -26,7 +26,7 @@ class ActionRecorder:
 
     def take_records(self, topic: Topic, records: Rows) -> None:
         """Take the steps among the records that the recorder gets."""
-        if topic.message not in schema.STEP_MESSAGES:
+        if topic.message is not schema.STEP:
             return
         if topic.phase != self._phase:
             self.commit()
@@ -57,5 +57,5 @@ class ActionRecorder:
         if self._rows:
             rows, self._rows = np.concatenate(self._rows), []
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
-            topic = schema.topics_of("step", self._phase).actions
+            topic = schema.topics_of("loop", self._phase).actions
             self._recorder.append(topic, encode(schema.ACTIONS, packed(rows, self._n)), position)

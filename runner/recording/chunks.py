@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.schema import ACTIONS, EXTRA, TOPIC_OF, TRANSITION, UNIFORM_TOPICS, Topic
+from runner.recording.schema import ACTIONS, EXTRA, EXTRA_TOPICS, ROW_TOPICS, STEP, TOPIC_OF, Topic
 from runner.util.packing import MAX_CHUNK_STEPS, MAX_LEVEL, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -88,7 +88,7 @@ def encode_chunk(
         packed: may return the records packed; by default, and if it does not, they are packed here.
     """
     name = "" if packing.compression == "none" else packing.compression
-    width = len(records) // len(log_times) if topic.message is TRANSITION else 0
+    width = len(records) // len(log_times) if topic.message is STEP and packing.values else 0
     size, crc = len(records), crc32(records)
     data = (packed and packed(name, records)) or _compress(records, packing, width)
     if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
@@ -222,7 +222,7 @@ def _check_message_count(body: memoryview, head: ChunkHead, where: str) -> None:
     """
     length, channel = _first_message(body, head, where)
     messages = head.uncompressed_size // (RECORD_HEAD.size + length)
-    if TOPIC_OF.get(channel) in UNIFORM_TOPICS and messages > MAX_CHUNK_STEPS:
+    if TOPIC_OF.get(channel) in (*ROW_TOPICS, *EXTRA_TOPICS) and messages > MAX_CHUNK_STEPS:
         raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -47,8 +48,11 @@ def compacted(file: RecordingFile, packing: Packing) -> tuple[RecordingFile, dic
         OSError: the new recording cannot be written; the old one is as before.
         RecordingError: the old one was damaged meanwhile, so the new one would lack messages; it stays.
     """
+    with open_recording(file.path) as recording:
+        layout = recording.layout
+    packing = replace(packing, values=not layout.has_states)
     with replacing(file.path) as path:
-        fresh = RecordingFile(path, file.topics)
+        fresh = RecordingFile(path, layout)
         try:
             messages = _compact(file, fresh, packing)
         except BaseException:

@@ -12,6 +12,7 @@ from typing import Protocol
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, Code, parse_code
+from runner.recording.layout import Layout
 from runner.recording.maker import (
     MAKER_RECORD,
     EnvironmentMaker,
@@ -25,12 +26,13 @@ from runner.recording.metadata import (
     environment_of,
     json_object,
     kind_of,
+    layout_of_run,
     lost_ranges,
     spaces_of,
     unpacked_provenance,
 )
 from runner.recording.run_file import Summary, parse_result
-from runner.recording.schema import KINDS, Q_TABLE_TOPIC, Topic
+from runner.recording.schema import Q_TABLE_TOPIC, Topic
 from runner.util.values import Json
 
 
@@ -175,7 +177,16 @@ class RunDescription:
     @property
     def topics(self) -> tuple[Topic, ...]:
         """The topics that the recording has, some of them perhaps empty."""
-        return KINDS[kind_of(self.run)]
+        return self.layout.topics
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The messages of the recording.
+
+        Raises:
+            RecordingError: it is of another version, or its metadata record `run` is damaged.
+        """
+        return layout_of_run(self.run, str(self.path))
 
     @cached_property
     def environment(self) -> RecordedEnvironment:
@@ -209,7 +220,7 @@ class RunDescription:
     @property
     def has_states(self) -> bool:
         """Whether its steps have states and actions by number, from 0; else values of the spaces."""
-        return kind_of(self.run) in ("job", "step")
+        return self.layout.has_states
 
     @cached_property
     def spaces(self) -> Json:

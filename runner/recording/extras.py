@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -21,8 +22,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import record_dtype
+from runner.recording.layout import sized
 from runner.recording.metadata import json_object
+from runner.recording.schema import MessageType
 from runner.recording.spaces import Description, dtype_of
 from runner.recording.topic_chunks import TopicChunks
 from runner.util.arrays import Array, MaskedArray
@@ -51,11 +53,11 @@ class ExtraLayout:
         """The names, in order."""
         return self.values.names or ()
 
-    @property
-    def record(self) -> np.dtype[np.void]:
-        """The dtype of a message record: `step`, `values` by name, and `given` by name."""
+    @cached_property
+    def message(self) -> MessageType:
+        """The type of a message: `values` by name, `given` by name, and `step`."""
         given = np.dtype([(name, "?") for name in self.names])
-        return record_dtype(schema.EXTRA, self.values, given)
+        return sized(schema.EXTRA, {"values": self.values, "given": given})
 
     @property
     def description(self) -> Description:

@@ -15,7 +15,7 @@ from runner.errors import RecordingError
 from runner.recording.gym_leaves import Part
 from runner.recording.gym_spaces import parts_of
 from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
-from runner.util.arrays import Array
+from runner.util.arrays import Array, zeros
 
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 
@@ -182,7 +182,7 @@ def fitted(
     leaves: Sequence[Leaf], value: object, batch: tuple[int, ...], dtype: np.dtype[np.generic]
 ) -> Array:
     """Return a batch of values of a space as they stand in a column of this dtype, [*batch, ...]."""
-    column = np.empty((1, *batch), dtype)
+    column = zeros((1, *batch), dtype)
     filler(leaves, column, batch)(0, value)
     return np.asarray(column[0])
 

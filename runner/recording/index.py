@@ -9,9 +9,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import lru_cache
 from io import BytesIO
-from typing import BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 import numpy as np
 from isal.isal_zlib import crc32
@@ -33,6 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import CutOff, RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES, ChunkEntry
+from runner.recording.layout import Layout
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import (
     LARGE,
@@ -44,7 +45,7 @@ from runner.recording.records import (
     check_unpacked_size,
     raw_records,
 )
-from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, TOPIC_OF, Topic
+from runner.recording.schema import ALL_TOPICS, FORMAT_VERSION, MESSAGES, PROFILE, TOPIC_OF, Topic
 from runner.util.arrays import Records
 
 K = TypeVar("K")
@@ -128,13 +129,21 @@ class ChunkTable:
         return np.frombuffer(self._packed, _ENTRY_COLUMNS)
 
 
+class Beginning(NamedTuple):
+    """The schemas and channels of a recording, and their records."""
+
+    schemas: Sequence[Schema]
+    channels: Sequence[Channel]
+    schema_records: bytes
+    channel_records: bytes
+
+
 @dataclass
 class Index:
     """The places of a recording's records, up to `end`."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
-    schemas: dict[int, bytes] = field(default_factory=dict)
-    """Id to the schema as it is in the file."""
+    schemas: dict[int, Schema] = field(default_factory=dict)
     chunks: ChunkTable = field(default_factory=ChunkTable)
     attachments: dict[str, tuple[int, int]] = field(default_factory=dict)
     """Name to (offset, length) of the record."""
@@ -144,12 +153,16 @@ class Index:
     message_counts: dict[int, int] = field(default_factory=dict)
     """Messages by channel, as the summary counts them; empty without one."""
     finished: bool = False
+    header_end: int = 0
+    """Offset after the header of the file, as `integrity.survey` finds it."""
     end: int = 0
     """Offset after the last whole record of the data section."""
     size: int = 0
     """Bytes of the file."""
     reason: str = ""
     """Why its records were not read to the end of the data section; empty if they were."""
+    _written: Beginning | None = None
+    """The schemas and channels of a recording that is written."""
 
     @property
     def topics(self) -> list[Topic]:
@@ -203,7 +216,7 @@ class Index:
                 self.add_attachment(attachment.name, place, attachment.media_type)
             case Opcode.SCHEMA:
                 schema = _parse(Schema, raw)
-                _add_once(self.schemas, schema.id, schema.data, "schema")
+                _add_once(self.schemas, schema.id, schema, "schema")
             case Opcode.CHANNEL:
                 channel = _parse(Channel, raw)
                 _add_once(self.channels, channel.id, channel, "channel")
@@ -255,25 +268,38 @@ class Index:
         if start != end:
             raise RecordingError(f"found {end - start} stray bytes at {start}, expected a record")
 
-    def tail(self, topics: Sequence[Topic], crc: int) -> bytes:
+    def begin(self, beginning: Beginning) -> None:
+        """Add the schemas and channels of a recording that is written."""
+        self.schemas = {schema.id: schema for schema in beginning.schemas}
+        self.channels = {channel.id: channel for channel in beginning.channels}
+        self._written = beginning
+
+    @property
+    def beginning(self) -> Beginning:
+        """Its schemas and channels."""
+        if self._written is not None:
+            return self._written
+        schemas, channels = [*self.schemas.values()], [*self.channels.values()]
+        return Beginning(schemas, channels, bytes_of(*schemas), bytes_of(*channels))
+
+    def tail(self, crc: int) -> bytes:
         """Return the end of a finished recording, after its data: data end, summary, footer, magic.
 
         Args:
-            topics: those that it has channels for.
             crc: the checksum of the file up to `end`.
         """
         data_end = bytes_of(DataEnd(crc))
         start = self.end + len(data_end)
-        schemas, channels = schemas_and_channels(tuple(topics))
+        beginning = self.beginning
         metadata = (MetadataIndex(*place, name) for name, place in self.metadata.items())
         attachments = (
             _attachment_index(name, *place, self.media_types[name])
             for name, place in self.attachments.items()
         )
         groups = [
-            (Opcode.SCHEMA, schemas),
-            (Opcode.CHANNEL, channels),
-            (Opcode.STATISTICS, bytes_of(self._statistics(topics))),
+            (Opcode.SCHEMA, beginning.schema_records),
+            (Opcode.CHANNEL, beginning.channel_records),
+            (Opcode.STATISTICS, bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, b"".join(map(_chunk_index, self.chunks))),
             (Opcode.ATTACHMENT_INDEX, bytes_of(*attachments)),
             (Opcode.METADATA_INDEX, bytes_of(*metadata)),
@@ -297,18 +323,18 @@ class Index:
         }
         return {channel: n for channel, n in counts.items() if n}
 
-    def _statistics(self, topics: Sequence[Topic]) -> Statistics:
+    def _statistics(self) -> Statistics:
         chunks, counts = self.chunks.columns, self.count_messages()
         return Statistics(
             attachment_count=len(self.attachments),
-            channel_count=len(topics),
+            channel_count=len(self.channels),
             channel_message_counts=counts,
             chunk_count=len(chunks),
             message_count=sum(counts.values()),
             metadata_count=len(self.metadata),
             message_start_time=int(chunks["start_time"].min()) if len(chunks) else 0,
             message_end_time=int(chunks["end_time"].max(initial=0)),
-            schema_count=len({topic.message for topic in topics}),
+            schema_count=len(self.schemas),
         )
 
 
@@ -371,26 +397,26 @@ def checksum(stream: BinaryIO, start: int, end: int) -> int:
     return crc
 
 
-@cache
-def schemas_and_channels(topics: tuple[Topic, ...]) -> tuple[bytes, bytes]:
-    """Return the schema and channel records of a recording with these topics, which follow its header."""
-    used = {topic.message for topic in topics}
+@lru_cache(64)
+def beginning_of(layout: Layout) -> Beginning:
+    """Return the schemas and channels of a recording, whose records follow its header."""
+    numbers = {message: number for number, message in enumerate(MESSAGES, start=1)}
+    messages = {topic.message: layout.message(topic) for topic in layout.topics}
     schemas = [
-        Schema(id=number, name=message.full_name, encoding="protobuf", data=file_descriptor_set(message))
-        for number, message in enumerate(MESSAGES, start=1)
-        if message in used
+        Schema(
+            id=number,
+            data=file_descriptor_set(messages[message]),
+            encoding="protobuf",
+            name=message.full_name,
+        )
+        for message, number in numbers.items()
+        if message in messages
     ]
     channels = [
-        Channel(
-            id=topic.channel,
-            topic=topic.name,
-            message_encoding="protobuf",
-            metadata={},
-            schema_id=1 + MESSAGES.index(topic.message),
-        )
-        for topic in sorted(topics, key=lambda topic: topic.channel)
+        Channel(topic.channel, topic.name, "protobuf", {}, numbers[topic.message])
+        for topic in sorted(layout.topics, key=lambda topic: topic.channel)
     ]
-    return bytes_of(*schemas), bytes_of(*channels)
+    return Beginning(schemas, channels, bytes_of(*schemas), bytes_of(*channels))
 
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
@@ -416,8 +442,8 @@ def _chunk_entry(raw: RawRecord) -> ChunkEntry:
         raise RecordingError(f"the ChunkIndex record at {raw.offset} cannot be read") from error
     if len(channels) > 1 or not TOPIC_OF.keys() >= set(channels):
         raise RecordingError(
-            f"the ChunkIndex record at {raw.offset} names {len(channels)} channels, "
-            "expected that of one topic"
+            f"the ChunkIndex record at {raw.offset} names the channels {channels}, expected one channel of "
+            f"version {FORMAT_VERSION} of the format"
         )
     return ChunkEntry(offset, length, uncompressed, start, end, channels[0] if channels else 0)
 

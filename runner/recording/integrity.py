@@ -10,18 +10,17 @@ import contextlib
 import itertools
 import operator
 import os
-from collections.abc import Iterator
-from functools import cache
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import CutOff, RecordingError
-from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, message_index
-from runner.recording.index import Index, check_beginning, checksum, schemas_and_channels
+from runner.recording.index import Index, beginning_of, check_beginning, checksum
+from runner.recording.metadata import layout_of_run
 from runner.recording.records import (
     MetadataRecord,
     RawRecord,
@@ -97,7 +96,7 @@ def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: No
             declared.take_records(stream)
         declared.check_unpacked_size(str(path))
         try:
-            _check_beginning(stream)
+            contents.header_end = check_beginning(stream)
             _take_records(stream, contents, keep_result, report)
         except RecordingError as error:
             contents.reason = str(error)
@@ -127,25 +126,17 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
-@cache
-def _beginnings() -> tuple[bytes, ...]:
-    """Return what may follow the header: the schemas and channels of each kind, as every version wrote them.
+def _check_beginning(raw: RawRecord, contents: Index, run: Mapping[str, str]) -> None:
+    """Compare what stands before the metadata record `run` of a recording with what belongs there.
 
-    A topic that is added gets the highest channel, so earlier versions wrote those up to some channel.
+    Raises:
+        RecordingError: they differ, or the record is damaged.
     """
-    newest = max(topic.channel for topic in schema.ALL_TOPICS)
-    return tuple(
-        b"".join(schemas_and_channels(tuple(topic for topic in topics if topic.channel <= last)))
-        for topics in schema.KINDS.values()
-        for last in range(schema.FIRST_VERSION_CHANNELS, newest + 1)
-    )
-
-
-def _check_beginning(stream: BinaryIO) -> None:
-    """Compare magic, header, schemas and channels; only the library's version may differ."""
-    stream.seek(check_beginning(stream))
-    if not stream.read(max(map(len, _beginnings()))).startswith(_beginnings()):
-        raise RecordingError("found other schemas or channels than every recording begins with")
+    expected = beginning_of(layout_of_run(run, "the recording"))
+    size = len(expected.schema_records) + len(expected.channel_records)
+    is_whole = contents.beginning[2:] == expected[2:] and raw.offset == contents.header_end + size
+    if not is_whole:
+        raise RecordingError("found other schemas or channels than a recording of its kind begins with")
 
 
 def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: Report) -> None:
@@ -159,13 +150,10 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
     """The record before, if it is a chunk."""
     for raw in walk(stream, contents.size):
         report(raw.offset, contents.size)
-        if chunk is not None and (raw.is_message_index or (indexed and chunk.topic.message != schema.EXTRA)):
+        if chunk is not None:
             contents.chunks.append(_with_index(chunk, raw, indexed))
             chunk, contents.end = None, raw.end
             continue
-        if chunk is not None:  # earlier versions wrote no index without entries
-            contents.chunks.append(chunk.entry)
-            chunk, contents.end = None, raw.offset
         if raw.ends_data:
             return
         if not raw.is_data or raw.is_message_index:
@@ -179,6 +167,8 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
         if isinstance(record, MetadataRecord) and record.name == "result" and not keep_result:
             continue
         contents.add(raw)
+        if isinstance(record, MetadataRecord) and record.name == "run":
+            _check_beginning(raw, contents, record.entries)
         if isinstance(record, MetadataRecord) and record.name == "config":
             indexed = asks_for_indexes(record.entries)
         contents.end = raw.end
@@ -209,7 +199,7 @@ def _with_index(chunk: ReadChunk, raw: RawRecord, indexed: bool) -> ChunkEntry:
 def _tails(path: Path, contents: Index) -> tuple[bytes, bytes]:
     """Return what follows the data of a recording, and what should follow it."""
     with _reading(path) as stream:
-        expected = contents.tail(contents.topics, checksum(stream, 0, contents.end))
+        expected = contents.tail(checksum(stream, 0, contents.end))
         stream.seek(contents.end)
         return stream.read(len(expected) + 1), expected
 

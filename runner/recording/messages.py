@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -17,22 +17,23 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import varint
-from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
+from runner.recording.blocks import HEADER_BYTES, blank_records, row_dtype
+from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, Field, MessageType
+from runner.recording.space_fields import decoded, encoded, is_text, raw_field, varint
 from runner.recording.spaces import NUMBERS
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Records
 
 Message = dict[str, Any]
 """The fields of a decoded message by name."""
 
 
-@cache
+@lru_cache(256)
 def file_descriptor_set(message: MessageType) -> bytes:
     """Return the schema of a message as MCAP wants it: a serialized FileDescriptorSet with its imports."""
     return descriptor_pb2.FileDescriptorSet(file=_files(message)).SerializeToString(deterministic=True)
 
 
-@cache
+@lru_cache(256)
 def message_class(message: MessageType) -> Any:
     """Return the protobuf class of a message."""
     pool = descriptor_pool.DescriptorPool()
@@ -49,13 +50,8 @@ def _files(message: MessageType) -> list[descriptor_pb2.FileDescriptorProto]:
     described = file.message_type.add(name=message.name)
     imports = []
     for field in message.fields:
-        added = described.field.add(
-            name=field.stored_name,
-            number=field.number,
-            type=field.kind,
-            label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,
-        )
-        if field.kind == Pb.TYPE_MESSAGE:
+        added = _add_field(file, described, field, field.stored_name)
+        if field.kind == Pb.TYPE_MESSAGE and field.parts is None:
             added.type_name = ".google.protobuf.Timestamp"
             timestamp = descriptor_pb2.FileDescriptorProto()
             timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
@@ -67,6 +63,30 @@ def _files(message: MessageType) -> list[descriptor_pb2.FileDescriptorProto]:
             for number, name in enumerate(LOG_LEVELS):
                 levels.value.add(name=name, number=number)
     return [*imports, file]
+
+
+def _add_field(
+    file: descriptor_pb2.FileDescriptorProto,
+    described: descriptor_pb2.DescriptorProto,
+    field: Field,
+    nested_name: str,
+    is_value: bool = False,
+) -> Pb:
+    """Add a field to a message, and the type of a nested message to the file, named after its parent."""
+    added: Pb = described.field.add(
+        name=field.stored_name,
+        number=field.number,
+        type=field.kind,
+        label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,
+    )
+    if is_text(field) and (is_value or field.is_value):
+        _add_field(file, described, raw_field(field), "")
+    if field.parts is not None:
+        nested = file.message_type.add(name=f"{described.name}_{nested_name}")
+        added.type_name = f".{file.package}.{nested.name}"
+        for part in field.parts:
+            _add_field(file, nested, part, str(part.number), is_value=True)
+    return added
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,17 +102,63 @@ class QTable:
 
 
 def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
-    """Return the message with these field values; a missing field is protobuf's zero."""
-    stored = {field.name: field.stored_as for field in message.fields if field.stored_as}
-    values = {stored.get(name, name): value for name, value in values.items()}
+    """Return the message with these field values; a missing field is protobuf's zero.
+
+    Values of spaces are bytes as `spaces` describes them; of such a message no field may be missing.
+    """
+    if any(field.is_value for field in message.fields):
+        row = np.zeros(1, row_dtype(message))
+        for field in message.fields:
+            row[field.name][0] = values[field.name]
+        return encode_rows(message, row)[0]
     return bytes(message_class(message)(**values).SerializeToString(deterministic=True))
 
 
-def encode_rows(message: MessageType, rows: NDArray[np.void]) -> list[bytes]:
-    """Return a message for each record."""
-    names = [field.name for field in message.fields]
-    columns = (rows[name].tolist() for name in names)
-    return [encode(message, dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
+@lru_cache(64)
+def _numbers_of(message: MessageType) -> MessageType:
+    """Return a message with the fields alone that come before its values of varying size."""
+    fields = tuple(field for field in message.fields if not field.is_value)
+    return replace(message, fields=fields, varies=False)
+
+
+def encode_rows(message: MessageType, rows: Records) -> list[bytes]:
+    """Return a message for each row; those of varying size."""
+    numbers, values = _numbers_of(message), [field for field in message.fields if field.is_value]
+    records = blank_records(schema.LOG_TOPIC, numbers, len(rows))
+    for field in numbers.fields:
+        records[field.name] = rows[field.name]
+    payloads = [record[HEADER_BYTES:] for record in records.view(f"V{records.itemsize}").tolist()]
+    for field in values:
+        parts = (encoded(field, value) for value in rows[field.name].tolist())
+        payloads = [payload + part for payload, part in zip(payloads, parts, strict=True)]
+    return payloads
+
+
+def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> Records:
+    """Return messages of varying size, given as log times and payloads, as rows.
+
+    Raises:
+        RecordingError: one is not as `encode_rows` writes them.
+    """
+    numbers, values = _numbers_of(message), [field for field in message.fields if field.is_value]
+    blank = blank_records(schema.LOG_TOPIC, numbers, len(messages))
+    size = blank.itemsize - HEADER_BYTES
+    head = bytes(HEADER_BYTES)
+    joined = b"".join([head + payload[:size].ljust(size, b"\0") for _, payload in messages])
+    records = np.frombuffer(joined, blank.dtype)
+    rows = np.zeros(len(messages), row_dtype(message))
+    rows["log_time"] = rows["publish_time"] = [time for time, _ in messages]
+    for field in numbers.fields:
+        if not np.array_equal(records[f"tag_{field.name}"], blank[f"tag_{field.name}"]):
+            raise RecordingError(f"found a payload that is no {message.full_name}")
+        rows[field.name] = records[field.name]
+    for k, (_, payload) in enumerate(messages):
+        end = size
+        for field in values:
+            rows[field.name][k], end = decoded(field, payload, end)
+        if end != len(payload):
+            raise RecordingError(f"found {len(payload)} bytes, expected {end} in a {message.full_name}")
+    return rows
 
 
 def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
@@ -214,11 +280,14 @@ def _number_places(fields: Message, payload: bytes) -> dict[str, int]:
 
 
 def decode(message: MessageType, payload: bytes) -> Message:
-    """Return the values of a message's fields; repeated ones as lists.
+    """Return the values of a message's fields; repeated ones as lists, those of spaces as bytes.
 
     Raises:
         RecordingError: the payload is not such a message.
     """
+    if any(field.is_value for field in message.fields):
+        row = decode_rows(message, [(0, payload)])[0]
+        return {field.name: _plain(row[field.name]) for field in message.fields}
     try:
         parsed = message_class(message).FromString(payload)
     except DecodeError as error:
@@ -228,6 +297,10 @@ def decode(message: MessageType, payload: bytes) -> Message:
         for field in message.fields
         for value in (getattr(parsed, field.stored_name),)
     }
+
+
+def _plain(value: Any) -> Any:
+    return value if isinstance(value, bytes) else value.tolist()
 
 
 def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:

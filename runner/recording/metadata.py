@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Final, cast
 
-import numpy as np
 import zstandard
 
 from runner.environments.mdp import (
@@ -25,13 +24,12 @@ from runner.environments.mdp import (
 from runner.environments.scene import scene_mistake
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import topic_dtype
-from runner.recording.index import Index
+from runner.recording.index import Index, beginning_of
+from runner.recording.layout import Layout, layout_of
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.packed_arrays import pack_array, unpack_array
 from runner.recording.records import MAX_METADATA_BYTES
-from runner.recording.schema import Topic
-from runner.recording.spaces import dtype_of, leaves_of
+from runner.recording.spaces import leaves_of
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.arrays import Array
 from runner.util.stored import stored_as
@@ -45,8 +43,8 @@ _PACKAGE: Final = "package."
 _PACKAGES: Final = "packages"
 """The entry of the provenance with the versions of all packages: JSON, in zstd, in Base64."""
 _MAX_PACKAGES_BYTES: Final = 1 << 20
-_FIXED_KINDS: Final = ("step", "transition")
-"""The kinds of loops whose steps have one size."""
+_OF_SPACES: Final = ("dualtaxi.Step", "dualtaxi.Reset")
+"""The messages whose fields follow from the spaces of the run."""
 _RUN_TEXTS: Final = ("run_id", "name", "job", "created", "agents")
 _RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_EVENTS}
 """The numbers that every metadata record `run` has, and the largest possible value of each."""
@@ -91,18 +89,24 @@ def run_metadata(
 
 
 def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
-    """Check the metadata record `run` of a file, and that it has the channels of its kind of recording.
+    """Check the metadata record `run` of a file, and that it has the schemas and channels of such a run.
 
     Raises:
-        RecordingError: it is of another version, is damaged, or has another channel.
+        RecordingError: it is of another version, is damaged, or has another schema or channel.
     """
-    check_run(run, path)
-    topics = {topic.channel: topic.name for topic in schema.KINDS[kind_of(run)]}
-    for number, channel in index.channels.items():
-        if topics.get(number) != channel.topic:
+    expected = beginning_of(layout_of_run(run, path))
+    for channel in expected.channels:
+        found = index.channels.get(channel.id)
+        if found != channel:
             raise RecordingError(
-                f"{path}: found channel {number} for {channel.topic!r}, "
-                f"expected {topics.get(number)!r}: not written by dualtaxi."
+                f"{path}: found channel {channel.id} for {found and found.topic!r}, "
+                f"expected {channel.topic!r}: not written by dualtaxi."
+            )
+    for message in expected.schemas:
+        if index.schemas.get(message.id) != message and message.name in _OF_SPACES:
+            raise RecordingError(
+                f"{path}: found a schema of {message.name} that does not follow from the spaces of its run: "
+                "not written by dualtaxi."
             )
 
 
@@ -161,30 +165,16 @@ def spaces_of(run: Mapping[str, str], path: str) -> Json:
     return spaces
 
 
-def dtypes_of(run: Mapping[str, str], path: str) -> dict[Topic, np.dtype[np.void]]:
-    """Return the dtype of each fixed-width topic's message records in a recording."""
-    kind = kind_of(run)
-    spaces = spaces_of(run, path) if kind in _FIXED_KINDS else {}
-    return dtypes_in(kind, int(run["learners"]), int(run["events"]), spaces, path)
+def layout_of_run(run: Mapping[str, str], path: str) -> Layout:
+    """Return the layout of the messages of a recording.
 
-
-def dtypes_in(
-    kind: str, learners: int, events: int, spaces: JsonView, path: str
-) -> dict[Topic, np.dtype[np.void]]:
-    """Return what `dtypes_of` returns, of a recording of this kind, whose spaces have these descriptions."""
-    action = None
-    observation = None
-    if kind in _FIXED_KINDS:
-        action, observation = (
-            dtype_of(spaces[name], f"{path}: the {name} space") for name in ("action", "observation")
-        )
-        if action is None or observation is None:
-            raise RecordingError(f"{path}: has a space of variable width, expected fixed ones in its kind.")
-    return {
-        topic: topic_dtype(topic, learners, events, action, observation)
-        for topic in schema.KINDS[kind]
-        if topic in schema.ALL_BLOCK_TOPICS
-    }
+    Raises:
+        RecordingError: it is of another version, or its metadata record `run` is damaged.
+    """
+    check_run(run, path)
+    if kind_of(run) != "job":
+        spaces_of(run, path)
+    return layout_of(kind_of(run), int(run["learners"]), int(run["events"]), run.get("spaces", ""))
 
 
 def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
@@ -325,6 +315,7 @@ def write_description(
 ) -> None:
     """Write what makes a recording self-contained; `maker` is how a loop's environment was made."""
     try:
+        file.begin(layout_of_run(run, str(file.path)))
         file.add_metadata("run", run)
         file.add_metadata("config", _json_entry(config))
         file.add_metadata("provenance", packed_provenance(provenance))

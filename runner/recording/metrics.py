@@ -48,8 +48,6 @@ class EvaluationMetric(Metric):
 
     number: int
     """Number of its field in `EvalMetrics`."""
-    stored_as: str = ""
-    """Name of its field in files and archives, if that is another one."""
     heading: str
     """Its short name, above a column."""
     suffix: str = ""
@@ -82,7 +80,6 @@ METRICS: Final = (
         better="higher",
         field="success_percent",
         number=14,
-        stored_as="finish_percent",
         heading="success %",
         suffix=" %",
         requires="success_events",

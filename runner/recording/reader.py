@@ -39,12 +39,12 @@ from runner.recording.messages import (
     decode_scalars,
     unknown_measures,
 )
-from runner.recording.metadata import check_file, dtypes_of, kind_of
+from runner.recording.metadata import check_file, kind_of
 from runner.recording.metrics import RECENT_EPISODES, finite_mean
 from runner.recording.record_store import RecordStore
 from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.run_file import RecentTraining, run_title
-from runner.recording.schema import STEP_MESSAGES, Topic, topics_of
+from runner.recording.schema import Topic, topics_of
 from runner.recording.spaces import decode as decode_value
 from runner.recording.steps import Steps
 from runner.recording.topic_chunks import FOREVER, ChunkFile, TopicChunks, chunks_by_topic
@@ -94,11 +94,6 @@ class Recording(RunDescription):
         """Close the file."""
         self.file.close()
 
-    @cached_property
-    def dtypes(self) -> dict[Topic, np.dtype[np.void]]:
-        """The dtype of each fixed-width topic's message records in this recording."""
-        return dtypes_of(self.run, str(self.path))
-
     def table(self, topic: Topic | str) -> TopicChunks:
         """Return the messages of a topic, or of this recording's own topic of that name: the kinds differ.
 
@@ -112,14 +107,17 @@ class Recording(RunDescription):
                 f"{self.path}: has no topic {name!r}: it is of the kind {kind_of(self.run)!r}."
             )
         if own not in self._tables:
-            chunks = self._file, own, self._places[own], self.dtypes.get(own), self.lost.get(own.name, [])
-            if own.message in STEP_MESSAGES:
+            message, lost = self.layout.message(own), self.lost.get(own.name, [])
+            chunks = self._file, own, self._places[own], message, lost
+            if own.message is schema.STEP:
                 actions = self.table(topics_of(kind_of(self.run), own.phase).actions)
                 self._tables[own] = Steps(*chunks, actions=actions)
             elif own.message in (schema.TRAIN_METRICS, schema.EVAL_METRICS, schema.OPTIMALITY):
                 channel = self.file.index.channels.get(own.channel)
-                recorded = self.file.index.schemas.get(channel.schema_id, b"") if channel else b""
-                unknown = dict.fromkeys(unknown_measures(own.message, recorded), math.nan)
+                recorded = self.file.index.schemas.get(channel.schema_id) if channel else None
+                unknown = dict.fromkeys(
+                    unknown_measures(own.message, recorded.data if recorded else b""), math.nan
+                )
                 self._tables[own] = TopicChunks(*chunks, _METRICS_BYTES, unknown)
             else:
                 self._tables[own] = TopicChunks(*chunks)
@@ -127,9 +125,7 @@ class Recording(RunDescription):
 
     @cached_property
     def _file(self) -> ChunkFile:
-        return ChunkFile(
-            str(self.path), self.file.index.chunks, self.file, len(self.agents), self.environments
-        )
+        return ChunkFile(str(self.path), self.file.index.chunks, self.file, self.environments)
 
     @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
@@ -305,7 +301,7 @@ class Phase:
             RecordingError: the recording has no such episode or steps, or they are too large for an array.
         """
         span, path = self.episode_span(episode), self._recording.path
-        if (span.stop - span.start) * self._recording.dtypes[self.steps.topic].itemsize > MAX_EPISODE_BYTES:
+        if (span.stop - span.start) * self.steps.row_dtype.itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
                 f"{path}: {self.title} episode {episode} has {span.stop - span.start:,} steps, too many "
                 f"for an array; read them in blocks, from {span.start}."
@@ -344,13 +340,14 @@ class Phase:
             for block in table.blocks():
                 yield from block
             return
-        for fields in table.decoded():
-            where = f"{self._recording.path}: {table.topic.name} at {fields['log_time']} ns"
-            for name, space in spaces.items():
-                fields[name] = decode_value(self._recording.spaces[space], fields[name], where)
-            if "rewards" in fields:
-                fields["rewards"] = np.array(fields["rewards"])
-            yield fields
+        names = ["log_time", *(field.name for field in table.message.fields)]
+        for block in table.rows():
+            for row in block:
+                where = f"{self._recording.path}: {table.topic.name} at {row['log_time']} ns"
+                fields = {name: row[name] for name in names}
+                for name, space in spaces.items():
+                    fields[name] = decode_value(self._recording.spaces[space], fields[name], where)
+                yield fields
 
     def whole_steps(self) -> int:
         """Return how many steps of a loop are known to have their resets.
@@ -385,7 +382,7 @@ class Phase:
         if (chosen < 0).any():
             raise RecordingError(f"{where}: {table.topic.name} has values before their names.")
         parts = [
-            (layout, TopicChunks(table.file, table.topic, table.places[chosen == k], layout.record))
+            (layout, TopicChunks(table.file, table.topic, table.places[chosen == k], layout.message))
             for k, layout in enumerate(layouts)
             if (chosen == k).any()
         ]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from typing import Final
 
@@ -17,15 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.blocks import blank_records, message_record
+from runner.recording.blocks import blank_records, message_record, record_dtype, row_dtype, rows_of
 from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
+from runner.recording.layout import Layout
 from runner.recording.messages import encode_rows
 from runner.recording.observer import Observer
 from runner.recording.pipeline import MAX_BATCH_MESSAGES, MessageBatches, Pipeline
 from runner.recording.reference import Reference
 from runner.recording.reuse import PackedChunks
-from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Array, Records
@@ -55,7 +56,7 @@ class _Lane:
     """The buffers of one fixed-width topic."""
 
     topic: Topic
-    dtype: np.dtype[np.void]
+    message: MessageType
     capacity: int
     """Records of a whole block."""
     write: bool
@@ -77,7 +78,7 @@ class Recorder:
 
     Args:
         file: the recording to write; None records nothing but the digest.
-        dtypes: those of the message records of the fixed-width topics.
+        layout: the messages of the run.
         record_steps: False keeps the steps' digest but not the steps.
         reference: what the recording already holds.
         beat: called about once a second while the recorder is in use, by the thread that writes.
@@ -97,7 +98,7 @@ class Recorder:
     def __init__(
         self,
         file: RecordingFile | None,
-        dtypes: Mapping[Topic, np.dtype[np.void]],
+        layout: Layout,
         packing: Packing | None = None,
         record_steps: bool = True,
         reference: Reference | None = None,
@@ -111,7 +112,7 @@ class Recorder:
         packed: PackedChunks | None = None,
         grouped: bool = False,
     ) -> None:
-        packing = packing or Packing()
+        packing = replace(packing or Packing(), values=not layout.has_states)
         self._file = file
         self._watch = watch
         self._packed, self._grouped = packed, grouped
@@ -119,8 +120,9 @@ class Recorder:
         self._first_records = _FIRST_RECORDS if before is not None else None
         self._reference = reference or Reference()
         self._lanes = {
-            topic: self._lane(topic, own, record_steps or topic.message not in schema.STEP_MESSAGES)
-            for topic, own in dtypes.items()
+            topic: self._lane(topic, layout.message(topic), record_steps or topic.message is not schema.STEP)
+            for topic in layout.topics
+            if topic in schema.ROW_TOPICS
         }
         self.steps = {"train": 0, "eval": 0, "elsewhere": 0}
         """Steps committed so far, by phase; and training steps of other processes, where they are stated."""
@@ -135,34 +137,38 @@ class Recorder:
         """Whether a block of steps was full since the last flush."""
         self._stopwatch: Stopwatch | None = None
         self._observer: Observer | None = None
-        if clock and file is not None and schema.CLOCK_TOPIC in file.topics:
+        if clock and file is not None:
             self._stopwatch = Stopwatch()
             self._record_machine()
-            if (system or console is not None) and schema.HOST_TOPIC in file.topics:
+            if system or console is not None:
                 self._observer = Observer(file.path.parent, self._stopwatch, system, console)
 
-    def _lane(self, topic: Topic, dtype: np.dtype[np.void], write: bool) -> _Lane:
-        return _Lane(topic, dtype, capacity_of(topic, dtype, self._chunk_steps), write)
+    def _lane(self, topic: Topic, message: MessageType, write: bool) -> _Lane:
+        return _Lane(topic, message, capacity_of(topic, message, self._chunk_steps), write)
 
     @property
     def bytes_written(self) -> int:
         """Bytes in the file so far."""
         return self._file.size if self._file is not None else 0
 
-    def set_dtypes(self, dtypes: Mapping[Topic, np.dtype[np.void]]) -> None:
-        """Change the dtypes of fixed-width topics, or add such topics; later messages have these dtypes.
+    def set_layout(self, layout: Layout) -> None:
+        """Change the messages of the run, before there are any of those that change."""
+        self.set_messages({topic: layout.message(topic) for topic in self._lanes})
 
-        Only the messages of a topic in `EXTRA_TOPICS` may have different dtypes in one recording.
+    def set_messages(self, messages: Mapping[Topic, MessageType]) -> None:
+        """Change the messages of topics whose rows are put down, or add such topics.
+
+        Only those of a topic in `EXTRA_TOPICS` may differ within a recording.
         """
-        for topic, own in dtypes.items():
+        for topic, message in messages.items():
             lane = self._lanes.get(topic)
             if lane is None:
-                self._lanes[topic] = self._lane(topic, own, write=True)
-            elif lane.dtype != own:
-                assert not self.counts[topic.name] or topic not in schema.ALL_BLOCK_TOPICS
+                self._lanes[topic] = self._lane(topic, message, write=True)
+            elif lane.message.fields != message.fields:
+                assert not self.counts[topic.name] or topic in schema.EXTRA_TOPICS
                 if lane.open is not None and lane.open.filled:
                     self._send_block(lane)
-                self._lanes[topic] = self._lane(topic, own, lane.write)
+                self._lanes[topic] = self._lane(topic, message, lane.write)
 
     @property
     def position(self) -> int:
@@ -178,8 +184,8 @@ class Recorder:
         self._pipeline.raise_failure()
 
     def dtype(self, topic: Topic) -> np.dtype[np.void]:
-        """Return the dtype of the records of a fixed-width topic."""
-        return self._lanes[topic].dtype
+        """Return the dtype of the rows of a topic."""
+        return row_dtype(self._lanes[topic].message)
 
     def block(self, topic: Topic) -> NDArray[np.void]:
         """Return the free records of the topic's open block, to be filled from the first on."""
@@ -267,7 +273,7 @@ class Recorder:
         """
         self._pipeline.raise_failure()
         self._batches.extend(topic, [position * STEP_NANOSECONDS for position in positions], payloads)
-        self._is_full |= self._grouped and topic.message in schema.STEP_MESSAGES
+        self._is_full |= self._grouped and topic.message is schema.STEP
         if topic not in schema.MACHINE_TOPICS:  # of which a resumed run does not know the number
             self.counts[topic.name] += len(payloads)
 
@@ -351,8 +357,8 @@ class Recorder:
             Diverged: a record differs from the one that the recording already holds.
         """
         lane, block = self._lanes[topic], self._open(topic)
-        if lane.dtype.hasobject:  # messages of varying size, and the block is filled again
-            payloads = encode_rows(topic.message, block.records[: len(positions)])
+        if block.records.dtype.hasobject:  # messages of varying size, and the block is filled again
+            payloads = encode_rows(lane.message, block.records[: len(positions)])
             self.extend(topic, payloads, positions.tolist())
             return
         has_reference = self._reference.remaining(topic) > 0
@@ -366,11 +372,11 @@ class Recorder:
             self._reference.check_new(topic, fresh)
         block.filled += len(positions)
         self.counts[topic.name] += len(positions)
-        self._watch(topic, fresh)
+        self._watch(topic, rows_of(lane.message, fresh))
         if has_reference:
             self._send_block(lane, write=False)
         elif block.filled == len(block.records) or (lane.span and lane.span.stop == self.counts[topic.name]):
-            if self._grouped and topic.message in schema.STEP_MESSAGES:
+            if self._grouped and topic.message is schema.STEP:
                 self._is_full |= len(block.records) == lane.capacity  # the first, smaller one can wait
             self._send_block(lane)
 
@@ -381,12 +387,12 @@ class Recorder:
 
     def _take_block(self, lane: _Lane) -> _Block:
         """Return a block to fill: one that was used before, or a new one while there may be more."""
-        if self._first_records is not None and not lane.has_started and not lane.dtype.hasobject:
+        if self._first_records is not None and not lane.has_started and record_dtype(lane.message):
             lane.has_started = True
-            return _Block(blank_records(lane.topic, lane.dtype, min(self._first_records, lane.capacity)))
+            return _Block(blank_records(lane.topic, lane.message, min(self._first_records, lane.capacity)))
         if lane.made < MAX_BLOCKS and lane.free.empty():
             lane.made += 1
-            return _Block(blank_records(lane.topic, lane.dtype, lane.capacity))
+            return _Block(blank_records(lane.topic, lane.message, lane.capacity))
         block = lane.free.get()
         block.filled = 0
         return block
@@ -420,9 +426,10 @@ def _offsets(count: int, size: int) -> NDArray[np.uint64]:
     return offsets
 
 
-def capacity_of(topic: Topic, dtype: np.dtype[np.void], chunk_steps: int) -> int:
-    """Return how many records a block of a topic has."""
+def capacity_of(topic: Topic, message: MessageType, chunk_steps: int) -> int:
+    """Return how many records a block of a topic has; `message` is the type of its messages in the run."""
+    dtype = record_dtype(message)
     limit = EPISODES_A_BLOCK if topic.message in (schema.EPISODE, schema.RESET) else chunk_steps
-    if dtype.hasobject:  # messages of varying size, which share chunks of fewer
-        limit = min(limit, MAX_BATCH_MESSAGES)
+    if dtype is None:  # messages of varying size, which share chunks of fewer
+        return min(limit, MAX_BATCH_MESSAGES)
     return max(1, min(limit, BLOCK_BYTES // dtype.itemsize))

@@ -217,6 +217,14 @@ def _read_chunk(body: bytes, offset: int) -> ReadChunk:
     return ReadChunk(body, entry, records, times, offsets)
 
 
+def _have_one_size(records: bytes, size: int) -> bool:
+    """Return whether messages follow one another that have the size of the first."""
+    if size < HEADER_BYTES or len(records) % size:
+        return False
+    heads = np.frombuffer(records, np.uint8).reshape(-1, size)[:, : RECORD_HEAD.size]
+    return bool((heads == heads[0]).all())
+
+
 def checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64], NDArray[np.uint64]]:
     """Return channel, times and offsets of a chunk's messages.
 
@@ -229,9 +237,7 @@ def checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64
     if channel not in schema.TOPIC_OF:
         raise RecordingError(f"{where}: found messages of channel {channel}, which no recording has")
     size = RECORD_HEAD.size + length
-    if schema.TOPIC_OF[channel] in schema.UNIFORM_TOPICS:
-        if size < HEADER_BYTES or len(records) % size:
-            raise RecordingError(f"{where}: its messages differ in size")
+    if _have_one_size(records, size):
         offsets = np.arange(0, len(records), size, dtype=np.uint64)
         heads = np.frombuffer(records, np.uint8).reshape(-1, size)[:, :HEADER_BYTES]
     else:

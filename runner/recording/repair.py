@@ -21,12 +21,12 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD
+from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
 from runner.recording.extras import read_layouts
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
-from runner.recording.metadata import REQUIRED_RECORDS, check_run, dtypes_of, json_object, kind_of
+from runner.recording.metadata import REQUIRED_RECORDS, check_run, json_object, layout_of_run
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import (
     MetadataRecord,
@@ -173,10 +173,9 @@ class _Salvage:
         self, path: Path, damaged: DamagedFile, run: Mapping[str, str], stated: Mapping[str, int]
     ) -> None:
         self._path, self._damaged, self._counts = path, damaged, stated
-        self._topics = schema.KINDS[kind_of(run)]
-        self._dtypes = dtypes_of(run, str(path))
+        self._layout = layout_of_run(run, str(path))
         self._done = Repair(path)
-        self._next = dict.fromkeys(self._topics, 0)
+        self._next = dict.fromkeys(self._layout.topics, 0)
         """The number of the next message expected of each topic."""
         self._extra_columns: list[tuple[int, str]] = []
         self._extra_widths: set[int] = set()
@@ -184,7 +183,7 @@ class _Salvage:
 
     def write(self, fresh: Path, report: Report) -> Repair:
         """Write the new file."""
-        with RecordingFile(fresh, self._topics) as file:
+        with RecordingFile(fresh, self._layout) as file:
             for record in self._damaged.good_records(report):
                 if isinstance(record, ReadChunk):
                     self._take_chunk(file, record)
@@ -206,14 +205,15 @@ class _Salvage:
         """Copy a good chunk; note a hole before it."""
         where = f"{self._path}: chunk at {chunk.offset}"
         topic, count = chunk.topic, len(chunk.times)
-        if topic not in self._topics:
+        if topic not in self._layout.topics:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         if topic is schema.EXTRA_COLUMNS_TOPIC:
             self._take_extra_columns(chunk)
         if topic.message is schema.EXTRA and len(chunk.records) // count not in self._extra_widths:
             self._damaged.lost_bytes += len(chunk.body)  # their names are lost
             return
-        if topic in self._dtypes and len(chunk.records) != count * self._dtypes[topic].itemsize:
+        dtype = self._layout.dtype(topic)
+        if dtype is not None and len(chunk.records) != count * dtype.itemsize:
             raise RecordingError(f"{where}: found messages of another size.")
         first = expected = self._next[topic]
         if topic.message in schema.NUMBERED_BY:
@@ -231,10 +231,11 @@ class _Salvage:
     def _numbers(self, chunk: ReadChunk) -> tuple[int, int]:
         """Return the numbers of a chunk's first and last message."""
         topic, name = chunk.topic, schema.NUMBERED_BY[chunk.topic.message]
-        if topic in self._dtypes:
-            numbers = np.frombuffer(chunk.records, self._dtypes[topic])[name]
+        dtype, message = self._layout.dtype(topic), self._layout.message(topic)
+        if dtype is not None:
+            numbers = np.frombuffer(chunk.records, dtype)[name]
             return int(numbers[0]), int(numbers[-1])
-        first, last = (decode(topic.message, chunk.messages[k][HEADER_BYTES:])[name] for k in (0, -1))
+        first, last = (decode(message, chunk.messages[k][HEADER_BYTES:])[name] for k in (0, -1))
         return first, last
 
     def _take_extra_columns(self, chunk: ReadChunk) -> None:
@@ -243,7 +244,7 @@ class _Salvage:
             fields = decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:])
             self._extra_columns.append((time, fields["json"]))
         layouts = read_layouts(self._extra_columns, str(self._path))
-        self._extra_widths = {layout.record.itemsize for layout in layouts}
+        self._extra_widths = {np.dtype(record_dtype(layout.message)).itemsize for layout in layouts}
 
     def _finish(self, file: RecordingFile) -> None:
         """Record what was lost, or else the result again, and finish the file."""
@@ -261,12 +262,12 @@ class _Salvage:
 
     def _steps_in(self, torn: bytes) -> int:
         """Return how many steps a chunk that was cut off held, by its head: a step takes one tick."""
-        if len(torn) < _CHUNK_TIMES_AND_SIZE.size or not self._dtypes:
+        dtype = self._layout.dtype(schema.TRAIN_STEP)
+        if len(torn) < _CHUNK_TIMES_AND_SIZE.size or dtype is None:
             return 0
         start, end, size = _CHUNK_TIMES_AND_SIZE.unpack_from(torn)
         ticks = (end - start) // schema.STEP_NANOSECONDS + 1
-        widths = [dtype.itemsize for topic, dtype in self._dtypes.items() if topic.name == "/train/step"]
-        return ticks if [size] == [ticks * width for width in widths] else 0
+        return ticks if size == ticks * dtype.itemsize else 0
 
 
 def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> dict[str, list[list[int]]]:

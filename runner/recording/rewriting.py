@@ -61,8 +61,8 @@ def rewrite(
 
     check_up_to_cut(path)
     with open_recording(path) as recording:
-        topics = recording.topics
-    with RecordingFile(fresh, topics) as file:
+        layout = recording.layout
+    with RecordingFile(fresh, layout) as file:
         copy(path, transform, file)
         add(file)
         for name, added in (more or {}).items():

@@ -183,10 +183,6 @@ def parse_result(record: Mapping[str, object], problems: list[str]) -> Summary:
 
 def _parse_summary(record: JsonView, prefix: str, problems: list[str]) -> Summary:
     values = _valid(record, _SUMMARY, prefix, problems)
-    if isinstance(values.get("last_evaluation"), dict):
-        values["last_evaluation"] = {
-            _RENAMED.get(key, key): value for key, value in values["last_evaluation"].items()
-        }
     fields = {key: values[key] for key in _SUMMARY if values.get(key) is not None}
     for key, make, checks in _NESTED:
         if key in fields:
@@ -298,8 +294,6 @@ _EVALUATION: Final = {
     **{metric.name: _optional(_within(metric.lowest, metric.highest)) for metric in METRICS},
     "trials": _optional(_COUNT),
 }
-_RENAMED: Final = {metric.stored_as: metric.name for metric in METRICS if metric.stored_as}
-"""Keys of an evaluation as earlier versions wrote them."""
 _RECENT: Final = {
     "episodes": _optional(_COUNT),
     "mean_length": _optional(_LENGTH),

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Final
 
+import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
 from runner.recording.metrics import METRICS
 
-FORMAT_VERSION: Final = 1
+FORMAT_VERSION: Final = 2
 PROFILE: Final = "dualtaxi"
 STEP_NANOSECONDS: Final = 100_000_000
 """Logical time of one environment step: 0.1 s, so that playback at 1x shows ten steps a second."""
@@ -28,11 +29,17 @@ class Field:
     kind: int
     repeated: bool = False
     stored_as: str = ""
-    """Its name in the file's schema and in archives, if that is another one."""
+    """Its name in the file's schema, if that is another one."""
+    dtype: np.dtype[np.generic] | None = None
+    """The dtype of its value, with the shape; None if that varies, or is not known without a run."""
+    parts: tuple[Field, ...] | None = None
+    """The fields of a nested message: the values of a `Dict` or `Tuple`."""
+    is_value: bool = False
+    """Whether it has values of a space of the environment."""
 
     @property
     def stored_name(self) -> str:
-        """Its name in the file's schema and in archives."""
+        """Its name in the file's schema."""
         return self.stored_as or self.name
 
 
@@ -43,6 +50,8 @@ class MessageType:
     name: str
     fields: tuple[Field, ...]
     package: str = "dualtaxi"
+    varies: bool = False
+    """Whether its messages vary in size although each of its fields may not: values of another one do."""
 
     @property
     def full_name(self) -> str:
@@ -82,6 +91,13 @@ STEP = MessageType(
         Field(10, "truncated", _BOOL),
     ),
 )
+"""A step of a job, or of a loop over states; `layout` has the fields of other steps."""
+AGENT_FIELDS: Final = (
+    Field(11, "acted", _FIXED32),
+    Field(12, "agents_terminated", _FIXED32),
+    Field(13, "agents_truncated", _FIXED32),
+)
+"""More fields of a step in a game of several agents: bit i is agent i."""
 EPISODE = MessageType(
     "Episode",
     (
@@ -115,7 +131,7 @@ _EVALUATION_SIDE = (
     Field(13, "successes", _SFIXED64),
     Field(17, "terminations", _SFIXED64),
     Field(19, "events", _SFIXED64, repeated=True),
-    *(Field(each.number, each.field, _DOUBLE, each.per_agent, each.stored_as) for each in METRICS),
+    *(Field(each.number, each.field, _DOUBLE, each.per_agent) for each in METRICS),
 )
 EVAL_METRICS = MessageType(
     "EvalMetrics", (*_TRAINING_SIDE, *sorted(_EVALUATION_SIDE, key=lambda field: field.number))
@@ -127,7 +143,7 @@ OPTIMALITY = MessageType(
         Field(2, "episode", _SFIXED64),
         Field(3, "evaluation", _SFIXED64),
         Field(4, "starts", _SFIXED64),
-        Field(5, "success_percent", _DOUBLE, stored_as="finish_percent"),
+        Field(5, "success_percent", _DOUBLE),
         Field(6, "timeout_percent", _DOUBLE),
         Field(7, "mean_length", _DOUBLE),
         Field(8, "mean_penalties", _DOUBLE),
@@ -135,7 +151,7 @@ OPTIMALITY = MessageType(
         Field(10, "values", _DOUBLE, repeated=True),
         Field(11, "best_responses", _DOUBLE, repeated=True),
         Field(12, "optimal_value", _DOUBLE),
-        Field(13, "optimal_success_percent", _DOUBLE, stored_as="optimal_finish_percent"),
+        Field(13, "optimal_success_percent", _DOUBLE),
         Field(14, "optimal_mean_length", _DOUBLE),
         Field(15, "cycle_states", _SFIXED64, repeated=True),
         Field(16, "cycle_lengths", _SFIXED64, repeated=True),
@@ -169,23 +185,6 @@ LOG = MessageType(
 )
 """Foxglove's own log message, so that viewers show it as text."""
 
-TRANSITION = MessageType(
-    "Transition",
-    (
-        Field(1, "action", _BYTES),
-        Field(2, "next_observation", _BYTES),
-        Field(3, "rewards", _DOUBLE, repeated=True),
-        Field(4, "step", _SFIXED64),
-        Field(5, "episode", _SFIXED64),
-        Field(6, "t", _FIXED32),
-        Field(7, "terminated", _BOOL),
-        Field(8, "truncated", _BOOL),
-        Field(9, "acted", _FIXED32),
-        Field(10, "agents_terminated", _FIXED32),
-        Field(11, "agents_truncated", _FIXED32),
-    ),
-)
-"""A step in spaces that are not both `Discrete`; bit i of the last three is agent i."""
 RESET = MessageType(
     "Reset",
     (
@@ -345,16 +344,11 @@ TOPICS: Final = (
 )
 """The topics of what the runner itself learned, which a job determines."""
 
-TRAIN_TRANSITION, EVAL_TRANSITION = _both("step", 9, TRANSITION)
-TRAIN_TRANSITION_VARIABLE, EVAL_TRANSITION_VARIABLE = _both("step", 11, TRANSITION)
 TRAIN_RESET, EVAL_RESET = _both("reset", 13, RESET)
-TRAIN_RESET_VARIABLE, EVAL_RESET_VARIABLE = _both("reset", 15, RESET)
 TRAIN_INFO, EVAL_INFO = _both("info", 17, INFO)
 SCALAR_TOPIC = Topic("/scalar", 19, SCALAR)
 ARRAY_TOPIC = Topic("/array", 20, ARRAY)
 TRAIN_FRAME, EVAL_FRAME = _both("frame", 21, IMAGE, digested=False)
-FIRST_VERSION_CHANNELS: Final = 23
-"""The highest channel of the format's first version; topics with higher ones may be missing in a file."""
 TRAIN_RESET_STATE, EVAL_RESET_STATE = _both("reset_state", 24, RESET_STATE, digested=False)
 EXTRA_COLUMNS_TOPIC = Topic("/extra", 26, EXTRA_COLUMNS)
 TRAIN_EXTRA, EVAL_EXTRA = _both("extra", 27, EXTRA)
@@ -368,18 +362,11 @@ IMAGE_TOPIC = Topic("/image", 50, IMAGE, digested=False)
 """Pictures that were logged under a name, which is their `frame_id`; a film is an animated WebP."""
 TRAIN_ACTIONS, EVAL_ACTIONS = _both("actions", 40, ACTIONS, digested=False)
 
-LOOP_TOPICS: Final = {
-    "step": (TRAIN_STEP, EVAL_STEP, TRAIN_RESET, EVAL_RESET),
-    "transition": (TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET),
-    "variable": (
-        TRAIN_TRANSITION_VARIABLE,
-        EVAL_TRANSITION_VARIABLE,
-        TRAIN_RESET_VARIABLE,
-        EVAL_RESET_VARIABLE,
-    ),
-}
-"""The topics of steps and resets in the recording of a loop, by the kind of its spaces."""
-_EVERY_LOOP: Final = (
+_LOOP_TOPICS: Final = (
+    TRAIN_STEP,
+    EVAL_STEP,
+    TRAIN_RESET,
+    EVAL_RESET,
     TRAIN_EPISODE,
     EVAL_EPISODE,
     TRAIN_INFO,
@@ -401,7 +388,8 @@ _EVERY_LOOP: Final = (
 )
 KINDS: Final = {
     "job": (*TOPICS, *MACHINE_TOPICS),
-    **{kind: (*topics, *_EVERY_LOOP, *MACHINE_TOPICS) for kind, topics in LOOP_TOPICS.items()},
+    "loop": (*_LOOP_TOPICS, *MACHINE_TOPICS),
+    "game": (*_LOOP_TOPICS, *MACHINE_TOPICS),
 }
 """The topics of each kind of recording, as the metadata record `run` names it."""
 ALL_TOPICS: Final = tuple(
@@ -416,13 +404,10 @@ MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))
 
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
 """The topics of a job whose messages have one size: read and written as blocks."""
-ALL_BLOCK_TOPICS: Final = (*BLOCK_TOPICS, TRAIN_TRANSITION, EVAL_TRANSITION, TRAIN_RESET, EVAL_RESET)
+ROW_TOPICS: Final = (*BLOCK_TOPICS, TRAIN_RESET, EVAL_RESET)
+"""The topics that are put down as rows: their messages have one size unless values of the spaces vary."""
 EXTRA_TOPICS: Final = (TRAIN_EXTRA, EVAL_EXTRA)
-UNIFORM_TOPICS: Final = (*ALL_BLOCK_TOPICS, *EXTRA_TOPICS)
-"""The topics whose messages have one size within a chunk."""
 
-STEP_MESSAGES: Final = (STEP, TRANSITION)
-"""The messages that are a step."""
 STEP_TOPICS: Final = (TRAIN_STEP.name, EVAL_STEP.name)
 """The names of the topics that a run may leave out."""
 PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
@@ -449,13 +434,13 @@ class PhaseTopics:
 @cache
 def topics_of(kind: str, phase: str) -> PhaseTopics:
     """Return the topics of a phase in a kind of recording."""
-    every = (*KINDS["transition"], *KINDS["job"], *KINDS[kind])
+    every = (*KINDS["loop"], *KINDS["job"], *KINDS[kind])
     own = {topic.name.rpartition("/")[2]: topic for topic in every if topic.phase == phase}
     names = ("step", "actions", "episode", "reset", "reset_state", "info", "frame", "extra", "metrics")
     return PhaseTopics(*(own[name] for name in names))
 
 
-NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", TRANSITION: "step", RESET: "reset"}
+NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""
 RESET_ONLY: Final = 2**32 - 1
 """The `t` of a step at which a vector environment only reset one of its environments."""

@@ -76,9 +76,9 @@ def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
 
 def row_dtype(description: Description) -> np.dtype[np.generic]:
     """Return the dtype of a space's values in records, `Dict` and `Tuple` as fields; a text is an object."""
-    parts = _parts(description)
+    parts = parts_of(description)
     if parts is None:
-        leaf = _leaf_dtype(description)
+        leaf = leaf_dtype(description)
         return np.dtype(object) if leaf is None else leaf
     return np.dtype([(name, row_dtype(part)) for name, part in parts])
 
@@ -106,11 +106,21 @@ def decode(description: Description, data: bytes, where: str) -> Value:
 
 def encode_text(text: str) -> bytes:
     """Return a text as it stands in a recording."""
-    encoded = text.encode("utf-8", "surrogatepass")
-    return _LENGTH.pack(len(encoded)) + encoded
+    return encode_bytes(text.encode("utf-8", "surrogatepass"))
 
 
-def _parts(description: Description) -> list[tuple[str, Description]] | None:
+def encode_bytes(text: bytes) -> bytes:
+    """Return a text, given in UTF-8, as it stands in a recording."""
+    return _LENGTH.pack(len(text)) + text
+
+
+def text_length(value: bytes, at: int) -> int:
+    """Return how many bytes a text has that stands at `at` in a value."""
+    (length,) = _LENGTH.unpack_from(value, at)
+    return int(length)
+
+
+def parts_of(description: Description) -> list[tuple[str, Description]] | None:
     """Return the parts of a `Dict` or `Tuple` by name; None for a leaf."""
     kind = description["type"]
     if kind == "Dict":
@@ -123,9 +133,9 @@ def _parts(description: Description) -> list[tuple[str, Description]] | None:
 def _leaves(description: object, path: tuple[str, ...]) -> Iterator[Leaf]:
     if not isinstance(description, Mapping) or len(path) > _MAX_DEPTH:
         raise ValueError("found no object that describes a space, or too many inside one another")
-    parts = _parts(description)
+    parts = parts_of(description)
     if parts is None:
-        yield Leaf(path, _leaf_dtype(description))
+        yield Leaf(path, leaf_dtype(description))
         return
     for name, part in parts:
         if not is_text(name) or not name:
@@ -133,7 +143,7 @@ def _leaves(description: object, path: tuple[str, ...]) -> Iterator[Leaf]:
         yield from _leaves(part, (*path, name))
 
 
-def _leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
+def leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
     """Return the dtype of a leaf, None for a text; every other kind of space has arrays of one shape."""
     kind = description["type"]
     if kind == "Text":
@@ -150,13 +160,13 @@ def _leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | Non
 
 def _value(description: Description, data: bytes, at: int) -> tuple[Value, int]:
     """Return the value at an offset, and the offset behind it."""
-    parts = _parts(description)
+    parts = parts_of(description)
     if parts is not None:
         values = {}
         for name, part in parts:
             values[name], at = _value(part, data, at)
         return (values if description["type"] == "Dict" else tuple(values.values())), at
-    dtype = _leaf_dtype(description)
+    dtype = leaf_dtype(description)
     if dtype is None:
         (length,) = _LENGTH.unpack_from(data, at)
         start, at = at + _LENGTH.size, at + _LENGTH.size + length

@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, topic_dtype
+from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype, row_dtype, rows_of
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
 from runner.recording.index import ChunkTable, Index
-from runner.recording.messages import Message, decode
+from runner.recording.messages import Message, decode, decode_rows
 from runner.recording.record_store import RecordStore
 from runner.recording.records import checked_messages
-from runner.recording.schema import ALL_TOPICS, Topic
+from runner.recording.schema import ALL_TOPICS, MessageType, Topic
 
 M = TypeVar("M")
 FOREVER: Final = 2**63 - 1
 """A time in nanoseconds that no message has."""
-_OBJECT: Final = np.dtype(object)
 _ROWS: Final = 1024
 _ROWS_BYTES: Final = 16 << 20
 """The most messages of varying size in a block of `rows`, and the bytes of values with which one ends."""
@@ -60,7 +59,6 @@ class ChunkFile:
     path: str
     chunks: ChunkTable
     store: RecordStore
-    learners: int
     environments: int
     """How many environments take turns."""
 
@@ -76,8 +74,8 @@ class TopicChunks:
     topic: Topic
     places: NDArray[np.intp]
     """The chunks of the file that hold it, by number."""
-    dtype: np.dtype[np.void] | None
-    """Of a message record; None if messages vary in size."""
+    message: MessageType
+    """The type of its messages in this run."""
     lost: Sequence[Sequence[int]] = ()
     """Ranges (first, stop) of the numbers of messages that a repair could not save."""
     max_bytes: int = MAX_CHUNK_BYTES
@@ -89,6 +87,16 @@ class TopicChunks:
 
     def __len__(self) -> int:
         return len(self.places)
+
+    @cached_property
+    def dtype(self) -> np.dtype[np.void] | None:
+        """The dtype of a message record in the file; None if messages vary in size."""
+        return record_dtype(self.message)
+
+    @cached_property
+    def row_dtype(self) -> np.dtype[np.void]:
+        """The dtype of `rows`."""
+        return row_dtype(self.message)
 
     def entry(self, k: int) -> ChunkEntry:
         """Return the entry of chunk number k in the file's table."""
@@ -113,6 +121,10 @@ class TopicChunks:
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
         """Yield the messages number `start` up to `stop`, a chunk at a time; they must have one size."""
+        return (self._rows_in(block) for block in self.stored(start, stop))
+
+    def stored(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield what `blocks` does as it is stored: message records."""
         firsts, ends = self._numbers
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
         begin, end = np.searchsorted(ends, start, side="right"), np.searchsorted(firsts, stop, side="left")
@@ -123,7 +135,7 @@ class TopicChunks:
     def array(self, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
         """Return the messages number `start` up to `stop` as one array; they must have one size."""
         blocks = list(self.blocks(start, stop))
-        return np.concatenate(blocks) if blocks else np.empty(0, self.dtype)
+        return np.concatenate(blocks) if blocks else np.empty(0, self.row_dtype)
 
     def records(self) -> Iterator[bytes]:
         """Yield the message records of each chunk, as they are in the file."""
@@ -190,7 +202,7 @@ class TopicChunks:
     def _rows_of(self, k: int) -> NDArray[np.void]:
         """Return the messages of chunk number k as records."""
         if self.dtype is not None:
-            return next(self._blocks_of([k]))[1]
+            return self._rows_in(next(self._blocks_of([k]))[1])
         number, rows = self._last
         if number != k:
             rows = np.concatenate(list(self._decoded_rows(chunks=[k])))
@@ -202,38 +214,55 @@ class TopicChunks:
         """The field that numbers the messages."""
         return schema.NUMBERED_BY[self.topic.message]
 
-    @property
-    def row_dtype(self) -> np.dtype[np.void]:
-        """The dtype of `rows`."""
-        if self.dtype is None:
-            return topic_dtype(self.topic, self.file.learners, 0, _OBJECT, _OBJECT)
-        return self.dtype
-
     def _decoded_rows(
         self, times: range | None = None, chunks: Sequence[int] | None = None
     ) -> Iterator[NDArray[np.void]]:
-        learners, size = self.file.learners, 0
-        messages: list[Message] = []
-        for message in self.decoded(times=times, chunks=chunks):
-            if len(rewards := message.get("rewards", [0.0] * learners)) != learners:
-                raise RecordingError(
-                    f"{self.file.path}: {self.topic.name}, {self._number} {message[self._number]}: found "
-                    f"{len(rewards)} rewards, expected {learners}."
-                )
+        size = 0
+        messages: list[tuple[int, bytes]] = []
+        for message in self.messages(times, chunks):
             messages.append(message)
-            size += sum(len(value) for value in message.values() if isinstance(value, bytes))
+            size += len(message[1])
             if len(messages) == _ROWS or size > _ROWS_BYTES:
-                yield _records_of(messages, self.row_dtype)
+                yield self._decoded(messages)
                 messages, size = [], 0
         if messages:
-            yield _records_of(messages, self.row_dtype)
+            yield self._decoded(messages)
+
+    def _decoded(self, messages: Sequence[tuple[int, bytes]]) -> NDArray[np.void]:
+        """Return messages of varying size as rows.
+
+        Raises:
+            RecordingError: one cannot be read; it is named.
+        """
+        try:
+            return decode_rows(self.message, messages)
+        except RecordingError as error:
+            if len(messages) == 1:
+                raise self._unreadable(messages[0][0], error) from error
+            for message in messages:
+                self._decoded([message])
+            raise
+
+    def _unreadable(self, time: int, error: RecordingError) -> RecordingError:
+        return RecordingError(f"{self.file.path}: {self.topic.name} at {time} ns: {error}")
+
+    def _rows_in(self, block: NDArray[np.void]) -> NDArray[np.void]:
+        """Return message records of one size as rows.
+
+        Raises:
+            RecordingError: they have a value that its space does not have.
+        """
+        try:
+            return rows_of(self.message, block)
+        except RecordingError as error:
+            raise self._unreadable(int(block["log_time"][0]), error) from error
 
     def _blocks_between(self, times: range) -> Iterator[NDArray[np.void]]:
         start, stop = _log_times(times)
         for _, block in self._blocks_of(self._overlapping(times)):
             low, high = (int(np.searchsorted(block["log_time"], time)) for time in (start, stop))
             if low < high:
-                yield block[low:high]
+                yield self._rows_in(block[low:high])
 
     def _overlapping(self, times: range, chunks: Sequence[int] | None = None) -> list[int]:
         """Return those of some chunks, by default of all, that may have messages of these times."""
@@ -295,7 +324,7 @@ class TopicChunks:
         Raises:
             RecordingError: one cannot be read, or has more than `max_bytes` bytes.
         """
-        parse = partial(decode, self.topic.message)
+        parse = partial(decode, self.message)
         for time, fields in self.parsed(parse, max_bytes, times, chunks):
             yield {"log_time": time} | fields | self.unknown
 
@@ -318,7 +347,7 @@ class TopicChunks:
                     raise RecordingError(f"found {len(payload):,} bytes, expected at most {max_bytes:,}.")
                 message = parse(payload)
             except RecordingError as error:
-                raise RecordingError(f"{self.file.path}: {self.topic.name} at {time} ns: {error}") from error
+                raise self._unreadable(time, error) from error
             yield time, message
 
     @cached_property
@@ -358,13 +387,6 @@ class TopicChunks:
 
     def _damaged(self, k: int, found: str) -> RecordingError:
         return _damaged(self.file.path, self.entry(k), found)
-
-
-def _records_of(messages: Sequence[Message], dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    records = np.zeros(len(messages), dtype)
-    for name in messages[0]:
-        records[name] = [message[name] for message in messages]
-    return records
 
 
 def _log_times(times: range) -> tuple[np.uint64, np.uint64]:

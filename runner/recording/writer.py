@@ -17,7 +17,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
 from runner.recording.chunks import Chunk
-from runner.recording.index import Index, checksum, schemas_and_channels
+from runner.recording.index import Index, beginning_of, checksum
+from runner.recording.layout import Layout
 from runner.recording.records import (
     AttachmentRecord,
     MetadataRecord,
@@ -28,7 +29,7 @@ from runner.recording.records import (
     copied_chunk,
     metadata_record,
 )
-from runner.recording.schema import KINDS, PROFILE, TOPIC_OF, Topic
+from runner.recording.schema import PROFILE, TOPIC_OF
 from runner.util import __version__
 
 _LIBRARY = f"dualtaxi {__version__}"
@@ -37,19 +38,20 @@ _LIBRARY = f"dualtaxi {__version__}"
 class RecordingFile:
     """A recording that is written: append records, then `finish`. Not thread-safe."""
 
-    def __init__(self, path: Path, topics: Sequence[Topic] = KINDS["job"]) -> None:
+    def __init__(self, path: Path, layout: Layout | None = None) -> None:
         """Create the file; one that exists is never overwritten.
+
+        Args:
+            layout: of the run; None if `begin` follows, before anything else is written.
 
         Raises:
             OSError: it exists, or cannot be created.
         """
-        self._set(path, path.open("xb", buffering=0), topics, Index())
+        self._set(path, path.open("xb", buffering=0), Index())
         try:
-            self._append(
-                b"".join(
-                    (MCAP0_MAGIC, bytes_of(Header(PROFILE, _LIBRARY)), *schemas_and_channels(tuple(topics)))
-                )
-            )
+            self._append(MCAP0_MAGIC + bytes_of(Header(PROFILE, _LIBRARY)))
+            if layout is not None:
+                self.begin(layout)
         except OSError:
             self._stream.close()
             path.unlink(missing_ok=True)
@@ -66,17 +68,21 @@ class RecordingFile:
             OSError: it cannot be written.
         """
         file = cls.__new__(cls)
-        file._set(path, path.open("r+b", buffering=0), contents.topics, contents)
+        file._set(path, path.open("r+b", buffering=0), contents)
         file._crc = checksum(file._stream, 0, contents.end)
         file.cut_back()
         return file
 
-    def _set(self, path: Path, stream: BinaryIO, topics: Sequence[Topic], index: Index) -> None:
+    def begin(self, layout: Layout) -> None:
+        """Append the schemas and channels of a run."""
+        beginning = beginning_of(layout)
+        self._append(beginning.schema_records + beginning.channel_records)
+        self._index.begin(beginning)
+
+    def _set(self, path: Path, stream: BinaryIO, index: Index) -> None:
         self.path, self._stream, self._index = path, stream, index
         self._crc = 0
         self._indexed = True
-        self.topics = tuple(topics)
-        """The topics it has channels for."""
 
     @property
     def size(self) -> int:
@@ -143,7 +149,7 @@ class RecordingFile:
         try:
             if name:
                 self.add_metadata(name, entries or {})
-            self._append(self._index.tail(self.topics, self._crc))
+            self._append(self._index.tail(self._crc))
             if synced:
                 self.sync()
         except OSError:
@@ -172,14 +178,14 @@ class RecordingFile:
         return place
 
 
-def create_recording(path: Path, topics: Sequence[Topic] = KINDS["job"]) -> RecordingFile:
-    """Return the file of a new recording with these topics.
+def create_recording(path: Path, layout: Layout | None = None) -> RecordingFile:
+    """Return the file of a new recording; arguments as for `RecordingFile`.
 
     Raises:
         StorageError: it exists, or cannot be created.
     """
     try:
-        return RecordingFile(path, topics)
+        return RecordingFile(path, layout)
     except OSError as error:
         raise StorageError(
             f"{path}: cannot be created ({error.strerror}); choose another --recordings."

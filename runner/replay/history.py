@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 
@@ -35,7 +34,7 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     replay = TableReplay(recording)
     shape = (len(replay.tables), max(table.shape[1] for table in replay.tables))
     history = StateHistory(np.zeros(shape, np.int64), np.full(shape, -1), np.full(shape, -1))
-    pending = np.empty(0, recording.dtypes[schema.TRAIN_STEP]), np.empty((0, *shape))
+    pending = np.empty(0, recording.train.steps.row_dtype), np.empty((0, *shape))
     while replay.step < step:
         first, stop = replay.step, min(replay.step + _STEPS_AT_ONCE, step)
         rows = replay.rows(stop)

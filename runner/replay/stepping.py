@@ -103,9 +103,9 @@ class Stepper(ABC):
         self._recording = recording
         self.observation_space, self.action_space = self._spaces()
         self._learners = len(recording.agents)
-        phase, after = recording.train, "next_state" if recording.has_states else "next_observation"
-        fields = (phase.steps.dtype, after), (phase.resets.dtype, "observation")
-        self.dtypes = Dtypes(*(np.dtype(object) if own is None else own[name] for own, name in fields))
+        topics, after = recording.train.topics, "next_state" if recording.has_states else "next_observation"
+        steps, resets = map(recording.layout.rows, (topics.steps, topics.resets))
+        self.dtypes = Dtypes(steps[after], resets["observation"])
 
     @abstractmethod
     def _spaces(self) -> tuple[Space, Space]:

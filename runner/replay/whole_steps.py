@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.actions import after_step
-from runner.recording.blocks import blank_records
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.schema import PHASE_NAMES
 from runner.recording.spaces import least_number
@@ -28,7 +27,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
         RecordingError: actions of the episode were lost, or it is too long for an array.
     """
     span, topic = recording.phase(phase).episode_span(episode), recording.phase(phase).steps.topic
-    if len(span) * recording.dtypes[topic].itemsize > MAX_EPISODE_BYTES:
+    if len(span) * recording.layout.rows(topic).itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
             f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to rerun for "
             f"an array; `dualtaxi rerecord {recording.run_id}` records them."
@@ -60,7 +59,7 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
 def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDArray[np.void]:
     """Return whole records of recorded actions, without states, observations and rewards."""
     topic = recording.phase(phase).steps.topic
-    records = blank_records(topic, recording.dtypes[topic], len(rows))
+    records = np.zeros(len(rows), recording.layout.rows(topic))
     for name in rows.dtype.names or ():
         if name != "digest":
             records[name] = rows[name]

@@ -1,6 +1,6 @@
 """Types of arrays that many modules handle."""
 
-from typing import TypeAlias, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,3 +14,8 @@ Records = NDArray[np.void]
 MaskedArray: TypeAlias = "np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]"
 """An `Array` with missing values; a string, as loading `numpy.ma` takes 20 ms."""
 Ints = NDArray[np.int64]
+
+
+def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+    """Return zeros of a dtype that may have a shape of its own, also one without elements."""
+    return np.zeros((*shape, *dtype.shape), dtype.base)

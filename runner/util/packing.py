@@ -25,3 +25,5 @@ class Packing:
     """Whether each message is indexed, or only each chunk."""
     chunk_steps: int = 1 << 14
     """The most steps in a chunk."""
+    values: bool = False
+    """Whether steps hold values of spaces, such as arrays of floats, and not the numbers of states."""

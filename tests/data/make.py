@@ -31,7 +31,7 @@ from tests.runner.loops.making import make as make_env
 HERE = Path(__file__).parent
 NAMES = ("cooperative", "competitive")
 LOOPS = {"taxi": "Taxi-v4", "pole": "CartPole-v1", "rooms": "RoomsText"}
-"""A loop of each kind: steps, transitions of fixed width, and of variable width."""
+"""Loops over states, over values of one size, and over values of varying size."""
 TOGETHER = ("vector", "game")
 """Loops over several environments at once, and over agents of which one after the other leaves."""
 

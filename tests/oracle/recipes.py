@@ -212,8 +212,8 @@ def _partial(folder: Path) -> Iterator[tuple[str, Path]]:
         for phase, seed in (("train", 5), ("eval", 6), ("train", 7)):
             with rec.phase(phase):
                 list(play(rec, 300, seed))
-    yield "loop-killed", _cut(rec.run.recording, schema.TRAIN_TRANSITION, 2)
-    without_chunk(rec.run.recording, schema.TRAIN_TRANSITION, 1)
+    yield "loop-killed", _cut(rec.run.recording, schema.TRAIN_STEP, 2)
+    without_chunk(rec.run.recording, schema.TRAIN_STEP, 1)
     yield "loop-repaired", rec.run.recording
     with runner.record(Counting(4), folder, frames_every=3) as rec:
         list(play(rec, 30))

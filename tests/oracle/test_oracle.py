@@ -67,7 +67,7 @@ def _other_luck(text: str) -> str:
 
 ALTERATIONS = {
     "steps": ("cooperative", schema.TRAIN_STEP, _changed("rewards", 17), "train.steps.rewards, row 17:"),
-    "flags": ("vector", schema.TRAIN_TRANSITION, _changed("truncated", 5), "train.steps.truncated, row 5:"),
+    "flags": ("vector", schema.TRAIN_STEP, _changed("truncated", 5), "train.steps.truncated, row 5:"),
     "resets": ("pole", schema.TRAIN_RESET, _changed("seed", 2), "train.resets.seed, row 2:"),
     "episodes": ("pole", schema.TRAIN_EPISODE, _changed("length", 3), "train.episodes.length, row 3:"),
     "evaluations": (

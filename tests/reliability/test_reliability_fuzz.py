@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
-from runner.recording.blocks import blank_records, record_dtype
+from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from tests.reliability.hostile import (
@@ -100,7 +101,7 @@ def with_chunks(data: bytes, bodies: list[bytes], finished: bool) -> bytes:
 
 def steps_of_zeros(size: int) -> bytes:
     """Return equal messages of training steps with about this size."""
-    one = blank_records(schema.TRAIN_STEP, record_dtype(schema.STEP, 2), 1).tobytes()
+    one = blank_records(schema.TRAIN_STEP, layout_of("job", 2, 0).message(schema.TRAIN_STEP), 1).tobytes()
     return one * (size // len(one))
 
 

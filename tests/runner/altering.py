@@ -31,7 +31,7 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
         change: maps all of its messages, one array or a list of (log time, payload), to the new ones.
         metadata: by the name of a metadata record, a function from its entries to the new ones.
     """
-    with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
+    with open_recording(source) as recording, RecordingFile(target, recording.layout) as file:
         contents = survey(source, keep_result=True)
         names = list(contents.metadata)
         entries = {name: recording.file.metadata(name) for name in names}
@@ -64,12 +64,10 @@ def without_chunk(path: Path, topic: Topic, number: int) -> int:
 
 def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes], list[int]]:
     """Return the bytes and the log time of each message of a topic, changed."""
-    if topic in recording.dtypes:
-        table = recording.table(topic)
-        blocks = [block.copy() for block in table.blocks()] if table else []
-        if not blocks:
+    if (dtype := recording.layout.dtype(topic)) is not None:
+        if not (stored := bytearray(b"".join(recording.table(topic).records()))):
             return [], []
-        whole = change(np.concatenate(blocks))
+        whole = change(np.frombuffer(stored, dtype))
         return [record.tobytes() for record in whole], whole["log_time"].tolist()
     messages = change(list(recording.table(topic).messages()))
     return [_record(topic, *message) for message in messages], [time for time, _ in messages]

@@ -41,7 +41,7 @@ FIELDS: Final = (
     "truncated",
 )
 """The fields of a step that are compared, in the order in which a step comes about."""
-_TRANSITION_FIELDS: Final = (
+_VALUE_FIELDS: Final = (
     "episode",
     "t",
     "acted",
@@ -274,13 +274,18 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
     return replace(divergence, episode=divergence.episode - start, after=after)
 
 
+def _compared(a: Recording, b: Recording, phase: str) -> tuple[str, ...]:
+    """Return the fields in which steps are compared: those that both recordings have."""
+    ours, theirs = (set(one.phase(phase).steps.row_dtype.names or ()) for one in (a, b))
+    fields = FIELDS if a.has_states else _VALUE_FIELDS
+    return tuple(name for name in fields if name in ours & theirs)
+
+
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
     """Return the same; the number of a trial is that among all evaluations."""
     (ours, theirs), is_tabular = (one.phase(phase).steps for one in (a, b)), a.has_states
     alone = [one.phase(phase).steps.are_actions for one in (a, b)]
-    common = set(ours.row_dtype.names or ()) & set(theirs.row_dtype.names or ())
-    digest = ("digest",) if all(alone) else ()
-    fields = (*(each for each in (FIELDS if is_tabular else _TRANSITION_FIELDS) if each in common), *digest)
+    fields = (*_compared(a, b, phase), *(("digest",) if all(alone) else ()))
     divergence = _divergence(phase, ours.rows(), theirs.rows(), fields)
     if not is_tabular:  # else a step has the state before it
         divergence = (
@@ -315,7 +320,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
     blocks = [
         episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)
     ]
-    fields = tuple(name for name in (FIELDS if a.has_states else _TRANSITION_FIELDS) if name != "episode")
+    fields = tuple(name for name in _compared(a, b, origin.phase) if name != "episode")
     divergence = _divergence(origin.phase, blocks[0], blocks[1], fields)
     if divergence is None:
         return None

@@ -13,7 +13,6 @@ from runner.analysis.diff.divergence import FIELDS, Block, differing_rows, unbro
 from runner.environments.mdp import Mdp
 from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
-from runner.recording import schema
 from runner.recording.reader import Recording
 
 _MAX_STATES: Final = 5
@@ -132,7 +131,7 @@ class _Steps:
     def __init__(self, recording: Recording) -> None:
         self._path = recording.path
         self._blocks = recording.train.steps.blocks()
-        self._rest: Block = np.empty(0, recording.dtypes[schema.TRAIN_STEP])
+        self._rest: Block = np.empty(0, recording.train.steps.row_dtype)
         self._visits = np.zeros(recording.mdp.states, np.int64)
 
     def take(self, count: int) -> Block:

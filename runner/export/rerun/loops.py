@@ -318,7 +318,7 @@ class LoopReader:
         for span in spans:
             for start in range(span.start, span.stop, limit):
                 blocks = table.blocks(start, min(start + limit, span.stop))
-                steps = np.concatenate([np.empty(0, table.dtype), *blocks])
+                steps = np.concatenate([np.empty(0, table.row_dtype), *blocks])
                 steps = steps[steps["t"] != schema.RESET_ONLY]
                 if len(steps):
                     if self._scene:

@@ -218,7 +218,7 @@ def test_every_number_of_an_observation_has_a_column(tmp_path):
     assert scalars.query("phase == 'eval'")[["name", "value"]].to_numpy().tolist() == [["score", 2.5]]
     assert pq.read_table(folder / layout.LOG)["name"].unique().to_pylist() == ["note"]
     run = pq.read_table(folder / layout.RUN).to_pylist()[0]
-    assert (run["kind"], run["env_id"], run["environments"]) == ("transition", "CartPole-v1", 1)
+    assert (run["kind"], run["env_id"], run["environments"]) == ("loop", "CartPole-v1", 1)
 
 
 def test_values_of_nested_spaces_are_named_by_their_path(tmp_path):
@@ -269,7 +269,7 @@ def test_a_message_that_no_recorder_writes_is_refused(tmp_path):
     def with_more(messages):
         return [(time, payload + b"\x98\x06\x01") for time, payload in messages]
 
-    odd = altered(path, tmp_path / "odd.mcap", schema.TRAIN_TRANSITION_VARIABLE, with_more)
+    odd = altered(path, tmp_path / "odd.mcap", schema.TRAIN_STEP, with_more)
     with pytest.raises(RecordingError, match="no recorder writes"):
         archived(odd, tmp_path / "archive")
 

@@ -17,13 +17,14 @@ def contents(path):
     """Return all that a recording holds, but where its chunks were closed."""
     with open_recording(path) as recording:
         blocks = {
-            topic.name: b"".join(block.tobytes() for block in recording.table(topic).blocks())
-            for topic in recording.dtypes
+            topic.name: b"".join(recording.table(topic).records())
+            for topic in recording.topics
+            if recording.layout.dtype(topic) is not None
         }
         messages = {
             topic.name: list(recording.table(topic).messages())
             for topic in recording.topics
-            if topic not in recording.dtypes
+            if recording.layout.dtype(topic) is None
         }
         metadata = {name: recording.file.metadata(name) for name in recording.file.metadata_names}
         return blocks, messages, metadata, list(recording.file.attachments())

@@ -14,6 +14,7 @@ from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import CHUNK_HEAD, encode_chunk
+from runner.recording.reader import open_recording
 from runner.recording.records import ReadChunk, walk
 from runner.recording.repair import repair
 from runner.recording.rewriting import whole_records
@@ -37,7 +38,9 @@ def repacked(run, folder, compression="zstd", level=19, damaged=None, altered=No
     copy = runner.Run(Path(shutil.copytree(run.folder, folder / run.run_id)), run.facts)
     copy.recording.unlink()
     places = [place for place, _, _ in packed_steps(run)]
-    with RecordingFile(copy.recording) as file:
+    with open_recording(run.recording) as recording:
+        layout = recording.layout
+    with RecordingFile(copy.recording, layout) as file:
         for record in whole_records(run.recording):
             if not isinstance(record, ReadChunk):
                 file.copy(record)

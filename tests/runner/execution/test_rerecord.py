@@ -48,7 +48,7 @@ def test_the_steps_recorded_later_are_those_that_were(measured, whole):
         for topic in schema.BLOCK_TOPICS:
             left, right = (one.table(topic).array() for one in (later, at_once))
             assert left.tobytes() == right.tobytes()
-        assert later.metadata("rerecord")["dualtaxi"]
+        assert later.file.metadata("rerecord")["dualtaxi"]
         circumstances = [list(later.table(topic).messages()) for topic in schema.MACHINE_TOPICS]
         assert circumstances == before, "the time that the training took"
         assert later.provenance == at_once.provenance

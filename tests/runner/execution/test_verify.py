@@ -115,7 +115,7 @@ def test_one_figure(run, tmp_path, topic, field, value):
     change = setting_in_message(1, **{field: value})(topic)
     found = verify(altered(run.recording, tmp_path / "x.mcap", topic, change))
     with open_recording(run.recording) as recording:
-        metrics = recording.metrics(topic.phase)[1]
+        metrics = recording.phase(topic.phase).all_metrics()[1]
     difference = found.difference
     assert (difference.topic, difference.field) == (topic.name, field)
     assert (difference.found, difference.expected) == (value, metrics[field])

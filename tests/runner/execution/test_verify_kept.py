@@ -73,6 +73,12 @@ def test_environments_in_parallel_are_distinguished():
 
 def test_kept_loops_have_every_kind_of_message_but_frames():
     kept = {topic for name in (*LOOPS, *TOGETHER) for topic in EXPECTED[name]["messages"]}
-    topics = {topic for name in schema.LOOP_TOPICS for topic in schema.KINDS[name]}
-    every = {topic.name for topic in topics if topic.channel <= schema.FIRST_VERSION_CHANNELS}
-    assert kept == every - {"/train/frame", "/eval/frame"}
+    every = {topic.name for topic in schema.KINDS["loop"]}
+    others = ("frame", "extra", "actions")
+    left_out = {f"/{phase}/{name}" for phase in schema.PHASES for name in others}
+    assert kept == every - left_out - {
+        "/extra",
+        "/checkpoint",
+        "/image",
+        *(topic.name for topic in schema.MACHINE_TOPICS),
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import gymnasium
 import numpy as np
@@ -17,7 +18,6 @@ from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import check_phase
 from runner.recording.digest import ContentHash
-from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of
 from runner.recording.topic_chunks import TopicChunks
@@ -222,27 +222,38 @@ def test_a_loop_that_was_killed_is_sound_as_far_as_it_goes(loops, tmp_path, name
         assert "/eval/" not in finding, finding
 
 
+REWARD = b'^"\x08.{8}'
+"""The reward of a step, and below its number, as they stand in a message."""
+STEP_3 = b"\\)\x03\x00{7}"
+
+
 @pytest.mark.parametrize(
-    ("field", "value", "finding"),
+    ("part", "other", "finding"),
     [
-        ("rewards", [1.0, 2.0], "step 3: found 2 rewards, expected 1"),
-        ("rewards", [], "step 3: found 0 rewards, expected 1"),
-        ("step", 4, "found step 4, expected 3"),
+        (
+            REWARD,
+            b'"\x10' + bytes(16),
+            "at 400000000 ns: found a payload that is no dualtaxi.Step",
+        ),
+        (REWARD, b"", "at 400000000 ns: found a payload that is no dualtaxi.Step"),
+        (STEP_3, b")\x04" + bytes(7), "found step 4, expected 3"),
     ],
 )
-def test_messages_of_varying_size_have_their_number_and_their_rewards(
-    tmp_path, monkeypatch, field, value, finding
-):
-    def encoded(message, fields):
-        wrong = "rewards" in fields and fields["step"] == 3
-        return encode(message, fields | ({field: value} if wrong else {}))
-
-    monkeypatch.setattr("runner.recording.messages.encode", encoded)
+def test_messages_of_varying_size_have_their_number_and_their_rewards(tmp_path, part, other, finding):
     with runner.record(Rooms(with_text=True), tmp_path) as rec:
         rec.reset(seed=1)
         for _ in range(5):
             rec.step(rec.action_space.sample())
-    assert finding in verify(rec.run.recording).finding
+
+    def change(messages):
+        time, payload = messages[3]
+        changed = re.sub(part, lambda _: other, payload, count=1, flags=re.DOTALL)
+        assert changed != payload
+        messages[3] = time, changed
+        return messages
+
+    odd = altered(rec.run.recording, tmp_path / "odd.mcap", schema.TRAIN_STEP, change)
+    assert finding in verify(odd).finding
 
 
 def test_descriptions_of_a_loop_that_cannot_be_true_are_refused(tmp_path):
@@ -305,7 +316,7 @@ def test_each_message_is_compared_in_a_time_that_does_not_grow(tmp_path, monkeyp
         for _ in range(300):
             rec.reset()
     with open_recording(rec.run.recording) as recording:
-        total = recording.table(recording.topic(topic)).count()
+        total = recording.table(topic).count()
         monkeypatch.setattr(TopicChunks, "blocks", counted(TopicChunks.blocks))
         check_phase(recording, "train", complete=True)
         assert total <= sum(read) <= 4 * total

@@ -47,7 +47,7 @@ def test_a_rerun_in_another_environment_diverges(tmp_path, monkeypatch):
 
 def described_as(source, target, change):
     """Rewrite a recording with another description of its environment; return its path."""
-    with open_recording(source) as recording, RecordingFile(target, recording.topics) as file:
+    with open_recording(source) as recording, RecordingFile(target, recording.layout) as file:
         for name in recording.file.metadata_names:
             if name != "result":
                 file.add_metadata(name, recording.file.metadata(name))

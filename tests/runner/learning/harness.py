@@ -14,7 +14,8 @@ from runner.environments.mdp import Mdp
 from runner.learning import kernel
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_dtype
+from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 from runner.replay.step_replay import NO_ROWS, NO_UPDATES
 from tests.runner.learning.twin import Twin
 
@@ -172,7 +173,7 @@ def blank_blocks(learner: Learner, n: int) -> tuple[Any, ...]:
     """Return n step records and n episode records to fill, such as the recorder hands out."""
     learners, events = len(learner.agents), len(learner.mdp.event_names)
     return tuple(
-        blank_records(topic, topic_dtype(topic, learners, events), n).view(np.recarray)
+        blank_records(topic, layout_of("job", learners, events).message(topic), n).view(np.recarray)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
 

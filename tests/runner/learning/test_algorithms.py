@@ -16,7 +16,8 @@ from runner.execution.verify import verify
 from runner.learning.algorithms import NUMBERS
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_dtype
+from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, named_tables_at, tables_at
 from runner.runs.listing import list_runs
@@ -59,7 +60,7 @@ def live(run, step):
     learner = Learner(config, mdp, 3)
     counts = len(learner.agents), len(mdp.event_names)
     steps, episodes = (
-        blank_records(topic, topic_dtype(topic, *counts), step + 1).view(np.recarray)
+        blank_records(topic, layout_of("job", *counts).message(topic), step + 1).view(np.recarray)
         for topic in (schema.TRAIN_STEP, schema.TRAIN_EPISODE)
     )
     if step:

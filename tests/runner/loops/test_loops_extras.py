@@ -25,7 +25,6 @@ from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.chunks import encode_chunk
-from runner.recording.integrity import survey
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from runner.recording.records import ReadChunk
@@ -332,8 +331,9 @@ def test_forged_names_are_refused(tmp_path):
 
 def forge(source: Path, path: Path, payload: bytes) -> None:
     """Copy a recording with another message in place of the names of its extras."""
-    contents = survey(source, keep_result=True)
-    with RecordingFile(path, contents.topics) as file:
+    with runner.open_recording(source) as recording:
+        layout = recording.layout
+    with RecordingFile(path, layout) as file:
         for record in whole_records(source):
             if isinstance(record, ReadChunk) and record.topic is schema.EXTRA_COLUMNS_TOPIC:
                 message = message_record(record.topic, int(record.times[0]), payload)

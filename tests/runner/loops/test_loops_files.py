@@ -18,16 +18,15 @@ import runner
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.recording.metadata import kind_of
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
 from tests.runner.loops.making import Rooms, dualtaxi, make, play
 
-KINDS = {"FrozenLake-v1": "step", "CartPole-v1": "transition", "Rooms": "transition", "RoomsText": "variable"}
+NAMES = ("FrozenLake-v1", "CartPole-v1", "Rooms", "RoomsText")
 
 
-@pytest.fixture(scope="session", params=KINDS)
+@pytest.fixture(scope="session", params=NAMES)
 def whole(request, tmp_path_factory):
     """Return the name of an environment and a recording of it with every topic."""
     folder = tmp_path_factory.mktemp("files")
@@ -54,15 +53,17 @@ def test_the_official_reader_reads_every_message(whole):
             if message.channel.topic == "/train/step" and first is None:
                 first = message.decoded_message
     with open_recording(path) as recording:
-        assert kind_of(recording.run) == KINDS[name]
+        assert recording.has_states == (name == "FrozenLake-v1")
         assert counts.pop("/clock") >= 2  # where it began, and where it ended
         counts.pop("/host", None)  # of a loop that takes over a second
         assert dict(counts) == recording.result["messages"]
         one = next(recording.train.transitions())
     assert first.step == 0
     assert list(first.rewards) == one["rewards"].tolist()
-    if KINDS[name] != "step":
-        assert set(counts) <= {topic.name for topic in schema.KINDS["transition"]}
+    assert set(counts) <= {topic.name for topic in schema.KINDS["loop"]}
+    if name == "CartPole-v1":
+        assert first.action == one["action"]
+        assert list(first.next_observation) == one["next_observation"].tolist()
 
 
 def test_rerun_verifies_the_recording(whole):
@@ -78,7 +79,7 @@ def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     with open_recording(path) as recording:
         topic = recording.table("/train/step").topic
         before = recording.table(topic).count()
-        entry = recording.table(topic).entry(1 if KINDS[name] != "variable" else 0)
+        entry = recording.table(topic).entry(1 if name != "RoomsText" else 0)
     at = entry.offset + entry.length - 40
     data[at : at + 8] = b"\xff" * 8
     damaged.write_bytes(data)
@@ -87,8 +88,8 @@ def test_a_damaged_chunk_is_reported_and_the_rest_is_read(whole, tmp_path):
     assert not done.lossless
     with open_recording(damaged) as recording:
         kept = [int(step["step"]) for step in recording.train.transitions()]
-        assert before - len(kept) > 0 or KINDS[name] == "variable"
-        if KINDS[name] != "variable":
+        assert before - len(kept) > 0 or name == "RoomsText"
+        if name != "RoomsText":
             ((start, stop),) = recording.lost["/train/step"]
             assert kept == [k for k in range(before) if not start <= k < stop]
         assert recording.eval.steps.count() == 300
@@ -161,7 +162,7 @@ def test_a_description_nested_without_end_is_refused(pole, tmp_path):
     deep = '{"type":"Tuple","spaces":[' * 40 + '{"type":"Text"}' + "]}" * 40
     made = altered(pole, tmp_path, spaces=f'{{"observation": {deep}, "action": {{}}}}')
     with pytest.raises(RecordingError, match="describes no space"), open_recording(made) as recording:
-        _ = recording.dtypes
+        _ = recording.layout
 
 
 def test_csv_lists_the_omitted_columns(tmp_path):

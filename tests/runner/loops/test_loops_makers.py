@@ -365,7 +365,7 @@ def test_the_agents_of_a_game_have_names_of_actions(tmp_path):
         while rec.agents:
             rec.step(dict(zip(rec.agents, (0, 2, 4), strict=True)))
     with open_recording(rec.run.recording) as recording:
-        assert recording.action_names("train", "agent_1") == ("no action", "left", "right", "down", "up")
+        assert recording.train.action_names("agent_1") == ("no action", "left", "right", "down", "up")
         assert recording.train.action_names() == ()
         described, _ = describer(recording, "train")(next(recording.train.transitions()))
         (first, *_) = Episode(recording, named_episode(recording, "train", 0), "").steps()

@@ -271,12 +271,12 @@ def tide(folder: Any, is_discrete: bool, mode: AutoresetMode) -> Any:
 
 
 TIDES = {
-    (True, AutoresetMode.NEXT_STEP): "7d1212c6b4beb05409c57d86fc187cb74c08a52ae97aad3486699367c518a535",
-    (True, AutoresetMode.SAME_STEP): "bd62f823f5c74c8a25f457876209f32e5177d1afc086662585805549eebf7b5e",
-    (True, AutoresetMode.DISABLED): "32bcc1d51885b8e685e430665920c6c9eabbffa6f4c7cc24e1b081e6d17c3898",
-    (False, AutoresetMode.NEXT_STEP): "76a3990be866c24b7082ba31f151868c2aff7d45cc46be6fe3bb6bd665a28641",
-    (False, AutoresetMode.SAME_STEP): "3f0fc9f5ea657a96a7502bb9e238cc9826734cffa16289009f7a3f190b1a4cf8",
-    (False, AutoresetMode.DISABLED): "14ddde05557dd75f9bd67ab2d0960a51e84bb87d354e4b4f147821f7d5a4c852",
+    (True, AutoresetMode.NEXT_STEP): "4d38e8e7a58b97fb5aaf7d82501e4872fad13e11135308e0d76626d8f2b94741",
+    (True, AutoresetMode.SAME_STEP): "12b03ee778453306a3624f0ef7032200e52361ecfa70e6a549b19f80c312f979",
+    (True, AutoresetMode.DISABLED): "b6f1492de4aba13155fad09e3db99691d878fdea0f267e307aa281ac95f11a65",
+    (False, AutoresetMode.NEXT_STEP): "09ec7d3b17143e3738ad7b0a240d6f9c72a5ac807d47d85972138f6d3b617298",
+    (False, AutoresetMode.SAME_STEP): "4531218a8fd22e5b0a387cfd3380170643aa19feadb43b85be2eb4e80385c271",
+    (False, AutoresetMode.DISABLED): "4c6d320109551bf82121f7d1371bdbd5bc6fa55ad949eaa3b46f8e8b62b26239",
 }
 """Content digests by kind of spaces and autoreset mode."""
 

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 import runner
 from runner.execution.verify import verify
 from runner.recording import schema
-from runner.recording.metadata import kind_of
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import Rooms
 
@@ -104,9 +103,7 @@ def test_a_loop_is_recorded_as_it_was_seen(seed, make, length):
         with open_recording(rec.run.recording) as recording:
             for each in PHASES:
                 names_of = (
-                    ("action", "next_state")
-                    if kind_of(recording.run) == "step"
-                    else ("action", "next_observation")
+                    ("action", "next_state") if recording.has_states else ("action", "next_observation")
                 )
                 fields = (*names_of, "rewards", "terminated", "truncated")
                 found = [

@@ -23,7 +23,6 @@ from runner.errors import ConfigError, EnvironmentNotUsable, RecordingError, Run
 from runner.loops.media import Histogram, Image
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
-from runner.recording.metadata import kind_of
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
@@ -80,7 +79,7 @@ def test_steps_have_the_values_of_the_loop(loop):
     steps = [entry for entry in seen if entry[0] == "step"]
     with open_recording(path) as recording:
         found = list(recording.train.transitions())
-        after = "next_state" if kind_of(recording.run) == "step" else "next_observation"
+        after = "next_state" if recording.has_states else "next_observation"
     assert len(found) == len(steps) == STEPS
     for one, (_, action, observation, reward, terminated, truncated, _) in zip(found, steps, strict=True):
         assert agree(one["action"], action)

@@ -119,7 +119,7 @@ def test_a_shard_of_another_kind_is_kept_and_the_others_are_folded(run, tmp_path
     folded = fold_if_over(run)
     assert steps_in(folded.recording) == 100 + 2 * STEPS
     assert folded.status == "interrupted"
-    assert "taxi: found kind step, expected transition" in folded.summary.error
+    assert "taxi: found agents ['taxi'], expected ['agent']" in folded.summary.error
     kept = dualtaxi(tmp_path, "show", str(run.folder / "unfolded" / "taxi"))
     assert "50 of training" in kept.output
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.execution.session import run_job
-from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.runs.run import Run, create_run
@@ -77,7 +76,7 @@ def training(run: Run, start: int = 0, stop: int | None = None) -> NDArray[np.vo
     """Return recorded training steps of a run."""
     with open_recording(run.recording) as recording:
         blocks = recording.train.steps.blocks(start, stop)
-        return np.concatenate([np.empty(0, recording.dtypes[schema.TRAIN_STEP]), *blocks])
+        return np.concatenate([np.empty(0, recording.train.steps.row_dtype), *blocks])
 
 
 def middle_of(run: Run, share: float = 0.5) -> int:

@@ -43,7 +43,7 @@ def all_messages(recording) -> dict[str, list]:
         found[topic.name] = list(recording.table(topic).messages())
         if topic in schema.BLOCK_TOPICS:
             blocks = list(recording.table(topic).blocks())
-            rows = np.concatenate(blocks) if blocks else np.empty(0, recording.dtypes[topic])
+            rows = np.concatenate(blocks) if blocks else np.empty(0, recording.table(topic).row_dtype)
             assert rows["log_time"].tolist() == [time for time, _ in found[topic.name]]
             assert recording.table(topic).count() == len(rows)
     return found

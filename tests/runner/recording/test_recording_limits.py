@@ -17,7 +17,7 @@ from runner.config.job import Job
 from runner.errors import StorageError
 from runner.execution.session import run_job
 from runner.recording import pipeline, schema
-from runner.recording.blocks import record_dtype
+from runner.recording.layout import layout_of
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs.resolve import find_run
@@ -58,7 +58,7 @@ def test_memory_does_not_grow_with_the_number_of_steps(tmp_path):
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 0, done.stderr
     steps, growth = map(int, done.stdout.split())
-    record_bytes = record_dtype(schema.STEP, 1).itemsize
+    record_bytes = layout_of("job", 1, 0).dtype(schema.TRAIN_STEP).itemsize
     assert steps > 4_000_000
     assert growth < steps * record_bytes / 10, "a tenth of the steps would not fit in what it grew by"
 

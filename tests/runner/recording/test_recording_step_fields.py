@@ -13,6 +13,7 @@ from runner.archive.columns import Shape
 from runner.archive.rows import batch_of, records_of
 from runner.recording import schema
 from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 
 NAMES = [field.name for field in schema.STEP.fields]
 
@@ -30,18 +31,20 @@ def test_a_data_frame_has_it(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_archive_keeps_it(name):
     run = {"kind": "job", "learners": "1", "events": "0"}
+    job = layout_of("job", 1, 0)
     shape = Shape(
         SimpleNamespace(
             path="a recording",
             run_id="k3v9m2xq",
             agents=("agency",),
-            topics=schema.KINDS["job"],
+            topics=job.topics,
+            layout=job,
             tabular=False,
             can_train_again=True,
             run=run,
         )
     )
-    records = blank_records(schema.TRAIN_STEP, shape.dtypes[schema.TRAIN_STEP], 1)
+    records = blank_records(schema.TRAIN_STEP, job.message(schema.TRAIN_STEP), 1)
     records[name] = 1
     table = shape.tables[layout.STEPS]
     batch = batch_of(table, schema.TRAIN_STEP, records, shape)

@@ -12,7 +12,8 @@ from runner.environments.loading import load_mdp
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records, topic_dtype
+from runner.recording.blocks import blank_records
+from runner.recording.layout import layout_of
 from runner.recording.reader import open_recording
 from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode
@@ -58,8 +59,12 @@ def live(config):
     def at(step: int) -> list[np.ndarray]:
         learner = Learner(config, mdp, 0)
         counts = len(learner.agents), len(mdp.event_names)
-        block = blank_records(schema.TRAIN_STEP, topic_dtype(schema.TRAIN_STEP, *counts), max(step, 1))
-        ended = blank_records(schema.TRAIN_EPISODE, topic_dtype(schema.TRAIN_EPISODE, *counts), 100)
+        block = blank_records(
+            schema.TRAIN_STEP, layout_of("job", *counts).message(schema.TRAIN_STEP), max(step, 1)
+        )
+        ended = blank_records(
+            schema.TRAIN_EPISODE, layout_of("job", *counts).message(schema.TRAIN_EPISODE), 100
+        )
         taken = learner.train(block.view(np.recarray), ended.view(np.recarray), 10**6, step)[0] if step else 0
         assert taken == step
         return [learner.table(i).copy() for i in range(len(learner.agents))]
@@ -115,7 +120,7 @@ def test_the_history_of_a_state(run, steps, share):
 
 
 def empty(recording):
-    return np.empty(0, recording.dtypes[schema.TRAIN_STEP])
+    return np.empty(0, recording.train.steps.row_dtype)
 
 
 def history_by_hand(recording, visits, state):

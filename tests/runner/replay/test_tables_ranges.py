@@ -26,7 +26,7 @@ def whole(recording, topic):
 
 
 def joined(recording, topic, blocks):
-    return np.concatenate([np.empty(0, recording.dtypes[topic]), *blocks])
+    return np.concatenate([np.empty(0, recording.table(topic).row_dtype), *blocks])
 
 
 @pytest.mark.parametrize("topic", schema.BLOCK_TOPICS, ids=lambda topic: topic.name)

@@ -9,7 +9,9 @@ import pytest
 from sweeping import described, swept
 
 from runner import sweep as names
-from runner.recording.reader import Recording, open_recording
+from runner.recording import schema
+from runner.recording.reader import open_recording
+from runner.recording.topic_chunks import TopicChunks
 from runner.sweep import state
 from runner.sweep.charts import picture_of, picture_plots
 from runner.sweep.loading import from_values
@@ -125,7 +127,12 @@ def test_exact_measures_belong_to_their_own_evaluation(done, monkeypatch):
         | {"values": [0.5], "best_responses": [0.5]}
         for number in range(4)
     ]
-    monkeypatch.setattr(Recording, "optimality", lambda _: iter(measures[1:]))
+    decoded = TopicChunks.decoded
+
+    def without_first(table):
+        return iter(measures[1:]) if table.topic == schema.OPTIMALITY_TOPIC else decoded(table)
+
+    monkeypatch.setattr(TopicChunks, "decoded", without_first)
     with open_recording(recording_path) as recording:
         assert curve_of(recording, "exact.success_percent") == {20: 10.0, 40: 20.0, 60: 30.0}
 

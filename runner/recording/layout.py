@@ -1,0 +1,145 @@
+"""The messages of a run: their fields follow from its learners, its events and its environment's spaces.
+
+A step over states has `state`, `action` and `next_state`; in other spaces `action` and `next_observation`
+have the types of the spaces' values, with a field for each part of a `Dict` or `Tuple` (`space_fields`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any, Final
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
+
+from runner.recording import schema
+from runner.recording.blocks import record_dtype, row_dtype
+from runner.recording.schema import Field, MessageType, Topic
+from runner.recording.space_fields import has_one_size, space_field
+from runner.util.values import Json, is_whole
+
+_MAX_STATES: Final = 2**32
+"""The most states and the most actions that steps over states number."""
+NUMBERS: Final[Mapping[int, str]] = {
+    Pb.TYPE_DOUBLE: "<f8",
+    Pb.TYPE_SFIXED64: "<i8",
+    Pb.TYPE_FIXED64: "<u8",
+    Pb.TYPE_FIXED32: "<u4",
+    Pb.TYPE_BOOL: "?",
+}
+"""The dtypes of numbers by their types."""
+_OF_STATES: Final = ("state", "action", "next_state", "explored")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the messages of a run depend on."""
+
+    kind: str
+    """A key of `schema.KINDS`."""
+    learners: int
+    events: int
+    spaces: str = ""
+    """The descriptions of the `observation` and the `action` space as JSON; empty for a job."""
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """The topics of its recordings."""
+        return schema.KINDS[self.kind]
+
+    @cached_property
+    def has_states(self) -> bool:
+        """Whether its steps are over states; else over values of its spaces."""
+        return self.kind == "job" or over_states(json.loads(self.spaces))
+
+    @cached_property
+    def varies(self) -> bool:
+        """Whether values of its spaces vary in size."""
+        return any(self.dtype(topic) is None for topic in self._messages)
+
+    def message(self, topic: Topic) -> MessageType:
+        """Return the type of a topic's messages."""
+        return self._messages.get(topic, topic.message)
+
+    def dtype(self, topic: Topic) -> np.dtype[np.void] | None:
+        """Return the dtype of a topic's message records in the file; None if they vary in size."""
+        return record_dtype(self.message(topic))
+
+    def rows(self, topic: Topic) -> np.dtype[np.void]:
+        """Return the dtype in which the messages of one of `schema.ROW_TOPICS` are put down and read."""
+        return row_dtype(self.message(topic))
+
+    @cached_property
+    def _messages(self) -> dict[Topic, MessageType]:
+        """The messages of the topics that are put down as rows."""
+        types = {"step": schema.STEP, "episode": schema.EPISODE, "reset": schema.RESET}
+        if self.kind != "job":
+            spaces: Json = json.loads(self.spaces)
+            observation = space_field(1, "observation", spaces["observation"])
+            types["reset"] = _with_values(schema.RESET, observation)
+            if not self.has_states:
+                after = space_field(3, "next_observation", spaces["observation"])
+                types["step"] = _with_values(schema.STEP, space_field(2, "action", spaces["action"]), after)
+                if self.kind == "game":
+                    more = types["step"].fields + schema.AGENT_FIELDS
+                    types["step"] = replace(types["step"], fields=more)
+        sizes = {"rewards": self.learners, "returns": self.learners, "events": self.events}
+        types = {name: sized(message, sizes) for name, message in types.items()}
+        values = [field for message in types.values() for field in message.fields if field.is_value]
+        if not all(map(has_one_size, values)):
+            types = {
+                name: _values_last(message) if name != "episode" else message
+                for name, message in types.items()
+            }
+        return {
+            topic: types[topic.name.rpartition("/")[2]] for topic in self.topics if topic in schema.ROW_TOPICS
+        }
+
+
+@lru_cache(64)
+def layout_of(kind: str, learners: int, events: int, spaces: str = "") -> Layout:
+    """Return a layout, the same one each time: what follows from it is computed once."""
+    return Layout(kind, learners, events, spaces)
+
+
+def over_states(spaces: Mapping[str, Any]) -> bool:
+    """Return whether steps in these spaces are recorded over states: both spaces are `Discrete`."""
+    return all(
+        spaces[name].get("type") == "Discrete" and is_whole(spaces[name].get("n"), 1, _MAX_STATES)
+        for name in ("observation", "action")
+    )
+
+
+def _with_values(message: MessageType, *values: Field) -> MessageType:
+    """Return a message with values of spaces in place of states."""
+    left_out = {"observation", *_OF_STATES}
+    others = tuple(field for field in message.fields if field.name not in left_out)
+    return replace(message, fields=(*values, *others))
+
+
+def _values_last(message: MessageType) -> MessageType:
+    """Return a message that varies in size with its values of spaces last: the rest has one size."""
+    fields = tuple(sorted(message.fields, key=lambda field: field.is_value))
+    return replace(message, fields=fields, varies=True)
+
+
+def sized(message: MessageType, sizes: Mapping[str, int | np.dtype[Any]]) -> MessageType:
+    """Return a message with the dtypes of its numbers.
+
+    Args:
+        sizes: of each repeated field the number of elements, of each field of bytes its dtype.
+    """
+
+    def with_dtype(field: Field) -> Field:
+        size = sizes.get(field.name)
+        if isinstance(size, np.dtype):
+            return replace(field, dtype=size)
+        if field.is_value or field.kind not in NUMBERS:
+            return field
+        number = NUMBERS[field.kind]
+        return replace(field, dtype=np.dtype((number, (size,)) if field.repeated else number))
+
+    return replace(message, fields=tuple(map(with_dtype, message.fields)))

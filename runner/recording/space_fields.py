@@ -1,0 +1,271 @@
+"""The values of a space as fields of a message: named, typed, and readable by any Protobuf reader.
+
+| space | field |
+|---|---|
+| a number of 32 or 64 bits, or a bool | of that type |
+| a smaller number | of 32 bits |
+| an array of numbers of 32 or 64 bits, or of bools | packed, row by row |
+| an array of smaller numbers | `bytes`: the array, row by row, little-endian |
+| a text | `string`; one with unpaired surrogates is in the field `NAME_raw`, as `bytes` |
+| `Dict`, `Tuple`, the agents of a game | a nested message with a field for each part |
+
+All fields are always written, in order. So values without texts have one size, and many messages are one
+NumPy array. In records, values stand as `spaces` describes them: those of varying size as bytes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
+
+from runner.errors import RecordingError
+from runner.recording.schema import Field
+from runner.recording.spaces import Description, encode_bytes, leaf_dtype, parts_of, text_length
+from runner.util.arrays import Array
+
+_KINDS: Final[Mapping[str, int]] = {
+    "|b1": Pb.TYPE_BOOL,
+    "<i4": Pb.TYPE_SFIXED32,
+    "<u4": Pb.TYPE_FIXED32,
+    "<f4": Pb.TYPE_FLOAT,
+    "<i8": Pb.TYPE_SFIXED64,
+    "<u8": Pb.TYPE_FIXED64,
+    "<f8": Pb.TYPE_DOUBLE,
+}
+"""The types of numbers by their dtypes."""
+_WIDER: Final = {"|i1": "<i4", "<i2": "<i4", "|u1": "<u4", "<u2": "<u4", "<f2": "<f4"}
+"""The dtypes in which single smaller numbers are stored."""
+_WIRE_TYPES: Final = {1: 0, 4: 5, 8: 1}
+"""Protobuf's wire types of numbers by their bytes."""
+_DELIMITED: Final = 2
+_RAW: Final = 4096
+"""Added to the number of a text's field if the text is no UTF-8; a message has fewer fields."""
+
+
+def space_field(number: int, name: str, description: Description) -> Field:
+    """Return the field of a message with the values of a space, whose description was checked."""
+    return replace(_field(number, name, name, description), is_value=True)
+
+
+def _field(number: int, name: str, stored_name: str, description: Description) -> Field:
+    stored_as = stored_name if stored_name != name else ""
+    parts = parts_of(description)
+    if parts is not None:
+        names = _identifiers([key for key, _ in parts])
+        fields = tuple(
+            _field(k, key, stored, part)
+            for k, ((key, part), stored) in enumerate(zip(parts, names, strict=True), start=1)
+        )
+        return Field(number, name, Pb.TYPE_MESSAGE, stored_as=stored_as, parts=fields)
+    dtype = leaf_dtype(description)
+    if dtype is None:
+        return Field(number, name, Pb.TYPE_STRING, stored_as=stored_as)
+    code = dtype.base.str
+    code = code if dtype.shape else _WIDER.get(code, code)
+    kind, is_repeated = _KINDS.get(code, Pb.TYPE_BYTES), bool(dtype.shape) and code in _KINDS
+    return Field(number, name, kind, is_repeated, stored_as, dtype)
+
+
+def _identifiers(keys: list[str]) -> list[str]:
+    """Return the names of fields for the keys of parts.
+
+    Other characters than ASCII letters, digits and `_` become `_`; a name that begins with a digit gets a `_`
+    before it; and names that are equal but for case and `_` are numbered from the second on, as `NAME_2`.
+    """
+    names: list[str] = []
+    taken: set[str] = set()
+    for key in keys:
+        base = re.sub(r"[^A-Za-z0-9_]", "_", key)
+        base = f"_{base}" if base[:1].isdigit() else base
+        name, number = base, 1
+        while _folded(name) in taken or _folded(f"{name}_raw") in taken:
+            number += 1
+            name = f"{base}_{number}"
+        taken |= {_folded(name), _folded(f"{name}_raw")}
+        names.append(name)
+    return names
+
+
+def _folded(name: str) -> str:
+    """Return what two fields of a message must not have in common: Protobuf compares their JSON names."""
+    return name.replace("_", "").lower()
+
+
+def raw_field(field: Field) -> Field:
+    """Return the field beside the field of a text, for texts that are no UTF-8."""
+    name = f"{field.stored_name}_raw"
+    return Field(field.number + _RAW, name, Pb.TYPE_BYTES)
+
+
+def is_text(field: Field) -> bool:
+    """Return whether a field has texts of a space."""
+    return field.kind == Pb.TYPE_STRING and field.parts is None
+
+
+def has_one_size(field: Field) -> bool:
+    """Return whether all values of a field have as many bytes."""
+    return field.dtype is not None if field.parts is None else all(map(has_one_size, field.parts))
+
+
+@lru_cache(256)
+def stored_dtype(field: Field) -> np.dtype[Any]:
+    """Return the dtype of a value as it is stored, after its tag; what stands between parts is left out."""
+    if field.parts is None:
+        assert field.dtype is not None
+        wider = None if field.dtype.shape else _WIDER.get(field.dtype.str)
+        return field.dtype if wider is None else np.dtype(wider)
+    offsets, at = [], 0
+    for part in field.parts:
+        at += len(tag(part))
+        offsets.append(at)
+        at += stored_dtype(part).itemsize
+    names, formats = [part.name for part in field.parts], [*map(stored_dtype, field.parts)]
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": at})
+
+
+def are_exact(field: Field, values: Array, stored: Array) -> bool:
+    """Return whether numbers, read from those that are stored in more bytes, are the stored ones."""
+    if field.parts is not None:
+        inside: tuple[Any, Any] = values, stored
+        return all(are_exact(part, *(own[part.name] for own in inside)) for part in field.parts)
+    if stored_dtype(field) == field.dtype:
+        return True
+    return values.astype(stored.dtype).tobytes() == stored.tobytes()
+
+
+@lru_cache(256)
+def row_dtype(field: Field) -> np.dtype[Any]:
+    """Return the dtype of a value in rows: without gaps, and of varying size an object, which holds bytes."""
+    if not has_one_size(field):
+        return np.dtype(object)
+    if field.parts is None:
+        assert field.dtype is not None
+        return field.dtype
+    return np.dtype([(part.name, row_dtype(part)) for part in field.parts])
+
+
+def tag(field: Field) -> bytes:
+    """Return the constant bytes before a value of one size: its tag, and its length if it has one."""
+    size = stored_dtype(field).itemsize
+    if field.parts is not None or field.repeated or field.kind == Pb.TYPE_BYTES:
+        return _head(field.number) + varint(size)
+    return varint(field.number << 3 | _WIRE_TYPES[size])
+
+
+def put_constants(field: Field, stored: Array, at: int = 0) -> None:
+    """Set the constant bytes within a stored value, which begins at `at` in an array of bytes."""
+    dtype = stored_dtype(field)
+    for part in field.parts or ():
+        start = at + int(dtype.fields[part.name][1])  # type: ignore[index]
+        constant = tag(part)
+        stored[start - len(constant) : start] = list(constant)
+        put_constants(part, stored, start)
+
+
+def varint(number: int) -> bytes:
+    """Return a number as Protobuf writes lengths: seven bits a byte, the lowest first."""
+    low = []
+    while number >= 128:
+        low.append(number & 0x7F | 0x80)
+        number >>= 7
+    return bytes([*low, number])
+
+
+# --- values of varying size ---------------------------------------------------------------------------
+
+
+def encoded(field: Field, value: bytes) -> bytes:
+    """Return the field of a message with a value that `spaces` describes."""
+    data, _ = _encoded(field, value, 0)
+    return data
+
+
+def _encoded(field: Field, value: bytes, at: int) -> tuple[bytes, int]:
+    """Return the field, and where the value that begins at `at` ends."""
+    if field.parts is not None:
+        pieces = []
+        for part in field.parts:
+            piece, at = _encoded(part, value, at)
+            pieces.append(piece)
+        return _delimited(field.number, b"".join(pieces)), at
+    if is_text(field):
+        end = at + 4 + text_length(value, at)
+        text = value[at + 4 : end]
+        return _delimited(field.number if _is_utf8(text) else field.number + _RAW, text), end
+    assert field.dtype is not None
+    end = at + field.dtype.itemsize
+    number = np.frombuffer(value[at:end], field.dtype.base)
+    return tag(field) + number.astype(stored_dtype(field).base, copy=False).tobytes(), end
+
+
+def decoded(field: Field, message: bytes, at: int) -> tuple[bytes, int]:
+    """Return the value in the field of a message that begins at `at`, and where the field ends.
+
+    Raises:
+        RecordingError: the field is not there, or is not as it is always written.
+    """
+    if is_text(field) or field.parts is not None:
+        number = field.number
+        if is_text(field) and not message.startswith(_head(number), at):
+            number += _RAW
+        start, end = _span(field, message, at, _head(number))
+        if field.parts is None:
+            text = message[start:end]
+            if _is_utf8(text) != (number == field.number):
+                raise _refused(field)
+            return encode_bytes(text), end
+        pieces = []
+        for part in field.parts:
+            piece, start = decoded(part, message, start)
+            pieces.append(piece)
+        if start != end:
+            raise _refused(field)
+        return b"".join(pieces), end
+    assert field.dtype is not None
+    dtype, constant = stored_dtype(field), tag(field)
+    end = at + len(constant) + dtype.itemsize
+    stored = np.frombuffer(message[at + len(constant) : end], dtype.base)
+    value = stored.astype(field.dtype.base, copy=False)
+    is_exact = value.astype(dtype.base, copy=False).tobytes() == stored.tobytes()
+    if not message.startswith(constant, at) or end > len(message) or not is_exact:
+        raise _refused(field)
+    return value.tobytes(), end
+
+
+def _head(number: int) -> bytes:
+    return varint(number << 3 | _DELIMITED)
+
+
+def _delimited(number: int, data: bytes) -> bytes:
+    return _head(number) + varint(len(data)) + data
+
+
+def _span(field: Field, message: bytes, at: int, head: bytes) -> tuple[int, int]:
+    """Return where the bytes of a delimited field begin, and where they end."""
+    length, start = 0, at + len(head)
+    for k, byte in enumerate(message[start : start + 5]):
+        length |= (byte & 0x7F) << 7 * k
+        if byte < 128:
+            break
+    begin = start + len(size := varint(length))
+    if not message.startswith(head + size, at) or begin + length > len(message):
+        raise _refused(field)
+    return begin, begin + length
+
+
+def _is_utf8(text: bytes) -> bool:
+    try:
+        text.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _refused(field: Field) -> RecordingError:
+    return RecordingError(f"found no value of its space in {field.name!r}")

@@ -1,0 +1,245 @@
+"""Values of spaces in a recording: every dtype, shape, space and way in, bit for bit, by every reader."""
+
+from __future__ import annotations
+
+import copy
+import json
+import tempfile
+
+import gymnasium
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from hypothesis import given, settings
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+import runner
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.layout import layout_of
+from runner.recording.messages import decode_rows, encode_rows, file_descriptor_set
+from runner.recording.reader import open_recording
+from runner.recording.space_fields import space_field
+from tests.runner.loops.making import Leaving
+
+STEPS = 7
+DTYPES = ("b1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "f8")
+
+
+def numbers(code: str, shape: tuple[int, ...]) -> spaces.Space:
+    dtype = np.dtype(code)
+    if dtype.kind == "b":
+        return spaces.Box(0, 1, shape, np.dtype("i1").type) if shape else spaces.Discrete(2)
+    low, high = (-1, 1) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    return spaces.Box(low, high, shape, dtype.type)
+
+
+LEAVES = st.one_of(
+    st.builds(numbers, st.sampled_from(DTYPES), st.sampled_from([(), (1,), (3,), (2, 2), (0,)])),
+    st.builds(spaces.Discrete, st.integers(1, 1000), start=st.integers(-5, 5)),
+    st.builds(spaces.MultiBinary, st.integers(1, 5)),
+    st.builds(spaces.MultiDiscrete, st.lists(st.integers(1, 9), min_size=1, max_size=4)),
+)
+KEYS = st.text("aB1_ .é", min_size=1, max_size=4).filter(lambda key: key.strip() == key)
+TEXTS = st.builds(spaces.Text, st.integers(1, 12))
+
+
+def nested(leaves):
+    return st.recursive(
+        leaves,
+        lambda inner: st.one_of(
+            st.builds(spaces.Dict, st.dictionaries(KEYS, inner, min_size=1, max_size=4)),
+            st.builds(spaces.Tuple, st.lists(inner, min_size=1, max_size=3)),
+        ),
+        max_leaves=5,
+    )
+
+
+class Any(gymnasium.Env):
+    """Returns samples of its space."""
+
+    def __init__(self, observation, action):
+        self.observation_space, self.action_space = observation, action
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self._t = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        self._t += 1
+        return self.observation_space.sample(), self._t / 3, self._t == 4, False, {}
+
+
+def same(left, right):
+    if isinstance(left, dict):
+        return list(left) == list(right) and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, tuple):
+        return len(left) == len(right) and all(map(same, left, right))
+    if isinstance(left, str):
+        return left == right
+    left, right = np.asarray(left), np.asarray(right)
+    return (left.dtype, left.shape, left.tobytes()) == (right.dtype, right.shape, right.tobytes())
+
+
+def plain(space, value):
+    """Return a value of a space as a reader has it that gives records with fields by name."""
+    if isinstance(space, spaces.Dict):
+        return {key: plain(part, value[key]) for key, part in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(
+            plain(part, value[str(i)] if isinstance(value, np.void) else value[i])
+            for i, part in enumerate(space)
+        )
+    return value
+
+
+def by_name(field, message):
+    """Return a value that a standard Protobuf parser gives, as arrays by the names of the description."""
+    value = getattr(message, field.stored_name)
+    if field.parts is not None:
+        return {part.name: by_name(part, value) for part in field.parts}
+    if field.dtype is None:
+        raw = getattr(message, f"{field.stored_name}_raw")
+        return value or raw.decode("utf-8", "surrogatepass")
+    if isinstance(value, bytes):
+        return np.frombuffer(value, field.dtype.base).reshape(field.dtype.shape)
+    return np.array(value, field.dtype.base).reshape(field.dtype.shape)
+
+
+def expected_by_name(value):
+    if isinstance(value, dict):
+        return {str(key): expected_by_name(part) for key, part in value.items()}
+    if isinstance(value, tuple):
+        return {str(i): expected_by_name(part) for i, part in enumerate(value)}
+    return value
+
+
+def official(path, topic):
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return [message.decoded_message for message in reader.iter_decoded_messages(topics=[topic])]
+
+
+def check_steps(path, observation, action, seen):
+    """Compare the recorded steps with those of a loop, by our reader and by the official one."""
+    with open_recording(path) as recording:
+        rows, fields = list(recording.train.transitions()), recording.layout.message(schema.TRAIN_STEP).fields
+    messages = official(path, "/train/step")
+    assert len(rows) == len(messages) == len(seen)
+    of_values = {field.name: field for field in fields if field.is_value}
+    for row, message, (taken, after) in zip(rows, messages, seen, strict=True):
+        if not of_values:
+            start = action.start, observation.start
+            assert (row["action"], row["next_state"]) == (taken - start[0], after - start[1])
+            continue
+        assert same(plain(observation, row["next_observation"]), after)
+        assert same(plain(action, row["action"]), taken)
+        assert same(by_name(of_values["next_observation"], message), expected_by_name(after))
+        assert same(by_name(of_values["action"], message), expected_by_name(taken))
+
+
+def loop_over(observation, action, folder):
+    seen = []
+    with runner.record(Any(observation, action), folder) as rec:
+        rec.action_space.seed(3)
+        rec.reset(seed=5)
+        for _ in range(STEPS):
+            taken = rec.action_space.sample()
+            after, _, over, _, _ = rec.step(taken)
+            seen.append((taken, after))
+            if over:
+                rec.reset()
+    return rec.run.recording, seen
+
+
+@settings(max_examples=60)
+@given(nested(LEAVES), nested(LEAVES))
+def test_values_of_one_size_come_back_and_have_names(observation, action):
+    with tempfile.TemporaryDirectory() as folder:
+        path, seen = loop_over(observation, action, folder)
+        check_steps(path, observation, action, seen)
+
+
+@settings(max_examples=40)
+@given(nested(st.one_of(LEAVES, TEXTS)), nested(st.one_of(LEAVES, TEXTS)))
+def test_values_of_varying_size_come_back_and_have_names(observation, action):
+    with tempfile.TemporaryDirectory() as folder:
+        path, seen = loop_over(observation, action, folder)
+        check_steps(path, observation, action, seen)
+
+
+@settings(max_examples=15)
+@given(nested(st.one_of(LEAVES, TEXTS)))
+def test_values_of_a_vector_come_back(observation):
+    def make():
+        return Any(copy.deepcopy(observation), spaces.Box(-1, 1, (2,), np.float32))
+
+    with tempfile.TemporaryDirectory() as folder:
+        envs = SyncVectorEnv([make] * 2, autoreset_mode=AutoresetMode.NEXT_STEP)
+        with runner.record_vector(envs, folder) as rec:
+            rec.reset(seed=[1, 2])
+            for _ in range(3):
+                rec.step(np.zeros((2, 2), np.float32))
+        with open_recording(rec.run.recording) as recording:
+            rows = list(recording.train.transitions())
+    expected = []
+    for seed in (1, 2):
+        env = make()
+        env.reset(seed=seed)
+        expected.append([env.step(None)[0] for _ in range(3)])
+    assert len(rows) == 6
+    for number, row in enumerate(rows):
+        assert same(plain(observation, row["next_observation"]), expected[number % 2][number // 2])
+
+
+def test_the_action_of_an_agent_stands_by_its_name(tmp_path):
+    env = Leaving()
+    with runner.record_parallel(env, tmp_path) as rec:
+        rec.reset(seed=1)
+        actions = {agent: rec.action_space(agent).sample() for agent in rec.agents}
+        rec.step(actions)
+    (step,) = official(rec.run.recording, "/train/step")
+    for agent, taken in actions.items():
+        assert np.array_equal(getattr(step.action, agent), taken)
+
+
+def test_names_that_protobuf_has_not_are_changed_by_the_rule():
+    keys = ["a b", "a_b", "aB", "1", "é", "", "x_raw", "x"]
+    parts = {key or " ": {"type": "Box", "dtype": "<f4", "shape": []} for key in keys}
+    field = space_field(2, "action", {"type": "Dict", "spaces": parts})
+    names = [part.stored_name for part in field.parts]
+    assert names == ["a_b", "a_b_2", "aB_3", "_1", "_", "__2", "x_raw", "x_2"]
+    layout = layout_of(
+        "loop",
+        1,
+        0,
+        '{"observation": {"type": "Discrete", "n": 2, "dtype": "<i8", "shape": []}, '
+        '"action": {"type": "Box", "dtype": "<f4", "shape": [2]}}',
+    )
+    assert b"next_observation" in file_descriptor_set(layout.message(schema.TRAIN_STEP))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda data: data[:-1], lambda data: data + b"\0", lambda data: data.replace(b"abc", b"ab\xff")],
+)
+def test_messages_of_varying_size_that_no_recorder_writes_are_refused(change):
+    text, number = (
+        {"type": "Text", "max_length": 9},
+        {"type": "Discrete", "n": 2, "dtype": "<i8", "shape": []},
+    )
+    layout = layout_of("loop", 1, 0, json.dumps({"observation": text, "action": number}))
+    message = layout.message(schema.TRAIN_STEP)
+    rows = np.zeros(1, layout.rows(schema.TRAIN_STEP))
+    rows["action"][0], rows["next_observation"][0] = bytes(8), b"\3\0\0\0abc"
+    (payload,) = encode_rows(message, rows)
+    (back,) = decode_rows(message, [(0, payload)])
+    assert back["next_observation"] == b"\3\0\0\0abc"
+    with pytest.raises(RecordingError):
+        decode_rows(message, [(0, change(payload))])
