@@ -11,7 +11,7 @@ import inspect
 import itertools
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import CannotRedo
@@ -22,9 +22,10 @@ from runner.replay.games import as_parallel
 from runner.replay.scripts import MAIN, definition
 from runner.replay.specifications import (
     EnvironmentSpec,
+    GameSpec,
+    Wrapper,
     modules_of,
-    parse_game,
-    parse_spec,
+    parsed,
     vector_wrappers,
 )
 from runner.replay.trust import (
@@ -121,7 +122,8 @@ def why_not_alone(maker: EnvironmentMaker) -> str:
     vector = maker.vector
     if vector is None or not is_whole_vector(maker):
         return ""
-    return reason if maker.make or vector_wrappers(vector) or not parse_spec(maker.spec).entry_point else ""
+    is_made_whole = maker.make or vector_wrappers(vector)
+    return reason if is_made_whole or not parsed(EnvironmentSpec, maker.spec).entry_point else ""
 
 
 def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> object:
@@ -142,7 +144,7 @@ def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> o
         assert vector is not None
         if vector.mode == "custom":
             spec, registered = _registered(maker, trust)
-            kwargs = spec.kwargs | {"num_envs": vector.number, "vectorization_mode": "vector_entry_point"}
+            kwargs = {**spec.kwargs, "num_envs": vector.number, "vectorization_mode": "vector_entry_point"}
             kwargs |= {"render_mode": "rgb_array"} if render else {}
             limit = spec.kwargs.get("max_episode_steps", spec.max_episode_steps)
             envs = gymnasium.make_vec(dataclasses.replace(registered, kwargs=kwargs, max_episode_steps=limit))
@@ -151,8 +153,8 @@ def make_vector(maker: EnvironmentMaker, trust: bool, render: bool = False) -> o
                 [lambda: make_environment(maker, trust, render)] * vector.number,
                 autoreset_mode=gymnasium.vector.AutoresetMode(vector.autoreset),
             )
-        for _, entry_point, arguments in vector_wrappers(vector):
-            envs = _wrapper(entry_point, gymnasium.vector.VectorWrapper, arguments, trust)(envs, **arguments)
+        for wrapper in vector_wrappers(vector):
+            envs = _wrapper(wrapper, gymnasium.vector.VectorWrapper, trust)(envs, **wrapper.kwargs)
         return envs
 
 
@@ -175,9 +177,9 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
     elif kwargs.get("render_mode") not in (None, "rgb_array"):
         kwargs["render_mode"] = None
     wrappers = [
-        (_wrapper(entry_point, gymnasium.Wrapper, own, trust), own)
-        for name, entry_point, own in spec.wrappers
-        if not is_left_out(entry_point)
+        (_wrapper(wrapper, gymnasium.Wrapper, trust), wrapper.kwargs)
+        for wrapper in spec.additional_wrappers
+        if not is_left_out(wrapper.entry_point)
     ]
     made: Env = gymnasium.make(
         dataclasses.replace(
@@ -191,8 +193,8 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
     )
     # Without their number, wrappers that the entry point adds are the first of the recorded ones.
     inside = () if maker.inner_wrappers or made.spec is None else made.spec.additional_wrappers
-    for wrapper, own in wrappers[len(inside) :]:
-        made = wrapper(env=made, **own)
+    for make, arguments in wrappers[len(inside) :]:
+        made = make(env=made, **arguments)
     return made
 
 
@@ -204,28 +206,29 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
     """
     import gymnasium
 
-    spec = parse_spec(maker.spec)
+    spec = parsed(EnvironmentSpec, maker.spec)
+    entry_point = spec.entry_point or ""
     if not trust and maker.registered_by not in ("", *packages()):
         raise CannotRedo(f"{spec.id} is registered by {maker.registered_by}. {advice()}")
     if maker.registered_by:
         importlib.import_module(maker.registered_by)
     registered = gymnasium.registry.get(spec.id)
-    if registered is None and trust and spec.entry_point:
-        registered = gymnasium.envs.registration.EnvSpec(spec.id, entry_point=_creator(spec.entry_point))
-    if registered is None and spec.id == spec.entry_point.partition(":")[2]:
-        raise CannotRedo(f"The environment is made by {spec.entry_point}. {advice()}")
+    if registered is None and trust and entry_point:
+        registered = gymnasium.envs.registration.EnvSpec(spec.id, entry_point=_creator(entry_point))
+    if registered is None and spec.id == entry_point.partition(":")[2]:
+        raise CannotRedo(f"The environment is made by {entry_point}. {advice()}")
     if registered is None:
         raise CannotRedo(
             f"{spec.id} is not registered with Gymnasium {gymnasium.__version__} here, by "
             f"{maker.registered_by or 'Gymnasium itself'}."
         )
-    if name_of(registered.entry_point) != spec.entry_point:
+    if name_of(registered.entry_point) != entry_point:
         if not trust:
             raise CannotRedo(
-                f"{spec.id} is {spec.entry_point} in the recording, and "
+                f"{spec.id} is {entry_point} in the recording, and "
                 f"{name_of(registered.entry_point)} here: it is another environment, or another version."
             )
-        registered = dataclasses.replace(registered, entry_point=_creator(spec.entry_point))
+        registered = dataclasses.replace(registered, entry_point=_creator(entry_point))
     if not trust:
         is_whole = maker.vector is not None and maker.vector.mode == "custom"
         own = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
@@ -234,18 +237,18 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
 
 
 def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
-    module, function, kwargs, wrappers = parse_game(maker.spec)
+    spec = parsed(GameSpec, maker.spec)
     if not trust:
-        if wrappers:
-            raise CannotRedo(f"The environment is wrapped by {wrappers[0][1]}. {advice()}")
-        require_listed_game(f"{module}:{function}", kwargs)
-    make = _attribute(f"{module}:{function}")
-    kwargs = {key: value for key, value in kwargs.items() if key != "render_mode"}
+        if spec.wrappers:
+            raise CannotRedo(f"The environment is wrapped by {spec.wrappers[0].entry_point}. {advice()}")
+        require_listed_game(spec.entry_point, spec.kwargs)
+    make = _attribute(spec.entry_point)
+    kwargs = {key: value for key, value in spec.kwargs.items() if key != "render_mode"}
     game = make(**kwargs, **({"render_mode": "rgb_array"} if render else {}))
-    for _, entry_point, arguments in wrappers:
-        game = _attribute(entry_point)(game, **arguments)
+    for wrapper in spec.wrappers:
+        game = _attribute(wrapper.entry_point)(game, **wrapper.kwargs)
     names = tuple(map(class_name, layers_of(game)))[:-1]
-    if wrappers and names != maker.wrappers:
+    if spec.wrappers and names != maker.wrappers:
         raise CannotRedo(f"The environment has the wrappers {names} here, recorded {maker.wrappers}.")
     return game
 
@@ -268,17 +271,17 @@ def _made_by_function(name: str, render: bool) -> Any:
     return env
 
 
-def _wrapper(entry_point: str, base: type, arguments: Mapping[str, object], trust: bool) -> Any:
-    """Return a wrapper.
+def _wrapper(spec: Wrapper, base: type, trust: bool) -> Any:
+    """Return the class of a wrapper.
 
     Raises:
         CannotRedo: it is something else, or may not be made.
     """
     if not trust:
-        require_listed_wrapper(entry_point, arguments)
-    wrapper = _attribute(entry_point)
+        require_listed_wrapper(spec.entry_point, spec.kwargs)
+    wrapper = _attribute(spec.entry_point)
     if not (isinstance(wrapper, type) and issubclass(wrapper, base)):
-        raise CannotRedo(f"{entry_point} is not a wrapper of Gymnasium.")
+        raise CannotRedo(f"{spec.entry_point} is not a wrapper of Gymnasium.")
     return wrapper
 
 

@@ -146,7 +146,7 @@ KINDS = sorted(hostile(EnvironmentMaker("gymnasium", "{}")))
 def test_no_kind_of_hostility_is_made(kind, maker, trap):
     one = hostile(maker)[kind]
     make = make_vector if one.vector else make_environment
-    with pytest.raises(CannotRedo, match=r"--trust|another environment|no id or entry point|script"):
+    with pytest.raises(CannotRedo, match=r"--trust|another environment|id without a module|script"):
         make(one, trust=False).close()
     assert untouched(trap)
 

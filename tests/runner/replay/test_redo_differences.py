@@ -208,13 +208,13 @@ def test_nothing_is_imported_but_installed_packages_of_environments(maker, tmp_p
         ({"id": "CartPole-v77"}, "not registered with Gymnasium"),
         ({"additional_wrappers": wrapper("gymnasium.utils.play:play")}, "not a known one"),
         ({"additional_wrappers": wrapper("gymnasium.wrappers.common:TimeLimit")}, "cannot be made here"),
-        ({"additional_wrappers": "x"}, "does not state its class"),
+        ({"additional_wrappers": "x"}, "not possible: found 'x' as additional_wrappers, expected a list"),
         ({"kwargs": {"xml_file": "/etc/passwd"}}, "expected numbers or a known word"),
         ({"kwargs": {"deep": [{"path": "../secret"}]}}, "expected numbers or a known word"),
         ({"kwargs": {"x": "y" * 100_000}}, "65,536 at most"),
         ({"kwargs": {"no_such": 1}}, "no_such"),
-        ({"max_episode_steps": -3}, "not possible"),
-        ({"id": None}, "no id"),
+        ({"max_episode_steps": -3}, "found -3 as max_episode_steps"),
+        ({"id": None}, "found None as id, expected a text"),
     ],
 )
 def test_a_hostile_specification_is_refused_with_the_reason(maker, changes, reason):
