@@ -32,9 +32,7 @@ class Difference(NamedTuple):
 
     root: str
     changed: list[str]
-    """New and changed runs."""
-    died: list[str]
-    """Runs whose process was killed."""
+    """Runs that are new, changed, or whose process was killed."""
     gone: list[str]
     """Runs that were removed."""
 
@@ -57,23 +55,19 @@ class Folders:
     def differences(self) -> list[Difference]:
         """Return how the folders, as they were at the first call, differ from the index as it is now."""
         all_differences = [self._difference(root) for root in self._roots]
-        return [each for each in all_differences if each.changed or each.died or each.gone]
+        return [difference for difference in all_differences if difference.changed or difference.gone]
 
     def apply(self, found: Sequence[Difference]) -> None:
         """Read what changed and write it to the index, a transaction for each batch."""
-        for root, changed, died, gone in found:
+        for root, changed, gone in found:
             changed.sort()  # in the order of the table, which then grows at its end
             for start in range(0, len(changed), _BATCH):
                 rows = [self._row(root, entry) for entry in changed[start : start + _BATCH]]
                 with transaction(self._database, "IMMEDIATE"):
                     write_rows(self._database, rows)
             with transaction(self._database, "IMMEDIATE"):
-                for what, entries in (
-                    ("UPDATE runs SET status = 'interrupted'", died),
-                    ("DELETE FROM runs", gone),
-                ):
-                    places = [(root, entry) for entry in entries]
-                    self._database.executemany(f"{what} WHERE root = ? AND entry = ?", places)
+                removed = [(root, entry) for entry in gone]
+                self._database.executemany("DELETE FROM runs WHERE root = ? AND entry = ?", removed)
 
     def expire(self) -> None:
         """Have all runs of these folders read again, and delete the rows of folders that no longer exist."""
@@ -95,19 +89,16 @@ class Folders:
         unsteady = (
             "SELECT entry, status, stable FROM runs WHERE root = ? AND (status = 'running' OR NOT stable)"
         )
-        running = set()
         for entry, status, stable in self._database.execute(unsteady, (root,)):
-            if status == "running":
-                running.add(entry)
-            may_differ = not stable or self._quick  # the recording of a running one grows in place
-            if may_differ and indexed.get(entry) == tokens.get(entry) and entry not in self._read[root]:
+            if indexed.get(entry) != tokens.get(entry) or entry in self._read[root]:
+                continue
+            # The recording of a running one grows in place.
+            if not stable or self._quick or (status == "running" and not _is_running(root, entry)):
                 changed.append(entry)
-        unchanged = running - set(changed)
-        died = [entry for entry in unchanged if entry in tokens and not _is_running(root, entry)]
-        there = [entry for entry in dict.fromkeys(changed) if _state_of(root, entry) is not None]
+        there = [entry for entry in changed if _state_of(root, entry) is not None]
         missing = {*indexed} - {*tokens} | {*changed} - {*there}
         gone = [entry for entry in missing if entry in indexed and _state_of(root, entry) is None]
-        return Difference(root, there, died, gone)
+        return Difference(root, there, gone)
 
     def _tokens_of(self, root: str) -> dict[str, str]:
         """Return the token of each run's folder at the first check, or when it was read."""
