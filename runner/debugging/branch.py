@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from runner.analysis.evaluations import evaluation_after, evaluations_of
 from runner.analysis.step_reference import StepRef, parse_step
@@ -239,7 +239,8 @@ class _Player:
 
     def __init__(self, recording: Recording, folder: Path, task: _Task) -> None:
         self._recording, self._folder, self._task = recording, folder, task
-        self.phase, self.episode = "train", task.at.episode
+        self.phase: Literal["train", "eval"] = "train"
+        self.episode = task.at.episode
         if task.at.after is not None:
             where = str(recording.path)
             trials = evaluation_after(evaluations_of(recording), task.at.after, where)

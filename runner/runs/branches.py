@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final, Literal
 
 from runner.util.humanize import counted, setting
-from runner.util.values import Json, flatten, is_whole
+from runner.util.values import flatten, is_whole
 
 PATHS: Final = ("config.origin", "branches")
 """The paths of origins in configurations."""
@@ -20,8 +21,7 @@ class BranchOrigin:
 
     run: str
     """The run id of the parent."""
-    phase: str
-    """`train` or `eval`."""
+    phase: Literal["train", "eval"]
     episode: int
     """The number of the episode in its phase, in the parent; the branch has this one alone."""
     t: int
@@ -51,9 +51,9 @@ class TrainingOrigin:
     """The run id of the parent."""
     step: int
     """The first training step that may differ."""
-    actions: Mapping[str, str]
+    actions: Mapping[str, str] = field(default_factory=dict)
     """Agent to the action that it took at this step, where that was set."""
-    settings: Mapping[str, object]
+    settings: Mapping[str, Any] = field(default_factory=dict)
     """The settings that changed from this step on, as the configuration has them."""
     episodes: int | None = field(default=None, compare=False)
     """Training episodes of the run, counted from the beginning; None if they are unknown."""
@@ -105,34 +105,14 @@ def parse_origin(found: object) -> Origin | None:
     """Return the origin with these fields, among others; None if one is missing or of another type."""
     if not isinstance(found, Mapping):
         return None
-    if "phase" not in found:
-        return _parse_training(found)
-    values: Json = {name: found.get(name) for name in BranchOrigin.__dataclass_fields__}
-    are_numbers = all(is_whole(values[name], 0, _MAX_NUMBER) for name in ("episode", "t", "seed"))
-    values["action_name"] = found.get("action_name", "")
-    are_texts = all(
-        isinstance(values[name], str) for name in ("run", "at", "action", "policy", "action_name")
-    )
-    return (
-        BranchOrigin(**values) if are_numbers and are_texts and values["phase"] in ("train", "eval") else None
-    )
+    import msgspec
 
-
-def _parse_training(found: Mapping[str, object]) -> TrainingOrigin | None:
-    run, step = found.get("run"), found.get("step")
-    actions, settings = found.get("actions", {}), found.get("settings", {})
-    if not (isinstance(run, str) and is_whole(step, 0, _MAX_NUMBER)):
-        return None
-    if not (isinstance(actions, Mapping) and isinstance(settings, Mapping)):
-        return None
-    episodes = found.get("episodes")  # in an index, not in a configuration
-    return TrainingOrigin(
-        run,
-        step,
-        {str(agent): str(action) for agent, action in actions.items()},
-        settings,
-        episodes if is_whole(episodes, 0, _MAX_NUMBER) else None,
-    )
+    kind: type[Origin] = BranchOrigin if "phase" in found else TrainingOrigin
+    with contextlib.suppress(msgspec.ValidationError, UnicodeEncodeError):  # a text may have half a character
+        origin = msgspec.convert(found, kind)
+        numbers = (value for value in vars(origin).values() if isinstance(value, int))
+        return origin if all(0 <= number <= _MAX_NUMBER for number in numbers) else None
+    return None
 
 
 @dataclass(frozen=True)

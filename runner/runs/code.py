@@ -27,6 +27,7 @@ from runner.runs.provenance import is_code_wanted
 from runner.runs.redaction import SETTINGS_FILES, is_secret_file, redacted_text
 from runner.runs.run import Run
 from runner.util.files import open_regular
+from runner.util.humanize import listed
 from runner.util.values import as_utf8
 
 MAX_FILE_BYTES: Final = 256 << 10
@@ -248,7 +249,7 @@ def collect(
         "git": repository.commit + ("-dirty" if is_dirty else ""),
         "code.script": "" if script is None else _within(root, script),
         "git.not_recorded": "; ".join(problems),
-        "code.left_out": _named(list(dict.fromkeys(sources.left_out))),
+        "code.left_out": listed(list(dict.fromkeys(sources.left_out)), _MAX_NAMED),
     }
     code = Code(sources.files, tuple(sorted(new)), patch)
     return RecordedCode(
@@ -265,12 +266,6 @@ def _place_in_git(repository: Repository) -> dict[str, str]:
         "git.remote": redacted_text(repository.remote),
     }
     return {key: as_utf8(text) for key, text in entries.items() if text}
-
-
-def _named(left_out: list[str]) -> str:
-    """Return what was left out as a text of bounded length."""
-    more = len(left_out) - _MAX_NAMED
-    return ", ".join(left_out[:_MAX_NAMED]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def _fitting_patch(repository: Repository, sources: _Sources) -> str:

@@ -123,7 +123,7 @@ def number_column(values: Sequence[float]) -> list[str]:
     return [number(value, digits) for value in values]
 
 
-def listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str], limit: int = _MAX_LISTED) -> str:
     """Return names as text, shortened to the first few: `a, b, c, d, e, f and 3 more`."""
-    more = len(names) - _MAX_LISTED
-    return ", ".join(names[:_MAX_LISTED]) + (f" and {more:,} more" if more > 0 else "")
+    more = len(names) - limit
+    return ", ".join(names[:limit]) + (f" and {more:,} more" if more > 0 else "")
