@@ -6,59 +6,69 @@ neither can be trusted.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NotRequired, TypedDict, TypeGuard
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from typing import Annotated, Final, NotRequired, TypedDict
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from runner.util.values import JsonView, is_text, is_whole
+from runner.util.stored import mistake_in_words
+from runner.util.values import MAX_TEXT
 
 MAX_CELLS: Final = 2**15 - 1
 """Cells are numbered in int16."""
-_COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
+_Count = Annotated[int, Meta(ge=1, le=MAX_CELLS)]
+_Cell = Annotated[Sequence[Annotated[int, Meta(ge=0)]], Meta(min_length=2, max_length=2)]
+"""Row and column."""
+_Label = Annotated[str, Meta(min_length=1, max_length=MAX_TEXT)]
 
 
 class Landmark(TypedDict):
     """A cell that is marked."""
 
-    name: str
-    cell: Sequence[int]
-    """Row and column."""
-    colour: str
+    name: _Label
+    cell: _Cell
+    colour: Annotated[str, Meta(pattern=r"^#[0-9A-Fa-f]{6}\Z")]
     """Such as `#009E73`."""
-    label: NotRequired[str | None]
-    kind: NotRequired[str | None]
+    label: NotRequired[_Label | None]
+    kind: NotRequired[_Label | None]
     """`hazard` or `goal`, or any other word."""
 
 
 class Thing(TypedDict):
     """What is somewhere in every state."""
 
-    name: str
-    label: str
-    kind: str
+    name: _Label
+    label: _Label
+    kind: _Label
     """`mover`, `goal`, or any other word."""
-    agent: NotRequired[str | None]
+    agent: NotRequired[_Label | None]
     """The agent that moves it."""
-    colour: NotRequired[str | None]
+    colour: NotRequired[_Label | None]
 
 
 class SceneAction(TypedDict):
     """An action of each agent."""
 
-    name: str
-    move: NotRequired[Sequence[int] | None]
+    name: _Label
+    move: NotRequired[
+        Annotated[
+            Sequence[Annotated[int, Meta(ge=-MAX_CELLS, le=MAX_CELLS)]], Meta(min_length=2, max_length=2)
+        ]
+        | None
+    ]
     """Rows and columns; None for an action that is no move."""
 
 
 class SceneDescription(TypedDict):
     """How the states of an environment are drawn, as it describes them and as recordings store it."""
 
-    rows: int
-    columns: int
-    walls: Sequence[Sequence[Sequence[int]]]
+    rows: _Count
+    columns: _Count
+    walls: Sequence[Annotated[Sequence[_Cell], Meta(min_length=2, max_length=2)]]
     """Pairs of cells with a wall between them."""
     landmarks: Sequence[Landmark]
     things: Sequence[Thing]
@@ -82,32 +92,31 @@ def scene_mistake(
     if not isinstance(scene, Mapping) or not set(scene) >= _KEYS:
         keys = ", ".join(sorted(map(str, scene))) if isinstance(scene, Mapping) else f"{scene!r}"
         return f"a scene must have {', '.join(sorted(_KEYS))}; found {keys:.100}"
-    rows, columns = scene["rows"], scene["columns"]
-    if not is_whole(rows, 1, MAX_CELLS) or not is_whole(columns, 1, MAX_CELLS) or rows * columns > MAX_CELLS:
-        return (
-            f"a scene has rows and columns, and at most {MAX_CELLS:,} cells; "
-            f"found {rows!r:.40} rows and {columns!r:.40} columns"
-        )
-
-    def is_cell(value: object) -> bool:
-        return _is_pair(value) and is_whole(value[0], 0, rows - 1) and is_whole(value[1], 0, columns - 1)
-
-    expected: dict[str, tuple[Callable[[object], bool], str]] = {
-        "walls": (lambda wall: _is_pair(wall) and all(map(is_cell, wall)), "two cells"),
-        "landmarks": (lambda mark: _is_landmark(mark, is_cell), "a name, a cell and a colour"),
-        "things": (_is_thing, "a name, a label and a kind"),
-        "actions": (_is_action, "a name, and a move or none"),
-    }
-    for key, (is_one, what) in expected.items():
-        if not isinstance(scene[key], list | tuple):
-            return f"the scene's {key} must be a list; found {scene[key]!r:.100}"
-        for one in scene[key]:
-            if not is_one(one):
-                return f"each of the scene's {key} needs {what}; found {one!r:.100}"
-    things = len(scene["things"])
-    return _array_mistake("cells", cells, np.int16, (states, things), (0, rows * columns - 1)) or (
-        _array_mistake("carriers", carriers, np.int8, (states, things), (-1, things - 1))
+    try:
+        checked = msgspec.convert(dict(scene), SceneDescription)
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:  # a key may have half a character
+        return f"the scene: {mistake_in_words(error, scene)}"
+    things, last_cell = len(checked["things"]), checked["rows"] * checked["columns"] - 1
+    return (
+        _content_mistake(checked)
+        or _array_mistake("cells", cells, np.int16, (states, things), (0, last_cell))
+        or _array_mistake("carriers", carriers, np.int8, (states, things), (-1, things - 1))
     )
+
+
+def _content_mistake(scene: SceneDescription) -> str | None:
+    """Return the first mistake of a scene with values of the right types."""
+    rows, columns = scene["rows"], scene["columns"]
+    if rows * columns > MAX_CELLS:
+        return f"a scene has at most {MAX_CELLS:,} cells; found {rows:,} rows and {columns:,} columns"
+    for cell in (*chain(*scene["walls"]), *(mark["cell"] for mark in scene["landmarks"])):
+        if cell[0] >= rows or cell[1] >= columns:
+            return f"each of the scene's cells is within {rows} rows and {columns} columns; found {cell}"
+    for part in (*scene["landmarks"], *scene["things"], *scene["actions"]):
+        for text in part.values():
+            if isinstance(text, str) and not text.isprintable():
+                return f"each of the scene's texts must be printable; found {text!r}"
+    return None
 
 
 def _array_mistake(
@@ -124,35 +133,3 @@ def _array_mistake(
     if array.size and not bounds[0] <= int(array.min()) <= int(array.max()) <= bounds[1]:
         return f"scene_{name} must be from {bounds[0]} to {bounds[1]}; found {array.min()} to {array.max()}"
     return None
-
-
-def _is_pair(value: object) -> TypeGuard[Sequence[object]]:
-    return isinstance(value, list | tuple) and len(value) == 2
-
-
-def _has_texts(value: object, *keys: str) -> TypeGuard[JsonView]:
-    return isinstance(value, Mapping) and all(is_text(value.get(key)) for key in keys)
-
-
-def _is_landmark(value: object, is_cell: Callable[[object], bool]) -> bool:
-    return (
-        _has_texts(value, "name", "colour")
-        and is_cell(value.get("cell"))
-        and _COLOUR.fullmatch(value["colour"]) is not None
-        and _is_optional(value, "label", "kind")
-    )
-
-
-def _is_thing(value: object) -> bool:
-    return _has_texts(value, "name", "label", "kind") and _is_optional(value, "agent", "colour")
-
-
-def _is_optional(value: JsonView, *keys: str) -> bool:
-    return all(value.get(key) is None or is_text(value[key]) for key in keys)
-
-
-def _is_action(value: object) -> bool:
-    if not _has_texts(value, "name"):
-        return False
-    move = value.get("move")
-    return move is None or (_is_pair(move) and all(is_whole(part, -MAX_CELLS, MAX_CELLS) for part in move))

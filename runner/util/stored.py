@@ -50,11 +50,16 @@ def stored_as(kind: type[_T], value: object, where: str) -> _T:
     try:
         return msgspec.convert(value, kind)
     except (msgspec.ValidationError, UnicodeEncodeError) as error:  # a key may have half a character
-        problem, _, place = str(error).partition(" - at ")
+        raise RecordingError(f"{where}: {mistake_in_words(error, value)}.") from error
+
+
+def mistake_in_words(error: Exception, value: object) -> str:
+    """Return what was found and expected, from an error of `msgspec` on this value."""
+    problem, _, place = str(error).partition(" - at ")
     for key in re.findall(r"\w+", place):  # of `$.vector.wrappers[3]`
         if isinstance(value, Mapping) and key in value:
             value = value[key]
-        elif isinstance(value, list) and key.isdecimal():
+        elif isinstance(value, list | tuple) and key.isdecimal():
             value = value[int(key)]
     problem = problem.replace("Object missing required field", "found none, expected the key")
     words = " ".join(
@@ -63,4 +68,4 @@ def stored_as(kind: type[_T], value: object, where: str) -> _T:
     if place:
         at = place.replace("$.", "").replace("`", "")
         words = f"found {shortened(repr(value), _QUOTED)} as {at}, {words}"
-    raise RecordingError(f"{where}: {words}.")
+    return words
