@@ -100,7 +100,7 @@ def du_command(
     """
     from runner.runs.catalogue.filters import parse
     from runner.runs.catalogue.index import look
-    from runner.runs.catalogue.usage import sizes, usage_of
+    from runner.runs.catalogue.usage import usage_of
 
     chosen = parse(" ".join(words))
     if limit is None and not as_json:
@@ -113,11 +113,11 @@ def du_command(
                 "run_id": usage.row["id"],
                 **{key: usage.row[key] for key in ("name", "status", "same_as")},
                 "path": str(Path(usage.row["root"], usage.row["entry"])),
-                **sizes([usage]),
+                **usage.bytes,
             }
             for usage in largest
         ]
-        print_json({"runs": runs, "total": sums.by_kind(), "freeable": freeable})
+        print_json({"runs": runs, "total": sums.bytes, "freeable": freeable})
     elif sums.runs:
         _draw(largest, sums, freeable)
     else:
@@ -125,9 +125,9 @@ def du_command(
 
 
 def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> None:
-    from runner.runs.catalogue.usage import FREED_BY, sizes
+    from runner.runs.catalogue.usage import FREED_BY
 
-    total, shown = sums.by_kind(), sizes(largest)
+    total = sums.bytes
     kinds = [kind for kind, count in total.items() if count or kind == "total"]
 
     def cells(counts: dict[str, int]) -> list[str]:
@@ -139,9 +139,9 @@ def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Non
     for usage in largest:
         row = usage.row
         originals = [row["same_as"] or ""] if same_as else []
-        grid.add_row(row["id"], row["name"], row["status"], *cells(sizes([usage])), *originals)
+        grid.add_row(row["id"], row["name"], row["status"], *cells(usage.bytes), *originals)
     if sums.runs > len(largest):
-        rest = {kind: count - shown[kind] for kind, count in total.items()}
+        rest = {kind: total[kind] - sum(usage.bytes[kind] for usage in largest) for kind in kinds}
         grid.add_row(f"{sums.runs - len(largest):,} more", "", "", *cells(rest))
     grid.add_row("all", "", "", *cells(total), style="bold")
     draw(grid)

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.runs.catalogue.columns import IndexRow
@@ -26,7 +26,7 @@ from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_fo
 REMOVED: Final = ".removed-"
 """The prefix of a run's folder from the moment it is removed until its files are deleted."""
 KINDS: Final = ("recording", "checkpoints", "exports", "restored", "other")
-"""The kinds of bytes, attributes of `Usage` and `Sums`."""
+"""The kinds of bytes."""
 FREED_BY: Final = {
     "same_content": ("Duplicates", "The same content was recorded before: `dualtaxi rm` removes runs."),
     "unfinished": (
@@ -117,52 +117,24 @@ def cached(part: str) -> Counter[str]:
     return by_run
 
 
-def sizes(usages: Sequence[Usage | Sums]) -> dict[str, int]:
-    """Return the bytes that runs use together, by kind, and their total."""
-    by_kind = {kind: sum(getattr(usage, kind) for usage in usages) for kind in KINDS}
-    return by_kind | {"total": sum(by_kind.values())}
-
-
-@dataclass(frozen=True)
-class Usage:
-    """The disk usage of a run, in bytes."""
+class Usage(NamedTuple):
+    """The disk usage of a run."""
 
     row: IndexRow
     """The run's row in the index, with `same_as`."""
-    recording: int
-    other: int
-    """The other files in its folder."""
-    checkpoints: int
-    """The contents of its checkpoints; what several runs share counts for one of them."""
-    exports: int
-    restored: int
-
-    @property
-    def total(self) -> int:
-        """All bytes."""
-        return self.recording + self.other + self.checkpoints + self.exports + self.restored
+    bytes: dict[str, int]
+    """By kind, and their total. What several runs share of checkpoints counts for one of them."""
 
 
 @dataclass
 class Sums:
-    """The disk usage of several runs together, in bytes."""
+    """The disk usage of several runs together."""
 
     runs: int = 0
-    recording: int = 0
-    other: int = 0
-    checkpoints: int = 0
-    exports: int = 0
-    restored: int = 0
-    same_content: int = 0
-    """Freed by removing runs whose content another run recorded first; not counting protected runs."""
-    unfinished: int = 0
-    """Freed by removing interrupted and failed runs; not counting protected runs."""
-    left_over: int = 0
-    """Left by repairs and interrupted commands; not counting protected runs."""
-
-    def by_kind(self) -> dict[str, int]:
-        """Return the bytes by kind, and their total."""
-        return sizes([self])
+    bytes: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*KINDS, "total"), 0))
+    """By kind, and their total."""
+    freed: Counter[str] = field(default_factory=Counter)
+    """Bytes of unprotected runs that could be freed, by reason: the first three in `FREED_BY`."""
 
     def freeable(self, recordings: Sequence[Path]) -> dict[str, int]:
         """Return the bytes that could be freed, by reason.
@@ -172,10 +144,10 @@ class Sums:
         """
         interrupted = [contents_of(stray) for root in recordings for stray in strays(root)]
         return {
-            "same_content": self.same_content,
-            "unfinished": self.unfinished,
-            "left_over": self.left_over,
-            "cached": self.exports + self.restored,
+            "same_content": self.freed["same_content"],
+            "unfinished": self.freed["unfinished"],
+            "left_over": self.freed["left_over"],
+            "cached": self.bytes["exports"] + self.bytes["restored"],
             "explanations": sum(_size_within(str(root / UNLISTED.parent)) for root in recordings),
             "half_removed": sum(contents.recording + contents.other for contents in interrupted),
         }
@@ -184,13 +156,13 @@ class Sums:
         """Add a run."""
         row = usage.row
         self.runs += 1
-        for kind in KINDS:
-            setattr(self, kind, getattr(self, kind) + getattr(usage, kind))
+        for kind, count in usage.bytes.items():
+            self.bytes[kind] += count
         if KEEP in row["tags"].split() or row["status"] == "running":
             return
-        self.left_over += contents.left_over
-        self.same_content += contents.freed if row["same_as"] else 0
-        self.unfinished += contents.freed if row["status"] in ("interrupted", "failed") else 0
+        self.freed["left_over"] += contents.left_over
+        self.freed["same_content"] += contents.freed if row["same_as"] else 0
+        self.freed["unfinished"] += contents.freed if row["status"] in ("interrupted", "failed") else 0
 
 
 def usage_of(
@@ -216,15 +188,16 @@ def usage_of(
                 contents = contents_of(f"{root}{os.sep}{entry}")
             except OSError:
                 contents = Contents()  # removed just now
-            checkpoint_bytes = checkpoints[root].get(entry, 0)
-            usage = Usage(
-                row, contents.recording, contents.other, checkpoint_bytes, exports[run_id], restored[run_id]
-            )
+            shared = checkpoints[root].get(entry, 0)
+            counts = (contents.recording, shared, exports[run_id], restored[run_id], contents.other)
+            usage = Usage(row, dict(zip(KINDS, counts, strict=True)) | {"total": sum(counts)})
             sums.add(usage, contents)
             yield usage
 
     largest = heapq.nsmallest(
-        len(rows) if limit is None else limit, measured(), key=lambda usage: (-usage.total, usage.row["id"])
+        len(rows) if limit is None else limit,
+        measured(),
+        key=lambda usage: (-usage.bytes["total"], usage.row["id"]),
     )
     return largest, sums
 

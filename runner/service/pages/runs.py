@@ -23,7 +23,7 @@ from runner.runs.catalogue.columns import (
 )
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import Index, order_of
-from runner.runs.catalogue.usage import FREED_BY, sizes, usage_of
+from runner.runs.catalogue.usage import FREED_BY, usage_of
 from runner.service.addresses import Paging, link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
@@ -125,10 +125,10 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
     freeable = sums.freeable(settings.recordings)
     values = {
-        "total": sums.by_kind(),
+        "total": sums.bytes,
         "free": jobs.status().free_bytes,
         "freeable": [(*FREED_BY[reason], size) for reason, size in freeable.items() if size],
-        "rows": [(usage.row, sizes([usage])) for usage in largest],
+        "rows": [(usage.row, usage.bytes) for usage in largest],
         "others": sums.runs - len(largest),
     }
     return page(request, "disk.html", values)

@@ -16,8 +16,8 @@ def test_a_change_in_the_folder_of_a_run_is_measured(folder):
 
     def used():
         (usage,), sums = usages.usage_of(lambda work: look([folder], work), ALL, 5)
-        assert (sums.runs, sums.by_kind()["total"]) == (1, usage.total)
-        return usage.recording, sums.left_over
+        assert (sums.runs, sums.bytes["total"]) == (1, usage.bytes["total"])
+        return usage.bytes["recording"], sums.freed["left_over"]
 
     assert used() == (1000, 0)
     (run.folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
@@ -41,21 +41,21 @@ def test_the_largest_runs_come_first_and_the_sums_are_those_of_all(folder, tmp_p
 
     def usage_with(limit):
         largest, sums = usages.usage_of(lambda work: look([folder], work), ALL, limit)
-        return [(usage.row["id"], usage.row["same_as"], usage.total) for usage in largest], sums
+        return [(usage.row["id"], usage.row["same_as"], usage.bytes["total"]) for usage in largest], sums
 
     first, sums = usage_with(2)
     assert [run_id for run_id, _, _ in first] == [runs[0].run_id, runs[5].run_id]
-    assert (sums.runs, sums.recording, sums.exports) == (6, 210_000, 1_000_000)
+    assert (sums.runs, sums.bytes["recording"], sums.bytes["exports"]) == (6, 210_000, 1_000_000)
     every, _ = usage_with(None)
     assert every[:2] == first
-    assert sums.by_kind()["total"] == sum(total for _, _, total in every)
+    assert sums.bytes["total"] == sum(total for _, _, total in every)
     copies = {run_id for run_id, same_as, _ in every if same_as}
     assert len(copies) == 5
     own = {run.run_id: usages.contents_of(run.folder).freed for run in runs}
     tagged = {runs[3].run_id, runs[5].run_id}
-    assert sums.same_content == sum(own[run_id] for run_id in copies - tagged)
-    assert sums.unfinished == own[runs[2].run_id]
-    assert sums.left_over == 0
+    assert sums.freed["same_content"] == sum(own[run_id] for run_id in copies - tagged)
+    assert sums.freed["unfinished"] == own[runs[2].run_id]
+    assert sums.freed["left_over"] == 0
 
 
 def test_cached_files_count_for_their_run(folder, tmp_path):
