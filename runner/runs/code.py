@@ -9,12 +9,10 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import sysconfig
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Final
@@ -26,7 +24,7 @@ from runner.runs.git import GIT_SECONDS, NotRecorded, Repository, read_repositor
 from runner.runs.provenance import is_code_wanted
 from runner.runs.redaction import SETTINGS_FILES, is_secret_file, redacted_text
 from runner.runs.run import Run
-from runner.util.files import open_regular
+from runner.util.files import is_installed, open_regular
 from runner.util.humanize import listed
 from runner.util.values import as_utf8
 
@@ -288,7 +286,7 @@ def user_script() -> Path | None:
     if not isinstance(file, str) or not file:
         return None
     path = Path(file).absolute()
-    return None if _is_installed(str(path)) or not path.is_file() else path
+    return None if is_installed(str(path), is_script=True) or not path.is_file() else path
 
 
 def _modules(root: Path) -> Iterator[str]:
@@ -297,7 +295,7 @@ def _modules(root: Path) -> Iterator[str]:
         if not isinstance(module, ModuleType) or name.partition(".")[0] in ("runner", "dualtaxi"):
             continue
         file = vars(module).get("__file__")  # getattr may import a lazy module
-        if isinstance(file, str) and file.endswith(".py") and not _is_installed(file):
+        if isinstance(file, str) and file.endswith(".py") and not is_installed(file):
             path = _within(root, Path(file))
             if path:
                 yield path
@@ -308,18 +306,6 @@ def _within(root: Path, path: Path) -> str:
     with contextlib.suppress(OSError, ValueError):
         return path.resolve().relative_to(root).as_posix()
     return ""
-
-
-@cache
-def _installed_folders() -> tuple[str, ...]:
-    schemes = (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme("user"))
-    names = ("stdlib", "platstdlib", "purelib", "platlib", "scripts")
-    return tuple({sysconfig.get_path(name, scheme) + os.sep for scheme in schemes for name in names})
-
-
-def _is_installed(file: str) -> bool:
-    parts = Path(file).parts
-    return file.startswith(_installed_folders()) or "site-packages" in parts or "dist-packages" in parts
 
 
 def _cells() -> str:

@@ -16,7 +16,6 @@ import json
 import os
 import secrets
 import sys
-import sysconfig
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.recording.maker import EnvironmentMaker
-from runner.util.files import open_regular, read_object, write_object
+from runner.util.files import is_installed, open_regular, read_object, write_object
 from runner.util.values import JsonView
 
 MARK_FILE: Final = "trust.json"
@@ -137,10 +136,10 @@ def _own_places(text: str) -> tuple[list[str], str]:
     modules = {top: sys.modules.get(top) for top in named}  # of texts such as `package.module:name`
     if script and Path(script).stem in modules:  # `make="train:make_env"` names the script by its module
         modules[Path(script).stem] = main
-    if not any(_is_users(place) for module in modules.values() for place in _places(module)):
+    if all(is_installed(place) for module in modules.values() for place in _places(module)):
         return [], ""
     paths = (os.path.abspath(path) for path in sys.path)  # noqa: PTH100 - links stay what they are
-    folders = [path for path in paths if _is_users(path) and Path(path).is_dir()]
+    folders = [path for path in paths if not is_installed(path) and Path(path).is_dir()]
     return folders, os.path.abspath(script) if script and "__main__" in modules else ""  # noqa: PTH100
 
 
@@ -148,19 +147,6 @@ def _places(module: object) -> list[str]:
     """Return the file of a module, or the folders of a package without one; none of what has neither."""
     file = getattr(module, "__file__", None)
     return [str(file)] if file else list(map(str, getattr(module, "__path__", ())))
-
-
-def _is_users(path: str) -> bool:
-    """Return whether a folder or file is neither Python's own nor installed."""
-    parts = Path(path).parts
-    is_installed = "site-packages" in parts or "dist-packages" in parts or path.endswith(".zip")
-    return not is_installed and not path.startswith(_stdlib())
-
-
-@lru_cache(1)
-def _stdlib() -> tuple[str, ...]:
-    names = ("stdlib", "platstdlib")
-    return tuple({place for name in names if (place := sysconfig.get_paths().get(name))})
 
 
 def _digest_of(script: str) -> str:

@@ -11,6 +11,7 @@ import secrets
 import shutil
 import stat
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -29,6 +30,32 @@ TABLES: Final = "tables"
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 """On Windows, leaves line ends as they are."""
 _to_json: Final = json.JSONEncoder(ensure_ascii=False).encode
+
+
+def is_installed(path: str, is_script: bool = False) -> bool:
+    """Return whether a file or folder is Python's own, or was installed, and is not the user's.
+
+    Args:
+        is_script: whether scripts that were installed count, such as `jupyter`.
+    """
+    parts = Path(path).parts
+    return (
+        "site-packages" in parts
+        or "dist-packages" in parts
+        or path.endswith(".zip")
+        or f"{path}{os.sep}".startswith(
+            _folders_of("stdlib", "platstdlib", *(["scripts"] if is_script else []))
+        )
+    )
+
+
+@cache
+def _folders_of(*names: str) -> tuple[str, ...]:
+    """Return the folders of Python and of the user with these names of `sysconfig`."""
+    import sysconfig
+
+    schemes = (sysconfig.get_default_scheme(), sysconfig.get_preferred_scheme("user"))
+    return tuple({sysconfig.get_path(name, scheme) + os.sep for scheme in schemes for name in names})
 
 
 def cache_folder() -> Path:
