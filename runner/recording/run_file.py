@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple, TypeGuard
 
 from runner.errors import shortened
 from runner.recording.metrics import METRICS
-from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep
+from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_number, is_too_deep
 
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
 """The statuses that a run's owner writes."""
@@ -247,14 +247,6 @@ def _is_count(value: object) -> bool:
     return type(value) is int and 0 <= value < _LARGEST
 
 
-def _is_number(value: object) -> TypeGuard[float]:
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    with contextlib.suppress(OverflowError):
-        return math.isfinite(value)
-    return False
-
-
 def _is_text(value: object) -> TypeGuard[str]:
     return isinstance(value, str)
 
@@ -276,7 +268,7 @@ def _within(lowest: float = -math.inf, highest: float = math.inf) -> Check:
         expected = f"a number from {lowest:g} to {highest:g}"
     else:
         expected = f"a finite number from {lowest:g} up" if math.isfinite(lowest) else "a finite number"
-    return Check(lambda value: _is_number(value) and lowest <= value <= highest, expected)
+    return Check(lambda value: is_number(value) and lowest <= value <= highest, expected)
 
 
 _DIGEST: Final = Check(
@@ -315,7 +307,7 @@ _SUMMARY: Final = {
     "last_evaluation": _optional(_OBJECT),
     "recent_training": _optional(_OBJECT),
     "logged": Check(
-        _maps_to(lambda value: value is None or _is_number(value)), "an object of finite numbers or nulls"
+        _maps_to(lambda value: value is None or is_number(value)), "an object of finite numbers or nulls"
     ),
     "rewards_off_table": _COUNT,
     "seconds": _optional(_LENGTH),

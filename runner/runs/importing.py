@@ -29,7 +29,7 @@ from runner.runs.resolve import run_with_id
 from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, made_by, new_run_id
 from runner.runs.store import Store
 from runner.util.files import require_room, storage_errors, sync, write_object
-from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView, is_number
 
 EXPORT_RECORD: Final = "export"
 """The metadata record of an exported recording: what `run.json` and the labels say, as JSON."""
@@ -139,7 +139,7 @@ def run_facts(recording: Recording, details: JsonView) -> Json:
     summary, given = dict(facts["summary"]), details.get("summary")
     given = given if isinstance(given, dict) else {}
     seconds, error = given.get("seconds"), given.get("error")
-    if isinstance(seconds, int | float) and not isinstance(seconds, bool) and 0 <= seconds < 1e12:
+    if is_number(seconds) and 0 <= seconds < 1e12:
         summary["seconds"] = seconds
     if isinstance(error, str) and len(error) <= MAX_ERROR:
         summary["error"] = error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -60,6 +61,15 @@ def is_text(value: object) -> TypeGuard[str]:
 def is_whole(value: object, low: int, high: int) -> TypeGuard[int]:
     """Return whether this is an integer from `low` to `high`."""
     return isinstance(value, int) and not isinstance(value, bool) and low <= value <= high
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether this is a finite number."""
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return False
+    with contextlib.suppress(OverflowError):  # of an integer beyond all floats
+        return math.isfinite(value)
+    return False
 
 
 def is_utf8(text: str) -> bool:

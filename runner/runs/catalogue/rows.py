@@ -19,6 +19,7 @@ from runner.runs.branches import origin_in
 from runner.runs.catalogue.columns import COLUMNS
 from runner.runs.listing import listed_run
 from runner.runs.run import Run
+from runner.util.values import is_number
 
 SEEDS: Final = 2**64
 
@@ -131,16 +132,6 @@ def text(value: object, max_length: int = _TEXT) -> str | None:
     return value[:max_length].encode(errors="replace").decode()
 
 
-def number(value: object) -> float | None:
-    """Return a finite number; None for any other value."""
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return None
-    try:
-        return float(value) if math.isfinite(value) else None
-    except OverflowError:
-        return None
-
-
 def _flat(config: Mapping[str, object]) -> dict[str, object]:
     """Return the plain values in a configuration by dotted path; items of lists by their position."""
     flat: dict[str, object] = {}
@@ -154,7 +145,7 @@ def _flat(config: Mapping[str, object]) -> dict[str, object]:
                     put(enumerate(inside) if kind is list else inside.items(), f"{here}.", depth + 1)
             elif kind is str:
                 flat[here] = text(value)
-            elif value is None or kind is bool or number(value) is not None:
+            elif value is None or kind is bool or is_number(value):
                 flat[here] = value
 
     put(config.items(), "", 1)
