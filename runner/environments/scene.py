@@ -6,6 +6,7 @@ neither can be trusted.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Annotated, Final, NotRequired, TypedDict
@@ -92,9 +93,9 @@ def scene_mistake(
     if not isinstance(scene, Mapping) or not set(scene) >= _KEYS:
         keys = ", ".join(sorted(map(str, scene))) if isinstance(scene, Mapping) else f"{scene!r}"
         return f"a scene must have {', '.join(sorted(_KEYS))}; found {keys:.100}"
-    try:
-        checked = msgspec.convert(dict(scene), SceneDescription)
-    except (msgspec.ValidationError, UnicodeEncodeError) as error:  # a key may have half a character
+    try:  # as it is recorded: JSON has no sets, whose order may change
+        checked = msgspec.convert(json.loads(json.dumps(dict(scene))), SceneDescription)
+    except (msgspec.ValidationError, TypeError, ValueError, RecursionError) as error:
         return f"the scene: {mistake_in_words(error, scene)}"
     things, last_cell = len(checked["things"]), checked["rows"] * checked["columns"] - 1
     return (

@@ -267,6 +267,31 @@ def test_errors_name_what_is_wrong_with_a_scene(lake):
         from_parts(lake.description() | {"scene": {"rows": 3}}, lake.arrays())
 
 
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"rows": 0}, "found 0 as rows, expected a whole number >= 1"),
+        ({"columns": 2**14, "rows": 3}, "at most 32,767 cells"),
+        ({"walls": {1}}, "Object of type set is not JSON serializable"),
+        ({"walls": [[[0, 0]]]}, r"found \[\[0, 0\]\] as walls\[0\], expected a list of length >= 2"),
+        ({"walls": [[[0, 0], [99, 0]]]}, r"within 4 rows and 4 columns; found \[99, 0\]"),
+        (
+            {"landmarks": [{"name": "a", "cell": [0, 0], "colour": "red"}]},
+            "'red' as landmarks.* expected a text",
+        ),
+        ({"landmarks": [{"name": "a", "cell": [0, -1], "colour": "#000000"}]}, "found -1 as landmarks"),
+        ({"things": [{"name": "a\n", "label": "a", "kind": "mover"}]}, r"must be printable; found 'a\\n'"),
+        ({"things": [{"name": "a", "label": "", "kind": "mover"}]}, "found '' as things"),
+        ({"actions": [{"name": "a", "move": [1, 2, 3]}]}, r"found \[1, 2, 3\] as actions\[0\].move"),
+        ({"actions": [{"move": None}]}, "expected the key name"),
+    ],
+)
+def test_an_impossible_value_in_a_scene_is_named(change, reason):
+    known = load_mdp("FrozenLake-v1", {})
+    with pytest.raises(EnvironmentNotUsable, match=reason):
+        from_parts(known.description() | {"scene": known.scene | change}, known.arrays())
+
+
 anything = st.recursive(
     st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.floats() | st.text(max_size=3),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=2),
