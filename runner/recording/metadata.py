@@ -9,9 +9,11 @@ import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from typing import Final, cast
+from itertools import chain
+from typing import Annotated, Final, TypedDict, cast
 
 import zstandard
+from msgspec import Meta
 
 from runner.environments.mdp import (
     MAX_AGENTS,
@@ -32,8 +34,8 @@ from runner.recording.records import MAX_METADATA_BYTES
 from runner.recording.spaces import leaves_of
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.arrays import Array
-from runner.util.stored import stored_as
-from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep, is_whole, without_surrogates
+from runner.util.stored import Count, stored_as
+from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep, without_surrogates
 
 REQUIRED_RECORDS: Final = frozenset({"run", "config", "provenance"})
 """The metadata records without which a recording's messages cannot be interpreted."""
@@ -194,22 +196,24 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
         raise RecordingError(f"{what} holds no JSON object ({error}).") from error
 
 
+class _Repair(TypedDict):
+    """What a repair could not save."""
+
+    lost: dict[str, list[Annotated[list[Count], Meta(min_length=2, max_length=2)]]]
+
+
 def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[int]]]:
     """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
 
     Raises:
         RecordingError: the metadata record has no such ranges.
     """
-
-    def are_ranges(value: object) -> bool:
-        if not isinstance(value, list) or not all(isinstance(one, list) and len(one) == 2 for one in value):
-            return False
-        numbers = [number for one in value for number in one]
-        return all(is_whole(number, 0, 2**62 - 1) for number in numbers) and numbers == sorted(numbers)
-
-    lost = repair.get("lost")
-    if not isinstance(lost, dict) or not all(map(are_ranges, lost.values())):
-        raise RecordingError(f"{path}: the metadata 'repair' does not say what was lost.")
+    where = f"{path}: the metadata 'repair' does not say what was lost"
+    lost = stored_as(_Repair, repair, where)["lost"]
+    for topic, ranges in lost.items():
+        numbers = list(chain(*ranges))
+        if numbers != sorted(numbers):
+            raise RecordingError(f"{where}: found ranges of {topic[:100]} that are not in order.")
     return lost
 
 
