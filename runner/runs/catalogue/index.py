@@ -137,24 +137,25 @@ class Index:
 
         At most `MAX_TREE` runs; where there are more, the newest are left out.
         """
-        columns = ("id", "name", "status", "success_percent", "mean_return", "parent", "origin")
-        above, top = {run_id}, run_id
-        while (rows := self.select(_of_id(top), columns=("parent",))) and rows[0]["parent"]:
-            top = rows[0]["parent"]
-            if top in above or len(above) == MAX_TREE:
-                break  # a configuration that names itself
-            above.add(top)
-        by_id = {row["id"]: row for row in self.rows(_of_id(top), columns=columns)}
-        below: dict[str, list[str]] = {}
-        level = [top]
-        while level and len(by_id) < MAX_TREE:
-            children = Filter(Sql(f"parent {_AMONG}", (json.dumps(level),)))
-            rows = self.select(children, Sql("created"), columns=columns)
-            new = {row["id"]: row for row in rows[: MAX_TREE - len(by_id)] if row["id"] not in by_id}
-            for row in new.values():
-                below.setdefault(row["parent"], []).append(row["id"])
-            by_id |= new
-            level = list(new)
+        among = f"root {self._is_here}"
+        ancestors = (
+            "WITH RECURSIVE above(id, depth) AS (SELECT ?, 0 UNION SELECT parent, depth + 1 FROM runs "
+            f"JOIN above USING (id) WHERE parent > '' AND depth < {MAX_TREE} AND {among}) "
+            "SELECT id FROM above ORDER BY depth DESC LIMIT 1"
+        )
+        (top,) = self._database.execute(ancestors, (run_id, *self.roots)).fetchone()
+        descendants = (
+            "WITH RECURSIVE tree(id) AS (SELECT ? UNION SELECT runs.id FROM runs "
+            f"JOIN tree ON parent = tree.id WHERE {among}) "
+            "SELECT id, name, status, success_percent, mean_return, parent, origin FROM runs "
+            f"WHERE id IN tree AND {among} ORDER BY created LIMIT {MAX_TREE}"
+        )
+        by_id, below = dict[str, IndexRow](), dict[str, list[str]]()
+        for row in _as_rows(self._database.execute(descendants, (top, *self.roots, *self.roots))):
+            if row["id"] not in by_id:
+                by_id[row["id"]] = row
+                if row["id"] != top:  # or a configuration names itself
+                    below.setdefault(row["parent"], []).append(row["id"])
 
         def node(name: str) -> BranchNode:
             row = by_id.get(name, {})
@@ -313,10 +314,6 @@ def _as_rows(cursor: sqlite3.Cursor) -> Iterator[IndexRow]:
 def _ordered(*order: Sql) -> Sql:
     text = ", ".join(part.text for part in order)
     return Sql(f"ORDER BY {text}", tuple(value for part in order for value in part.values))
-
-
-def _of_id(run_id: str) -> Filter:
-    return Filter(Sql("id = ?", (run_id,)))
 
 
 def _begins(column: str, beginning: str) -> Sql:

@@ -20,7 +20,7 @@ from runner.recording.labels import Labels, change_labels, read_labels
 from runner.runs.catalogue import folders
 from runner.runs.catalogue.database import index_path, open_index
 from runner.runs.catalogue.folders import Folders
-from runner.runs.catalogue.index import look
+from runner.runs.catalogue.index import MAX_TREE, look
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
@@ -173,7 +173,7 @@ def test_a_run_is_found_by_the_names_that_find_it_in_the_folder(folder):
 WRITER = """
 import sys
 from pathlib import Path
-from runner.runs.catalogue.index import look
+from runner.runs.catalogue.index import MAX_TREE, look
 from runner.runs.catalogue.filters import parse
 from types import SimpleNamespace
 from runner.recording.labels import Labels, change_labels
@@ -251,3 +251,29 @@ def test_rebuilding_the_index_never_empties_it(folder, monkeypatch):
     monkeypatch.setattr(folders, "row_of", looking_on)
     assert len(look([folder], lambda index: index.select(ALL), rebuild=True)) == 4
     assert seen == [len(runs)] * 4
+
+
+def test_a_tree_of_branches_is_bounded_and_ends_where_runs_name_each_other(folder):
+    def branched(run_id, parent):
+        branch = {"run": parent, "step": 1, "actions": {}, "settings": {}}
+        config = CONFIG.to_mapping() | {"branches": [branch] if parent else []}
+        (folder / run_id).mkdir(parents=True)
+        created = f"2026-01-01T00:00:00.{int(run_id[1:]):06}+00:00"
+        facts = {"run_id": run_id, "name": run_id, "seed": 1, "status": "finished", "created": created}
+        (folder / run_id / RUN_FILE).write_text(json.dumps(facts | {"config": config}))
+
+    def tree(run_id):
+        def size(node):
+            return 1 + sum(map(size, node.branches))
+
+        root = look([folder], lambda index: index.branch_tree(run_id))
+        return root.run, size(root)
+
+    for own, parent in (("a1", "a3"), ("a2", "a1"), ("a3", "a2"), ("b1", "b1"), ("c1", "")):
+        branched(own, parent)
+    for number in range(2, 400):
+        branched(f"c{number}", "c1")
+    assert tree("a2")[1] == 3
+    assert tree("b1") == ("b1", 1)
+    assert tree("c5") == ("c1", MAX_TREE)
+    assert tree("unknown") == ("unknown", 1)
