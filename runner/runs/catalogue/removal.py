@@ -7,6 +7,7 @@ touched. A run that is running, or tagged `keep`, stays.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 import shutil
@@ -21,7 +22,7 @@ from typing import Final
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_readable
 from runner.runs.catalogue.columns import IndexRow, moment
-from runner.runs.catalogue.filters import ANY_RUN, Filter
+from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import Index
 from runner.runs.catalogue.rows import Sql, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
@@ -46,6 +47,12 @@ _COLUMNS: Final = (
     "created",
     "archive",
 )
+_OLDER: Final = (
+    "(root, entry) IN (SELECT root, entry FROM (SELECT root, entry, ROW_NUMBER() OVER "
+    "(PARTITION BY config ORDER BY created DESC, id, root) AS place FROM runs "
+    "WHERE root IN (SELECT value FROM json_each(?)) AND id IS NOT NULL) WHERE place > ?)"
+)
+"""The condition to be older than the newest runs of a configuration's name, in some folders."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,18 +194,10 @@ def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[list[IndexRo
     if criteria.older_than is not None:
         latest = int((now - criteria.older_than) * 1000)
         chosen = chosen.also(Sql("created < ?", (latest,)))
-    rows = index.select(chosen, columns=_COLUMNS)
-    spared = set()
     if criteria.keep_last is not None:
-        seen: Counter[str | None] = Counter()
-        for row in index.rows(ANY_RUN, columns=("root", "entry", "config")):  # the newest first
-            if seen[row["config"]] < criteria.keep_last:
-                spared.add((row["root"], row["entry"]))
-            seen[row["config"]] += 1
+        chosen = chosen.also(Sql(_OLDER, (json.dumps(index.roots), criteria.keep_last)))
     going, staying = [], Counter[str]()
-    for row in rows:
-        if (row["root"], row["entry"]) in spared:
-            continue
+    for row in index.select(chosen, columns=_COLUMNS):
         if criteria.statuses and row["status"] not in criteria.statuses:
             continue
         if row["status"] == "running":
