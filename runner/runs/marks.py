@@ -177,7 +177,14 @@ def _key(is_needed: bool) -> bytes | None:
     """Return this user's key, which is made if `is_needed` and there is none; None if there is none."""
     from platformdirs import user_data_path
 
-    return _key_in(user_data_path("dualtaxi"), is_needed)
+    path = user_data_path("dualtaxi") / KEY_FILE
+    with contextlib.suppress(OSError):
+        return _known_key(path)
+    if is_needed:
+        with contextlib.suppress(OSError):
+            _make_key(path)
+            return _known_key(path)
+    return None
 
 
 @lru_cache(4)
@@ -187,17 +194,6 @@ def _known_key(path: Path) -> bytes:
     if len(key) != _KEY_BYTES:
         raise OSError("it is no key")
     return key
-
-
-def _key_in(folder: Path, is_needed: bool) -> bytes | None:
-    path = folder / KEY_FILE
-    with contextlib.suppress(OSError):
-        return _known_key(path)
-    if is_needed:
-        with contextlib.suppress(OSError):
-            _make_key(path)
-            return _known_key(path)
-    return None
 
 
 def _make_key(path: Path) -> None:
