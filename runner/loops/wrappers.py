@@ -8,14 +8,14 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
-from gymnasium.envs.registration import EnvSpec, WrapperSpec, load_env_creator
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker, RecordVideo, TimeLimit
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 
 from runner.loops.arguments import VARIABLE, CannotBeMade, arguments_of, factory_of, plain_kwargs
 from runner.recording.maker import FUNCTION_NAME
-from runner.replay.makers import class_name
+from runner.replay.makers import class_name, creator_of
 from runner.replay.scripts import MAIN
 from runner.replay.trust import is_left_out, name_of
 from runner.util.values import MAX_TEXT
@@ -40,7 +40,7 @@ def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]
     """
     left = list(wrappers)
     inner = 0
-    if isinstance(spec, EnvSpec) and not isinstance(_creator_of(spec), type):
+    if isinstance(spec, EnvSpec) and not isinstance(creator_of(spec), type):
         firsts = [at for at, each in enumerate(left) if type(each) in (PassiveEnvChecker, OrderEnforcing)]
         inner = next(iter(firsts), 0)
         if not firsts:  # both were left out, or only an inner environment is recorded
@@ -56,11 +56,6 @@ def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]
         "max_episode_steps": None if limit is None else limit._max_episode_steps,
         "additional_wrappers": [wrapper_fields(wrapper, assumed) for wrapper in left],
     }
-
-
-def _creator_of(spec: EnvSpec) -> object:
-    """Return the class or function that makes the environment of a specification."""
-    return load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
 
 
 def return_name(names: Sequence[str]) -> str:

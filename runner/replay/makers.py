@@ -164,10 +164,7 @@ def _made(maker: EnvironmentMaker, trust: bool, render: bool) -> Env:
     spec, registered = _registered(maker, trust)
     kwargs = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
     if render:
-        creator: Any = registered.entry_point
-        if isinstance(creator, str):
-            creator = gymnasium.envs.registration.load_env_creator(creator)
-        modes = (getattr(creator, "metadata", None) or {}).get("render_modes", ())
+        modes = (getattr(creator_of(registered), "metadata", None) or {}).get("render_modes", ())
         if "rgb_array" not in modes:
             names = ", ".join(map(str, modes)) or "none"
             raise CannotRedo(
@@ -302,6 +299,13 @@ def _attribute(name: str) -> Any:
 def _creator(entry_point: str) -> Any:
     """Return what Gymnasium takes as an entry point: a definition of the script itself, else its name."""
     return _attribute(entry_point) if entry_point.startswith(f"{MAIN}:") else entry_point
+
+
+def creator_of(spec: EnvSpec) -> object:
+    """Return the class or function that makes the environment of a specification."""
+    from gymnasium.envs.registration import load_env_creator
+
+    return load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
 
 
 def layers_of(env: object) -> Iterator[Any]:
