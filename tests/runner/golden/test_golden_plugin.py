@@ -6,9 +6,13 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
+
+from runner.service.processes import PRELOADED
+from runner.util.processes import process_context, start_process
 
 TESTS = """
 import gymnasium
@@ -38,22 +42,43 @@ def test_scores(golden):
 """
 CHANGED = TESTS.replace("0.5, 0.2, 0.0", "1.5, 0.3, 3.0")
 FILES = {"test_loop.mcap", "test_job.mcap", "test_scores.json"}
-
+OPTIONS = ("-q", "-p", "no:cacheprovider")
+ENVIRONMENT = {"PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "200"}
 
 PAGE = Path(__file__).parents[3] / "docs" / "golden-runs.md"
 
 
 def pytest_over(folder: Path, text: str, *options: str) -> tuple[int, str]:
-    """Return the exit code and output of pytest over a folder, with this test file if it is not empty."""
+    """Return the exit code and output of pytest over a folder, with this test file if it is not empty.
+
+    It runs in a process that is forked with all that the tests import, which takes a fraction of the time.
+    """
     if text:
         (folder / "test_mine.py").write_text(text)
     (folder / "pytest.ini").touch()
-    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "COLUMNS": "200"}
+    output = folder.with_name(f"{folder.name}.out")
+    words = [*OPTIONS, "-p", "runner.golden.plugin", *options]
+    process = start_process(process_context(PRELOADED), run_pytest, folder, words, output)
+    process.join()
+    return process.exitcode, output.read_text()
+
+
+def run_pytest(folder: Path, words: list[str], output: Path) -> None:
+    """Run pytest in this process, which then ends."""
+    os.chdir(folder)
+    os.environ.update(ENVIRONMENT, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
+    os.environ.pop("PYTEST_ADDOPTS", None)
+    sys.dont_write_bytecode = True  # files are rewritten within the second that their time stamps tell
+    with output.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+        code = pytest.main(words)
+    sys.exit(int(code))
+
+
+def pytest_typed(folder: Path) -> tuple[int, str]:
+    """Return the same of pytest as users start it, which finds the plugin by itself."""
+    environment = os.environ | ENVIRONMENT
     environment.pop("PYTEST_ADDOPTS", None)
-    if (folder / "golden").exists():  # found as users' pytest finds it before; other plugins take a second
-        environment["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-        options = ("-p", "runner.golden.plugin", *options)
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
+    command = [sys.executable, "-m", "pytest", *OPTIONS]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     return done.returncode, done.stdout + done.stderr
 
@@ -62,7 +87,9 @@ def pytest_over(folder: Path, text: str, *options: str) -> tuple[int, str]:
 def folder(tmp_path_factory) -> Path:
     """Return a folder of tests whose golden runs are recorded."""
     folder = tmp_path_factory.mktemp("golden")
-    code, output = pytest_over(folder, TESTS)
+    (folder / "test_mine.py").write_text(TESTS)
+    (folder / "pytest.ini").touch()
+    code, output = pytest_typed(folder)
     assert code == 1
     assert "3 failed" in output
     assert "record it by `pytest --golden-update`" in output
