@@ -9,15 +9,15 @@ import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import threading
 import time
 
 import httpx2 as httpx
 import pytest
+from click.testing import CliRunner
 from served import Served
 
+from runner.cli import cli
 from runner.runs.catalogue.database import index_path
 from runner.service.app import create_app
 from runner.service.server import bind, serve
@@ -200,15 +200,10 @@ def test_a_used_port_and_a_served_folder_are_reported(recordings):
     with Served(recordings) as served:
         port, elsewhere = str(served.port), recordings.with_name("elsewhere")
         taken, twice = (
-            subprocess.run(
-                [sys.executable, "-m", "runner", "serve", "--port", where, "--recordings", str(folder)],
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            CliRunner().invoke(cli, ["serve", "--port", where, "--recordings", str(folder)])
             for where, folder in ((port, elsewhere), ("0", recordings))
         )
-    assert (taken.returncode, twice.returncode) == (2, 2)
+    assert (taken.exit_code, twice.exit_code) == (2, 2)
     assert "cannot listen there" in taken.stderr
     assert "served by another process" in twice.stderr
     assert "Traceback" not in taken.stderr + twice.stderr

@@ -181,14 +181,3 @@ def test_a_killed_sweep_ends_as_if_it_never_was(tmp_path):
         server.until(are_finished)
     assert len(list_runs(killed)) == len(tried(calm)) == 8
     assert tried(killed) == tried(calm)
-
-
-def test_a_second_server_of_the_same_folder_is_refused(tmp_path):
-    from click.testing import CliRunner
-
-    from runner.cli import cli
-
-    with Served(tmp_path):
-        result = CliRunner().invoke(cli, ["serve", "--port", "0", "--recordings", str(tmp_path)])
-    assert "is served by another process already" in result.output
-    assert result.exit_code == 2
