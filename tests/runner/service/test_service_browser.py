@@ -289,12 +289,11 @@ def test_a_step_is_opened_in_rerun(page, folder):
 
 
 @pytest.mark.parametrize("width", [400, 1400])
-def test_nothing_sticks_out_of_any_page(page, width):
+def test_nothing_sticks_out_of_any_page(page, browser, width):
+    size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     for address in PAGES:
-        browser = page(address)
-        size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}
-        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-        browser.refresh()
+        page(address)
         assert browser.execute_script("return document.documentElement.scrollWidth") <= width, address
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
@@ -317,13 +316,10 @@ def test_a_narrow_comparison_cuts_no_word(page):
     assert set(lines) == {1}
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_everything_has_a_name_and_text_stands_out(page, scheme):
+def test_everything_has_a_name_and_text_stands_out(page):
     """Names for screen readers; contrast of at least 4.5 to 1, as WCAG 2 wants it (level AA)."""
     for address in PAGES:
         browser = page(address)
-        features = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", features)
         tree = browser.execute_cdp_cmd("Accessibility.getFullAXTree", {})["nodes"]
         for node in tree:
             if not node.get("ignored") and node["role"]["value"] in (
@@ -337,10 +333,13 @@ def test_everything_has_a_name_and_text_stands_out(page, scheme):
             ):
                 named = node.get("name", {}).get("value") or node["role"]["value"] == "table"
                 assert named, (address, node["role"]["value"], node.get("properties"))
-        for selector in ("body", ".soft", ".hint", ".bar nav a", ".tabs a", "button", "dt", ".status"):
-            for colours in browser.execute_script(COLOURS, selector):
-                light, dark = sorted((luminance(colour) for colour in colours[:2]), reverse=True)
-                assert (light + 0.05) / (dark + 0.05) >= 4.5, (address, selector, colours)
+        for scheme in ("light", "dark"):
+            features = {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+            browser.execute_cdp_cmd("Emulation.setEmulatedMedia", features)
+            for selector in ("body", ".soft", ".hint", ".bar nav a", ".tabs a", "button", "dt", ".status"):
+                for colours in browser.execute_script(COLOURS, selector):
+                    light, dark = sorted((luminance(colour) for colour in colours[:2]), reverse=True)
+                    assert (light + 0.05) / (dark + 0.05) >= 4.5, (address, scheme, selector, colours)
     browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
