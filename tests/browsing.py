@@ -18,28 +18,29 @@ ARGUMENTS: Final = (
     "--no-sandbox",
     "--disable-dev-shm-usage",
     "--window-size=1300,1000",
+    "--enable-unsafe-swiftshader",  # WebGL without a graphics card
 )
-WEBGL: Final = ("--enable-unsafe-swiftshader", "--use-angle=swiftshader")
-"""What WebGL needs without a graphics card; everything else is drawn more slowly with it."""
 
 
-@contextlib.contextmanager
-def chromium(*arguments: str) -> Iterator[webdriver.Chrome]:
-    """Start Chromium, whose log holds its requests and errors; skip the test where it is not installed.
-
-    Args:
-        arguments: more words of its command line.
-    """
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
+def chromium_programs() -> tuple[str | None, str | None]:
+    """Return the paths of Chromium and its driver; skip the test where they are not installed."""
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     driver = shutil.which("chromedriver")
     if (program is None or driver is None) and "DUALTAXI_CI" not in os.environ:
         pytest.skip("needs Debian's chromium and chromium-driver")
+    return program, driver
+
+
+@contextlib.contextmanager
+def chromium() -> Iterator[webdriver.Chrome]:
+    """Start Chromium, whose log holds its requests and errors; skip the test where it is not installed."""
+    from selenium import webdriver
+    from selenium.webdriver.chrome.service import Service
+
+    program, driver = chromium_programs()
     options = webdriver.ChromeOptions()
     options.binary_location = program
-    for argument in (*ARGUMENTS, *arguments):
+    for argument in ARGUMENTS:
         options.add_argument(argument)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
     with webdriver.Chrome(options=options, service=Service(driver)) as browser:

@@ -23,7 +23,7 @@ def lake(tmp_path_factory):
 @pytest.fixture(scope="session")
 def chromium():
     """Return Chromium, whose log holds its requests and errors."""
-    with browsing.chromium(*browsing.WEBGL) as started:
+    with browsing.chromium() as started:
         yield started
 
 
