@@ -188,9 +188,9 @@ def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
         {
             "name": "long",
             "env": {"id": "FrozenLake-v1"},
-            "episodes": 4000,
+            "episodes": 1600,
             "log": {"every_steps": 5},
-            "evaluation": {"every": 4000, "trials": 2},
+            "evaluation": {"every": 1600, "trials": 2},
         },
         recordings=folder,
     )
@@ -298,11 +298,10 @@ def test_nothing_sticks_out_of_any_page(page, browser, width):
     browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
-def test_a_narrow_comparison_cuts_no_word(page):
+def test_a_narrow_comparison_cuts_no_word(page, browser):
     size = {"width": 390, "height": 800, "deviceScaleFactor": 1, "mobile": True}
-    browser = page("/compare?run=first&run=second")
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    browser.refresh()
+    page("/compare?run=first&run=second")
     lines = browser.execute_script(
         """
         const cells = [...document.querySelectorAll(".against td")];

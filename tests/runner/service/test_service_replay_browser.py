@@ -100,12 +100,11 @@ def test_the_report_contains_pictures(browser, loops, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["pole", "game", "rooms"])
-def test_nothing_sticks_out_of_a_narrow_page(page, name):
-    browser = page(f"/runs/{name}/replay/train/0")
+def test_nothing_sticks_out_of_a_narrow_page(page, browser, name):
     size = {"width": 380, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
-        browser.refresh()
+        page(f"/runs/{name}/replay/train/0")
         wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".values section"))
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 380
     finally:

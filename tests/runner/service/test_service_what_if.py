@@ -100,12 +100,11 @@ def test_a_loop_has_no_such_link(loops_client):
     assert "What if" not in loops_client.get("/runs/pole/replay/train/0").text
 
 
-def test_nothing_sticks_out_of_a_narrow_page(page):
-    browser = page(f"/runs/first/what-if/{AT}")
+def test_nothing_sticks_out_of_a_narrow_page(page, browser):
     size = {"width": 380, "height": 800, "deviceScaleFactor": 1, "mobile": True}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     try:
-        browser.refresh()
+        page(f"/runs/first/what-if/{AT}")
         wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".choice ol"))
         assert browser.execute_script("return document.documentElement.scrollWidth") <= 380
     finally:
