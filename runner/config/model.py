@@ -23,8 +23,10 @@ from runner.config.sections import (
     Hysteretic,
     InitialTable,
     Log,
+    NStep,
     Quirks,
     Recording,
+    SarsaLambda,
     Snapshots,
     WolfPhc,
 )
@@ -139,6 +141,8 @@ class Settings(Section):
     )
     hysteretic: Optional[Hysteretic] = _only_with(Hysteretic)
     wolf_phc: Optional[WolfPhc] = _only_with(WolfPhc)
+    sarsa_lambda: Optional[SarsaLambda] = _only_with(SarsaLambda)
+    n_step: Optional[NStep] = _only_with(NStep)
     evaluation: Evaluation | None = Field(
         default=Evaluation(every=1000, trials=200),
         description="Greedy trials during training, which never alter it; null for none.",

@@ -245,6 +245,8 @@ Algorithm = Literal[
     "double_q_learning",
     "hysteretic_q_learning",
     "wolf_phc",
+    "sarsa_lambda",
+    "n_step_q_learning",
     "random",
 ]
 
@@ -286,6 +288,28 @@ class WolfPhc(AlgorithmSection):
         return self
 
 
+class SarsaLambda(AlgorithmSection):
+    """How far back an update of SARSA(lambda) reaches."""
+
+    algorithm = "sarsa_lambda"
+
+    trace_decay: Probability = Field(
+        default=0.9,
+        description="Lambda, from 0 to 1: each step multiplies all traces by it and the discount. With 0 "
+        "an update changes only the last value, as with sarsa.",
+    )
+
+
+class NStep(AlgorithmSection):
+    """How many rewards n-step Q-learning waits for; this cannot change while a run is trained."""
+
+    algorithm = "n_step_q_learning"
+
+    n: Annotated[int, Field(ge=1, le=10_000)] = Field(
+        default=4, description="Rewards in a return before the greedy value; 1 is q_learning."
+    )
+
+
 class Changes(Section):
     """The settings that can change while a run is trained; those that are left out stay as they are."""
 
@@ -295,6 +319,7 @@ class Changes(Section):
     exploration: Optional[Exploration] = Field(default=None, description="As for the whole run.")
     hysteretic: Optional[Hysteretic] = Field(default=None, description="The whole section.")
     wolf_phc: Optional[WolfPhc] = Field(default=None, description="The whole section.")
+    sarsa_lambda: Optional[SarsaLambda] = Field(default=None, description="The whole section.")
     quirks: Optional[Quirks] = Field(default=None, description="The whole section.")
 
     @property

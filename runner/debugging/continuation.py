@@ -8,7 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.learning import algorithms, kernel
+from runner.learning import kernel
+from runner.learning.algorithms import POLICY, QLearning
 from runner.learning.kernel import Tally
 from runner.learning.learner import CHOSEN, NEVER, Learner
 from runner.learning.schedules import compile_schedule, schedule_value
@@ -43,9 +44,9 @@ class Continuation:
         learner.begin_evaluation()
         rules = learner.segment_at(moment.trained_step).rules
         self._settings = rules
-        draws_actions = len(rules.algorithm) == algorithms.WOLF_PHC
+        self._draws_actions = learner.algorithm.draws_actions
         # Without learning all others act alike; SARSA would expect that its next action is chosen already.
-        algorithm = rules.algorithm if draws_actions else (0,) * algorithms.Q_LEARNING
+        algorithm = rules.algorithm if self._draws_actions else QLearning()
         self._rules = rules._replace(learns=False, algorithm=algorithm)
 
     @property
@@ -68,7 +69,7 @@ class Continuation:
         if not self._settings.learns:
             return "random"
         own = "greedy"
-        if len(self._rules.algorithm) == algorithms.WOLF_PHC:
+        if self._draws_actions:
             own = "drawn from the learned policies"
         return own if self._moment.phase == "eval" else f"{own}, exploring with probability {self.epsilon:g}"
 
@@ -122,9 +123,9 @@ class Continuation:
             rules = rules._replace(epsilon=compile_schedule(0.0), epsilon_exploits=False)
             tables = tables._replace(greedy=tables.greedy.copy(), extra=tables.extra.copy())
             tables.greedy[:, state] = own
-            if len(rules.algorithm) == algorithms.WOLF_PHC:
+            if self._draws_actions:
                 for offset, width, choice in zip(tables.offset, learner.model.width, own, strict=True):
-                    row = tables.extra[algorithms.POLICY, offset + state * width :][:width]
+                    row = tables.extra[POLICY, offset + state * width :][:width]
                     row[:] = np.arange(width) == choice
         fixed = (learner.seed, learner.model, tables, rules)
         until = self._moment.episode + 1

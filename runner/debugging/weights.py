@@ -73,7 +73,7 @@ def weights_of(
     """
     replay = TableReplay(recording)
     learner, model = replay.learner, replay.learner.model
-    tables = ("q_1", "q_2") if "q_2" in replay.kinds else ("q",)
+    tables = learner.algorithm.tables if learner.algorithm.is_double else ("q",)
     initial_values = np.stack([replay.named_tables[cell.learner][name].reshape(-1) for name in tables])
     advice = "set TMPDIR to a folder with more space"
     free = free_bytes(Path(tempfile.gettempdir()))

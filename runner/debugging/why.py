@@ -36,6 +36,7 @@ from runner.environments.naming import (
 )
 from runner.errors import ConfigError, RunnerError, nearest
 from runner.export.episodes import no_step, place_of
+from runner.learning.algorithms import ALGORITHMS
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import check_steps, last_step
@@ -111,6 +112,11 @@ def why_in(
             f"{recording.path}: has no Q-values, as its algorithm is `random`, which learns nothing; choose "
             "a run of another algorithm."
         )
+    if ALGORITHMS[algorithm].remember:
+        raise RunnerError(
+            f"{recording.path}: `why` cannot follow {algorithm}, where one step changes the values of many "
+            "steps before it; choose a run of an algorithm that changes one value a step, such as q_learning."
+        )
     if not 0 <= limit <= MAX_LIMIT:
         raise ConfigError(f"limit: found {limit}, expected 0 to {MAX_LIMIT:,}.")
     mdp = recording.mdp
@@ -157,7 +163,7 @@ def why_in(
         ),
         steps=tuple(_steps(recording, weights.largest, learner)),
         moves=moves,
-        note=POLICY_NOTE if algorithm == "wolf_phc" else "",
+        note=POLICY_NOTE if ALGORITHMS[algorithm].draws_actions else "",
         picture=_picture(mdp, cell.state, moves),
     )
 

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numba
 
 loop = numba.njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)
 """Compiles a loop. It allocates nothing, so it need not count references to its arrays (`_nrt`): inlined
 functions would count them at every step, atomically, and take four times as long."""
-inlined = numba.njit(forceinline=True, _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+INLINED: Final = {
+    "forceinline": True,
+    "_nrt": False,
+    "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}
+inlined = numba.njit(**INLINED)
 """Compiles a function that takes arrays and is called by loops alone. LLVM inlines it; if Numba did so first
 (`inline="always"`), a loop would be as fast and take two to four times as long to compile."""

@@ -14,16 +14,17 @@ from numpy.typing import NDArray
 
 from runner.learning import draws
 from runner.learning.algorithms import (
-    EXPECTED_SARSA,
-    SARSA,
     Index,
-    Moment,
     Rules,
     Tables,
+    Transition,
     choose,
+    chooses_ahead,
     drawn,
+    expects,
     exploring,
     learn,
+    remember,
 )
 from runner.learning.compiling import inlined, loop
 from runner.learning.ledger import outcome_of
@@ -81,7 +82,7 @@ CURSOR = np.dtype(
     [(name, "<i8") for name in ("step", "episode", "t", "state", "next_action", "next_explored")]
 )
 """The position in a phase: steps taken, current episode, steps in it; if t > 0 the current state, and of
-SARSA the joint action to take there, and which learners explore by it."""
+an algorithm that chooses ahead the joint action to take there, and which learners explore by it."""
 
 
 @inlined
@@ -161,7 +162,7 @@ def train(
     at = cursor[0]
     step, episode, t, state = at.step, at.episode, at.t, Index(at.state)
     next_action, next_explored = at.next_action, at.next_explored
-    algorithm = len(rules.algorithm)
+    ahead, looks_ahead = chooses_ahead(rules), chooses_ahead(rules) or expects(rules)
     learners = len(model.width)
     joint_actions = len(model.own_action)
     window, lengths = len(tally.recent_outcomes), len(tally.recent_lengths)
@@ -183,8 +184,8 @@ def train(
             discount = schedule_value(rules.discount, episode, step)
             epsilon = exploring(rules, episode, step)
 
-        # Choose the joint action; SARSA has done so before its last update.
-        if algorithm == SARSA and t > 0:
+        # Choose the joint action; an algorithm that chooses ahead did so before its last update.
+        if ahead and t > 0:
             action, explored = next_action, next_explored
         else:
             action, explored = choose(seed, model, tables, rules, epsilon, exploration, episode, t, state)
@@ -200,22 +201,33 @@ def train(
 
         # Learn from it.
         next_epsilon = epsilon
-        if algorithm in (SARSA, EXPECTED_SARSA) and rules.by_step:
+        if looks_ahead and rules.by_step:
             next_epsilon = exploring(rules, episode, step + 1)
-        if algorithm == SARSA:
+        if ahead:
             next_action, next_explored = choose(
                 seed, model, tables, rules, next_epsilon, exploration, episode, t + 1, next_state
             )
         if rules.learns:
-            now = Moment(episode, step, t, step_size, discount, next_epsilon)
             bootstraps = not terminated or rules.bootstrap_after_termination
             for i in range(learners):
-                own = Index(model.own_action[action, 0 if rules.first_action_for_all else i])
-                next_own = Index(model.own_action[next_action, i])
-                reward = model.rewards[kind, i]
-                learn(
-                    seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps
+                seen = Transition(
+                    seed=seed,
+                    episode=episode,
+                    step=step,
+                    t=t,
+                    learner=i,
+                    state=state,
+                    action=Index(model.own_action[action, 0 if rules.first_action_for_all else i]),
+                    reward=model.rewards[kind, i],
+                    next_state=next_state,
+                    next_action=Index(model.own_action[next_action, i]),
+                    bootstraps=bootstraps,
+                    ends=terminated or truncated,
+                    step_size=step_size,
+                    discount=discount,
+                    next_epsilon=next_epsilon,
                 )
+                learn(rules, model, tables, seen)
 
         # Record it.
         record = steps[Index(filled)]
@@ -314,43 +326,64 @@ def evaluate(
 
 
 @inlined
+def _recorded(
+    seed: np.uint64, model: Model, rules: Rules, record: np.record, i: int, next_action: int, epsilon: float
+) -> Transition:
+    """Return a recorded step as learner i saw it; the next joint action and epsilon are given."""
+    return Transition(
+        seed=seed,
+        episode=record.episode,
+        step=record.step,
+        t=np.int64(record.t),
+        learner=i,
+        state=Index(record.state),
+        action=Index(model.own_action[record.action, 0 if rules.first_action_for_all else i]),
+        reward=record.rewards[i],
+        next_state=Index(record.next_state),
+        next_action=Index(model.own_action[next_action, i]),
+        bootstraps=not record.terminated or rules.bootstrap_after_termination,
+        ends=record.terminated or record.truncated,
+        step_size=schedule_value(rules.step_size, record.episode, record.step),
+        discount=schedule_value(rules.discount, record.episode, record.step),
+        next_epsilon=epsilon,
+    )
+
+
+@inlined
 def relearn(
     seed: np.uint64, model: Model, tables: Tables, rules: Rules, record: np.record, traced: int
 ) -> tuple[int, bool]:
     """Apply the updates of a recorded training step; return what `learn` returns of learner `traced`.
 
     A recorded step and the run's draws hold all inputs of its update, so the update is equal to `train`'s,
-    to the last bit.
+    to the last bit. A memory of earlier steps is one of these inputs: see `recall`.
     """
     noted = np.int64(-1), False
     if not rules.learns:
         return noted
-    algorithm = len(rules.algorithm)
-    episode, step, t = record.episode, record.step, np.int64(record.t)
-    state, next_state = Index(record.state), Index(record.next_state)
-    step_size = schedule_value(rules.step_size, episode, step)
-    discount = schedule_value(rules.discount, episode, step)
-    next_epsilon = 0.0
-    if algorithm in (SARSA, EXPECTED_SARSA):
-        next_epsilon = exploring(rules, episode, step + 1)
-    next_action = 0
-    if algorithm == SARSA:
-        exploration = draws.key(seed, draws.EXPLORATION, episode)
+    next_action, next_epsilon = 0, 0.0
+    if chooses_ahead(rules) or expects(rules):
+        next_epsilon = exploring(rules, record.episode, record.step + 1)
+    if chooses_ahead(rules):
+        exploration = draws.key(seed, draws.EXPLORATION, record.episode)
+        t, next_state = np.int64(record.t) + 1, Index(record.next_state)
         next_action, _ = choose(
-            seed, model, tables, rules, next_epsilon, exploration, episode, t + 1, next_state
+            seed, model, tables, rules, next_epsilon, exploration, record.episode, t, next_state
         )
-    now = Moment(episode, step, t, step_size, discount, next_epsilon)
-    bootstraps = not record.terminated or rules.bootstrap_after_termination
     for i in range(len(model.width)):
-        own = Index(model.own_action[record.action, 0 if rules.first_action_for_all else i])
-        next_own = Index(model.own_action[next_action, i])
-        reward = record.rewards[i]
-        made_of = learn(
-            seed, model, tables, rules, now, i, state, own, reward, next_state, next_own, bootstraps
-        )
+        seen = _recorded(seed, model, rules, record, i, next_action, next_epsilon)
+        made_of = learn(rules, model, tables, seen)
         if i == traced:
             noted = made_of
     return noted
+
+
+@loop
+def recall(seed: np.uint64, model: Model, tables: Tables, rules: Rules, steps: NDArray[np.void]) -> None:
+    """Remember recorded training steps, in order, as when they were learned from; only the memory changes."""
+    for k in range(len(steps)):
+        for i in range(len(model.width)):
+            remember(rules, model, tables, _recorded(seed, model, rules, steps[k], i, 0, 0.0))
 
 
 @inlined

@@ -15,8 +15,8 @@ from runner.config.sections import RandomTable
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_of, own_action
 from runner.errors import ConfigError, EnvironmentNotUsable
-from runner.learning import algorithms, kernel
-from runner.learning.algorithms import Rules, Tables
+from runner.learning import kernel
+from runner.learning.algorithms import ALGORITHMS, Memory, Rules, Tables
 from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
@@ -27,7 +27,7 @@ CHOSEN: Final = np.empty(0, np.int32)
 """As `Segment.replacement`: agents take the actions that they choose."""
 
 NamedTables = Mapping[str, NDArray[np.float64]]
-"""The tables of one learner: its Q-table as `q`, and its algorithm's `EXTRA_TABLES` by name."""
+"""The tables of one learner: its Q-table as `q`, and the other `tables` of its algorithm by name."""
 
 
 class Segment(NamedTuple):
@@ -60,8 +60,11 @@ class Learner:
         self._segments = _segments(config, mdp)
         self._cursor = np.zeros(1, kernel.CURSOR)
         _check_fit(config, mdp, self.model)
+        self.algorithm = ALGORITHMS[config.algorithm]
         self.kinds = kinds_of(config)
-        self.tables = _tables(self.model, mdp.states, self.kinds)
+        sizes = [width * mdp.states for width in self.model.width]
+        capacity = self.algorithm.capacity(self.rules.algorithm, max(sizes))
+        self.tables = _tables(sizes, mdp.states, self.kinds, capacity)
         self.set_tables(initial)
         log = config.log
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
@@ -148,7 +151,7 @@ class Learner:
         """
         if trial is not None:
             self._eval_cursor["episode"] = trial
-        if not self.rules.learns or len(self.rules.algorithm) == algorithms.WOLF_PHC:
+        if not self.rules.learns or self.algorithm.draws_actions:
             self._policy.fill(kernel.DRAWN if self.rules.learns else -1)
             return
         self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
@@ -167,7 +170,7 @@ class Learner:
         """
         if not self.rules.learns:
             return [np.full((self.mdp.states, width), 1 / width) for width in self.model.width]
-        if len(self.rules.algorithm) == algorithms.WOLF_PHC:
+        if self.algorithm.draws_actions:
             policies = [self.named_tables(i)["policy"] for i in range(len(self.agents))]
             return [policy / policy.sum(axis=1, keepdims=True) for policy in policies]
         return self._policy
@@ -243,7 +246,7 @@ class Learner:
         What `initial` leaves out follows from its `q`: both tables of Double Q-learning are equal to it, and
         a policy of WoLF-PHC is uniform.
         """
-        double = len(self.rules.algorithm) == algorithms.DOUBLE_Q_LEARNING
+        double = self.algorithm.is_double
         if initial is None:
             self._fill(self.tables.extra.reshape(-1) if double else self.tables.q)
         for i in range(len(self.agents)):
@@ -290,14 +293,12 @@ def rules_of(config: ExperimentConfig) -> Rules:
     sections = (
         getattr(config, key) for key, each in SECTION_OF.items() if each.algorithm == config.algorithm
     )
-    own = [compile_schedule(value) for section in sections if section for _, value in section]
-    padding = [compile_schedule(0.0)] * (algorithms.MAX_PARAMETERS - len(own))
+    own = {key: compile_schedule(value) for section in sections if section for key, value in section}
     return Rules(
-        algorithm=(0,) * algorithms.NUMBERS[config.algorithm],
+        algorithm=ALGORITHMS[config.algorithm].settings(**own),
         step_size=step_size,
         discount=discount,
         epsilon=epsilon,
-        parameters=(*own, *padding),
         by_step=any(bool(schedule[1]) for schedule in (step_size, discount, epsilon)),
         learns=learns,
         independent=config.exploration == "independent",
@@ -336,7 +337,7 @@ def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.in
 
 def kinds_of(config: ExperimentConfig) -> tuple[str, ...]:
     """Return the names of each learner's tables in an experiment, in the order of a snapshot."""
-    return ("q", *algorithms.EXTRA_TABLES.get(config.algorithm, ()))
+    return ("q", *ALGORITHMS[config.algorithm].tables)
 
 
 def name_tables(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> list[NamedTables]:
@@ -360,8 +361,7 @@ def _check_fit(config: ExperimentConfig, mdp: Mdp, model: Model) -> None:
         )
 
 
-def _tables(model: Model, states: int, kinds: tuple[str, ...]) -> Tables:
-    sizes = [width * states for width in model.width]
+def _tables(sizes: list[int], states: int, kinds: tuple[str, ...], capacity: int) -> Tables:
     learners = len(sizes)
     return Tables(
         q=np.zeros(sum(sizes)),
@@ -370,6 +370,11 @@ def _tables(model: Model, states: int, kinds: tuple[str, ...]) -> Tables:
         value=np.zeros((learners, states)),
         extra=np.zeros((2 if len(kinds) > 1 else 0, sum(sizes))),
         visits=np.zeros((learners if "visits" in kinds else 0, states)),
+        memory=Memory(
+            count=np.zeros(learners, np.int64),
+            cells=np.zeros((learners, capacity), np.int64),
+            numbers=np.zeros((learners, capacity)),
+        ),
     )
 
 

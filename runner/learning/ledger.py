@@ -15,15 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.learning.algorithms import (
-    DOUBLE_Q_LEARNING,
-    EXPECTED_SARSA,
-    FIRST,
-    SECOND,
-    Rules,
-    exploring,
-    update_rate,
-)
+from runner.learning.algorithms import Rules, expects, exploring, rate
 from runner.learning.compiling import inlined, loop
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
@@ -95,7 +87,7 @@ def spread(
         stretch: episodes of a stretch.
         shares: [N] of `SHARE`, filled with the steps whose rewards have a weight, the last ones first.
     """
-    algorithm = len(rules.algorithm)
+    is_double = len(ledger.weights) > 1
     width = model.width[i]
     joint_actions, outcomes = len(model.own_action), model.cumulative.shape[1]
     filled = 0
@@ -105,22 +97,21 @@ def spread(
         state, action = pair // joint_actions, pair % joint_actions
         own = np.int64(model.own_action[action, 0 if rules.first_action_for_all else i])
         cell = state * width + own
-        learned, other = FIRST, FIRST
-        if algorithm == DOUBLE_Q_LEARNING:
-            learned, other = (SECOND, FIRST) if update.second else (FIRST, SECOND)
+        learned = np.int64(is_double and update.second)
+        other = 1 - learned if is_double else learned
         weight = ledger.weights[learned, cell]
         if weight == 0.0:
             continue
         distance = ledger.distances[learned, cell]
         episode, step = update.episode, first + k
         step_size = schedule_value(rules.step_size, episode, step)
-        rate = update_rate(rules, episode, step, step_size, update.second)
+        moved = rate(rules, episode, step, step_size, update.second)
 
         # The reward.
         share = shares[filled]
         filled += 1
         share.step = step
-        share.weight = weight * rate
+        share.weight = weight * moved
         share.distance = distance / weight
         share.contribution = share.weight * model.rewards[model.outcome_class[update.outcome], i]
         ledger.outcomes[update.outcome] += share.weight
@@ -128,14 +119,14 @@ def spread(
         ledger.episodes[episode // stretch, 1] += share.contribution
 
         # The old value, and the values of the next state.
-        ledger.weights[learned, cell] = weight * (1.0 - rate)
-        ledger.distances[learned, cell] = distance * (1.0 - rate)
+        ledger.weights[learned, cell] = weight * (1.0 - moved)
+        ledger.distances[learned, cell] = distance * (1.0 - moved)
         if update.bootstrapped < 0:
             continue
-        passed = rate * schedule_value(rules.discount, episode, step)
+        passed = moved * schedule_value(rules.discount, episode, step)
         next_row = np.int64(model.next_state[update.outcome]) * width
         greedy = passed
-        if algorithm == EXPECTED_SARSA:
+        if expects(rules):
             epsilon = exploring(rules, episode, step + 1)
             for each in range(width):
                 ledger.weights[other, next_row + each] += passed * epsilon / width * weight

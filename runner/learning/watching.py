@@ -112,6 +112,17 @@ def _read(tables: Tables, watch: Watch, changes: Changes, k: int) -> None:
         changes.succeeds[k, p] = watch.succeeds[p]
 
 
+@inlined
+def _is_remembered(model: Model, tables: Tables, states: NDArray[np.bool_]) -> bool:
+    """Return whether a learner remembers a value of one of these states, [S]."""
+    memory = tables.memory
+    for i in range(len(model.width)):
+        for k in range(memory.count[i]):
+            if states[memory.cells[i, k] // model.width[i]]:
+                return True
+    return False
+
+
 @loop
 def begin(model: Model, tables: Tables, watch: Watch, changes: Changes) -> None:
     """Follow all greedy paths, and fill the first row of `changes`."""
@@ -132,24 +143,22 @@ def replay_watched(
 ) -> int:
     """Replay steps, fill `changes`, which has a row for each step, and return how many rows were filled.
 
-    An update changes values of its step's state only. So a greedy path is followed again only when the greedy
-    action changed in one of its states.
+    An update changes values of its step's state, and of states in the learners' memory. So a greedy path is
+    followed again only when the greedy action changed in the step's state, or a state in memory is on it.
     """
     filled = 0
     for k in range(len(steps)):
         state = Index(steps[k].state)
-        is_on_path = False
-        for p in range(len(watch.starts)):
-            is_on_path |= watch.on_path[p, state]
-        is_changed = watch.states[state]
         before = _joint_greedy(model, tables, state)
         relearn(seed, model, tables, rules, steps[k], 0)
-        if is_on_path and _joint_greedy(model, tables, state) != before:
-            for p in range(len(watch.starts)):
-                if watch.on_path[p, state]:
-                    succeeded = watch.succeeds[p]
-                    _follow(model, tables, watch, p)
-                    is_changed |= watch.succeeds[p] != succeeded
+        is_turned = _joint_greedy(model, tables, state) != before
+        is_changed = watch.states[state] or _is_remembered(model, tables, watch.states)
+        for p in range(len(watch.starts)):
+            on_path = watch.on_path[p]
+            if (is_turned and on_path[state]) or _is_remembered(model, tables, on_path):
+                succeeded = watch.succeeds[p]
+                _follow(model, tables, watch, p)
+                is_changed |= watch.succeeds[p] != succeeded
         if is_changed:
             changes.row[filled] = k
             _read(tables, watch, changes, filled)

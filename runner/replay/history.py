@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.learning.watching import Watch
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
-
-_STEPS_AT_ONCE: Final = 65_536
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,42 +30,45 @@ class StateHistory:
 def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     """Return the history of a state's values in the first `step` training steps, by replaying them."""
     replay = TableReplay(recording)
-    shape = (len(replay.tables), max(table.shape[1] for table in replay.tables))
-    history = StateHistory(np.zeros(shape, np.int64), np.full(shape, -1), np.full(shape, -1))
-    pending = np.empty(0, recording.train.steps.row_dtype), np.empty((0, *shape))
-    while replay.step < step:
-        first, stop = replay.step, min(replay.step + _STEPS_AT_ONCE, step)
-        rows = replay.rows(stop)
-        steps = recording.train.steps.array(first, stop)
-        here = steps["state"] == state
-        _count(history.visits, replay.own_actions[steps["action"][here]])
-        pending = _note_changes(
-            history, np.concatenate([pending[0], steps[here]]), np.concatenate([pending[1], rows[here]])
-        )
-    last = replay.values_in(np.array([state]))
-    _note_changes(history, np.repeat(pending[0], 2), np.concatenate([pending[1], last[: len(pending[1])]]))
+    widths = np.array(replay.learner.model.width)
+    is_action = np.arange(widths.max()) < widths[:, np.newaxis]
+    visits = np.zeros(is_action.shape, np.int64)
+    changed_step, changed_episode = (np.full(widths.sum(), -1) for _ in range(2))
+    watch = _watch_of(replay, state)
+    before = replay.begin_watch(watch).q
+    for steps in replay.blocks(step):
+        _count(visits, replay.own_actions[steps["action"][steps["state"] == state]])
+        changes = replay.watch(steps, watch)
+        bits = np.concatenate([before, changes.q]).view(np.int64)
+        rows, cells = np.nonzero(bits[1:] != bits[:-1])
+        changed_step[cells] = steps["step"][changes.row[rows]]  # of several the last
+        changed_episode[cells] = steps["episode"][changes.row[rows]]
+        before = np.concatenate([before, changes.q])[-1:]
+    history = StateHistory(visits, np.full(visits.shape, -1), np.full(visits.shape, -1))
+    history.changed_step[is_action] = changed_step
+    history.changed_episode[is_action] = changed_episode
     return history
+
+
+def _watch_of(replay: TableReplay, state: int) -> Watch:
+    """Return what to watch to see each change of a state's values, of one learner after the other."""
+    model, states = replay.learner.model, replay.learner.mdp.states
+    offsets = zip(replay.learner.tables.offset, model.width, strict=True)
+    cells = [offset + state * width + np.arange(width) for offset, width in offsets]
+    return Watch(
+        states=np.arange(states) == state,
+        cells=np.concatenate(cells),
+        greedy=np.empty((0, 2), np.int64),
+        starts=np.empty(0, np.int64),
+        success=np.uint32(0),
+        path=np.empty((0, states), np.int32),
+        length=np.empty(0, np.int64),
+        on_path=np.empty((0, states), np.bool_),
+        succeeds=np.empty(0, np.bool_),
+    )
 
 
 def _count(visits: NDArray[np.int64], own: NDArray[np.int32]) -> None:
     """Count each learner's own actions, [visits, learners]."""
     for i in range(len(visits)):
         visits[i] += np.bincount(own[:, i], minlength=visits.shape[1])
-
-
-def _note_changes(
-    history: StateHistory, steps: NDArray[np.void], rows: NDArray[np.float64]
-) -> tuple[NDArray[np.void], NDArray[np.float64]]:
-    """Note which visit last changed each value; return the last visit, whose effect only the next shows.
-
-    Args:
-        rows: the state's values before each of them, [visits, learners, most actions].
-    """
-    if len(rows) > 1:
-        bits = rows.view(np.int64)
-        changed = bits[1:] != bits[:-1]
-        last = len(changed) - 1 - changed[::-1].argmax(axis=0)
-        ever = changed.any(axis=0)
-        history.changed_step[ever] = steps["step"][last[ever]]
-        history.changed_episode[ever] = steps["episode"][last[ever]]
-    return steps[-1:], rows[-1:]

@@ -6,7 +6,7 @@ kernel indexes its arrays by what they say, without any check of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -65,6 +65,8 @@ class StepReplay:
         self._learner = Learner(from_mapping(config), mdp, seed)
         self.step = 0
         """Training steps that the tables have learned from."""
+        self._remembered = 0
+        """The step up to which the learners remember the episode."""
 
     @property
     def learner(self) -> Learner:
@@ -175,6 +177,8 @@ class StepReplay:
                 f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
             )
         check_steps(steps, self._mdp, self._where)
+        if self._learner.algorithm.remember and self._remembered != self.step and (t := int(steps["t"][0])):
+            self._recall(t)
         records = steps.view(np.recarray)
         records.flags.writeable = False  # as a file's are: the kernel is compiled once
         at = 0
@@ -184,7 +188,28 @@ class StepReplay:
             learner, part = self._learner, slice(at, stop)
             yield (learner.seed, learner.model, learner.tables, segment.rules, records[part]), part
             self.step += stop - at
+            self._remembered = self.step
             at = stop
+
+    def recall(self, blocks: Iterable[NDArray[np.void]], first: int) -> None:
+        """Remember the training steps of the current episode before `step`, of which `first` is the first.
+
+        The tables stay as they are.
+        """
+        stop = self.step
+        self.step = self._remembered = first
+        for block in blocks:
+            for segment, _ in self._segments(block):
+                kernel.recall(*segment)
+        if self.step < stop:
+            raise self._lost(stop)
+
+    def _recall(self, t: int) -> None:
+        """Remember the `t` steps of the current episode before `step`; here they are not known any more."""
+        raise RecordingError(
+            f"{self._where}: training steps {self.step - t} to {self.step - 1} were lost, from which their "
+            "episode went on learning; the Q-tables are known again from the next snapshot after it."
+        )
 
     def values_in(self, states: Array) -> NDArray[np.float64]:
         """Return each learner's values in these states now, [states, learners, most actions]."""

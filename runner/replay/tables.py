@@ -7,6 +7,7 @@ with runner.open_recording(path) as recording:
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
@@ -112,21 +113,35 @@ class TableReplay(StepReplay):
             RecordingError: the step is earlier, or not recorded.
         """
         first = self.step
+        for part in self.blocks(stop):
+            at = slice(self.step - first, self.step - first + len(part))
+            own = None if trace is None else Trace(trace.updates[at], trace.learner)
+            self.apply(part, rows[at], trace=own)
+
+    def blocks(self, stop: int) -> Iterator[NDArray[np.void]]:
+        """Yield the recorded steps from here to a later one; each block must be applied before the next.
+
+        Raises:
+            RecordingError: the step is earlier, or not recorded.
+        """
+        first = self.step
         if stop < first:
             raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")
         if stop > max(self._recorded, first):
             raise self._missing(stop)
         for block in self._recording.train.steps.blocks(first, stop) if stop > first else ():
             for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
-                at = slice(self.step - first, self.step - first + len(part))
-                own = None if trace is None else Trace(trace.updates[at], trace.learner)
-                self.apply(part, rows[at], trace=own)
+                yield part
                 is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
                 if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
                     self._checkpoints.save(self.step, self.snapshot())
         self._checkpoints.prune()
         if self.step < stop:
             raise self._lost(stop)
+
+    def _recall(self, t: int) -> None:
+        first = max(self.step - t, 0)
+        self.recall(self._recording.train.steps.blocks(first, self.step), first)
 
     def _missing(self, stop: int) -> RecordingError:
         recording = self._recording

@@ -107,15 +107,11 @@ def _describe_update(a: Recording, b: Recording, step: int, replays: Sequence[Ta
     records = [next(recording.train.steps.blocks(step, step + 1))[0] for recording in (a, b)]
     for replay in replays:
         replay.advance(step + 1)
-    state = int(records[0]["state"])
     ours, theirs = (replay.tables for replay in replays)
-    learner, action = next(
-        (
-            (learner, int(np.argmax(left[state] != right[state])))
-            for learner, (left, right) in enumerate(zip(ours, theirs, strict=True))
-            if (left[state] != right[state]).any()
-        ),
-        (0, 0),
+    learner, state, action = next(
+        (learner, *map(int, cell))
+        for learner, (left, right) in enumerate(zip(ours, theirs, strict=True))
+        for cell in np.argwhere(left != right)[:1]
     )
     return Update(
         step=step,

@@ -39,6 +39,8 @@ OTHER = {
 OF_ONE_ALGORITHM = {
     "hysteretic": ("hysteretic_q_learning", {"decrease": 0.01}, {"decrease": 0.02}),
     "wolf_phc": ("wolf_phc", {"win": 0.05}, {"win": 0.04}),
+    "sarsa_lambda": ("sarsa_lambda", {"trace_decay": 0.9}, {"trace_decay": 0.8}),
+    "n_step": ("n_step_q_learning", {"n": 4}, {"n": 5}),
 }
 
 

@@ -28,6 +28,8 @@ RUNS: dict[str, dict[str, Any]] = {
     "double": TAXIS | {"algorithm": "double_q_learning", "initial_q": "random"},
     "hysteretic": TAXIS
     | {"algorithm": "hysteretic_q_learning", "quirks": {"bootstrap_after_termination": True}},
+    "sarsa lambda": TAXIS | {"algorithm": "sarsa_lambda"},
+    "n-step": TAXIS | {"algorithm": "n_step_q_learning", "mode": "cooperative"},
     "wolf": TAXIS | {"algorithm": "wolf_phc", "exploration": "independent"},
 }
 

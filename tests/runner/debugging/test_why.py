@@ -17,7 +17,7 @@ from runner.debugging.q_value import EpisodesPart, sections_of
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
-from tests.runner.learning.harness import ALGORITHMS, LINEAR, RULES
+from tests.runner.learning.harness import FOLLOWED, LINEAR, RULES
 from tests.runner.learning.linear import LinearTwin
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
@@ -35,8 +35,8 @@ BRANCHES = [
     {"run": "other", "step": 613, "settings": {"epsilon": 0.0}, "actions": {"taxi_1": "pickup"}},
 ]
 CASES = {name: RULES[name] for name in ("cooperative", "every quirk", "initially random", "slipping")}
-CASES |= ALGORITHMS | {"branches": {"branches": BRANCHES}}
-CASES |= {f"{name}, schedules": rules | SCHEDULES for name, rules in ALGORITHMS.items() if " " not in name}
+CASES |= FOLLOWED | {"branches": {"branches": BRANCHES}}
+CASES |= {f"{name}, schedules": rules | SCHEDULES for name, rules in FOLLOWED.items() if " " not in name}
 
 
 def last_steps(run, count):
@@ -157,6 +157,12 @@ def test_an_environment_without_a_scene_has_no_moves(tmp_path):
 def test_a_policy_is_no_sum_and_the_answer_says_so(tmp_path):
     assert "policy" in runner.why(make_run(tmp_path, PLAIN, algorithm="wolf_phc"), at=STEP).note
     assert not runner.why(make_run(tmp_path, PLAIN), at=STEP).note
+
+
+def test_values_that_many_steps_change_are_not_explained(tmp_path):
+    run = make_run(tmp_path, PLAIN, algorithm="n_step_q_learning")
+    with pytest.raises(RunnerError, match=r"`why` cannot follow n_step_q_learning.* q_learning"):
+        runner.why(run, at=STEP)
 
 
 def test_the_answer_says_whether_the_sum_is_the_value_and_leaves_out_episodes_without_weight(tmp_path):

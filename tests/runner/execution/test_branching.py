@@ -116,6 +116,8 @@ def test_a_branch_without_a_change_has_its_parents_content(
         ("competitive", "double_q_learning", ["step_size=0.9"]),
         ("competitive", "hysteretic_q_learning", ["hysteretic.decrease=0.9"]),
         ("competitive", "wolf_phc", ["wolf_phc.win=0.01"]),
+        ("competitive", "sarsa_lambda", ["sarsa_lambda.trace_decay=0.5", "discount=0.5"]),
+        ("cooperative", "n_step_q_learning", ["step_size=0.9", "discount=0.5"]),
         ("competitive", "q_learning", ["exploration=shared"]),
         ("competitive", "q_learning", ["quirks.second_table_uses_first_action=true"]),
     ],

@@ -115,8 +115,46 @@ ALGORITHMS = {
         "epsilon": 0.1,
         "wolf_phc": {"win": EXPONENTIAL | {"factor": 0.99}, "lose": 1.0},
     },
+    "sarsa lambda": {"algorithm": "sarsa_lambda"},
+    "sarsa lambda of two, changing": COMPETITIVE
+    | {
+        "algorithm": "sarsa_lambda",
+        "exploration": "independent",
+        "discount": EXPONENTIAL | {"factor": 0.9997, "by": "step"},
+        "sarsa_lambda": {"trace_decay": LINEAR | {"over": 700, "by": "step"}},
+    },
+    "sarsa lambda, traces without decay": {
+        "algorithm": "sarsa_lambda",
+        "discount": 1.0,
+        "step_size": 0.01,
+        "sarsa_lambda": {"trace_decay": 1.0},
+        "quirks": {"bootstrap_after_termination": True},
+        "initial_q": 3.0,
+    },
+    "n-step": {"algorithm": "n_step_q_learning"},
+    "n-step of two, changing": COMPETITIVE
+    | {
+        "algorithm": "n_step_q_learning",
+        "initial_q": "random",
+        "discount": EXPONENTIAL | {"factor": 0.9997, "by": "step"},
+        "step_size": LINEAR | {"over": 300, "by": "step"},
+        "n_step": {"n": 3},
+    },
+    "whole episodes of a team": INDEPENDENT_LEARNERS
+    | {
+        "algorithm": "n_step_q_learning",
+        "quirks": {"bootstrap_after_termination": True},
+        "initial_q": 3.0,
+        "n_step": {"n": 500},
+    },
 }
 """Every algorithm besides Q-learning, with what is special to it."""
+FOLLOWED = {
+    name: rules
+    for name, rules in ALGORITHMS.items()
+    if rules["algorithm"] not in ("sarsa_lambda", "n_step_q_learning")
+}
+"""Those where a step changes one value of a learner, and `why` can follow it."""
 
 
 class Played(NamedTuple):
@@ -154,6 +192,13 @@ def replay(
     records.flags.writeable = False  # as `StepReplay` passes them: the kernel is compiled once
     state = learner.seed, learner.model, learner.tables, learner.rules
     kernel.replay(*state, records, NO_ROWS, updates, i)
+
+
+def recall(learner: Learner, steps: NDArray[np.void]) -> None:
+    """Let a learner remember recorded steps."""
+    records = steps.view(np.recarray)
+    records.flags.writeable = False
+    kernel.recall(learner.seed, learner.model, learner.tables, learner.rules, records)
 
 
 def evaluate(learner: Learner, first: int, trials: int, block: int) -> Played:

@@ -13,7 +13,7 @@ from runner.environments.loading import load_mdp
 from runner.execution.rerecord import evaluate
 from runner.execution.resume import resume
 from runner.execution.verify import verify
-from runner.learning.algorithms import NUMBERS
+from runner.learning.algorithms import ALGORITHMS as DEFINITIONS
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.blocks import blank_records
@@ -33,6 +33,8 @@ ALGORITHMS = {
     "double_q_learning": TWO | {"initial_q": "random"},
     "hysteretic_q_learning": TWO,
     "wolf_phc": TWO | SAMPLED,
+    "sarsa_lambda": TWO,
+    "n_step_q_learning": TEAM,
 }
 KINDS = {
     "double_q_learning": ["q", "q_1", "q_2"],
@@ -177,8 +179,8 @@ def test_a_policy_that_draws_is_measured_exactly(algorithm, tmp_path):
     assert verify(done.recording).sound
 
 
-def test_every_algorithm_has_a_number_and_is_compared_with_plain_python():
+def test_every_algorithm_is_defined_and_compared_with_plain_python():
     names = set(get_args(Algorithm))
-    assert names == set(NUMBERS)
+    assert names == set(DEFINITIONS)
     compared = {values["algorithm"] for values in harness.ALGORITHMS.values()}
     assert names - compared == {"q_learning", "random"}  # `harness.RULES` are of Q-learning

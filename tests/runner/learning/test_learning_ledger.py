@@ -11,11 +11,11 @@ import pytest
 
 from runner.learning import ledger
 from runner.learning.learner import Learner
-from tests.runner.learning.harness import ALGORITHMS, RULES, SMALL, experiment, replay, train
+from tests.runner.learning.harness import FOLLOWED, RULES, SMALL, experiment, replay, train
 from tests.runner.learning.linear import LinearTwin
 
 STEPS = 500
-LEARNING = {name: rules for name, rules in (RULES | ALGORITHMS).items() if rules.get("algorithm") != "random"}
+LEARNING = {name: rules for name, rules in (RULES | FOLLOWED).items() if rules.get("algorithm") != "random"}
 
 
 def updates_of(config, mdp, steps, i):

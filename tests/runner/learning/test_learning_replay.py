@@ -6,12 +6,24 @@ import numpy as np
 import pytest
 
 from runner.learning.learner import Learner
-from tests.runner.learning.harness import ALGORITHMS, GAMES, RULES, SMALL, Played, experiment, replay, train
+from tests.runner.learning.harness import (
+    ALGORITHMS,
+    GAMES,
+    RULES,
+    SMALL,
+    Played,
+    experiment,
+    recall,
+    replay,
+    train,
+)
 
 
-def replayed(config, mdp, seed, steps, tables=None):
-    """Return the tables after these steps."""
+def replayed(config, mdp, seed, steps, tables=None, before=None):
+    """Return the tables after these steps; `before` are those of the first episode before them."""
     learner = Learner(config, mdp, seed, tables)
+    if learner.algorithm.remember and before is not None:
+        recall(learner, before)
     replay(learner, steps)
     return learner.tables
 
@@ -41,9 +53,10 @@ def test_steps_after_any_moment_give_the_tables_from_what_was_held_then(rules):
             for i in range(len(learner.agents))
         ]
         other = Learner(config, mdp, 2)
-        train(other, 10**6, stop, block=1000)
+        before = train(other, 10**6, stop, block=1000).steps
         steps = train(other, 10**6, stop + 500, block=77).steps
-        same(replayed(config, mdp, 2, steps, held), other.tables)
+        before = before[before["episode"] == steps["episode"][0]]
+        same(replayed(config, mdp, 2, steps, held, before), other.tables)
 
 
 @pytest.mark.parametrize("game", GAMES)
@@ -69,3 +82,21 @@ def test_the_cached_greedy_action_and_value_always_match_the_table():
             table = learner.table(i)
             assert np.array_equal(learner.tables.greedy[i], table.argmax(axis=1))
             assert np.array_equal(learner.tables.value[i], table.max(axis=1))
+
+
+@pytest.mark.parametrize("learners", [{}, {"mode": "competitive"}])
+@pytest.mark.parametrize(
+    ("simple", "general"),
+    [
+        ("sarsa", {"algorithm": "sarsa_lambda", "sarsa_lambda": {"trace_decay": 0.0}}),
+        ("q_learning", {"algorithm": "n_step_q_learning", "n_step": {"n": 1}}),
+    ],
+)
+def test_the_simplest_case_of_a_general_algorithm_is_the_simple_one(simple, general, learners):
+    tables = []
+    for values in ({"algorithm": simple}, general):
+        config, mdp = experiment(SMALL, learners, {"epsilon": 0.4, "step_size": 0.3}, values)
+        learner = Learner(config, mdp, 2)
+        train(learner, 10**6, 3000, block=1000)
+        tables.append(learner.tables)
+    same(*tables)

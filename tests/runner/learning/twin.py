@@ -82,6 +82,7 @@ class Twin:
         self.averages = [[[1.0 / width] * width for _ in range(mdp.states)] for width in self.widths]
         self.visits = [[0] * mdp.states for _ in self.widths]
         self.chosen: tuple[int, int] | None = None  # by SARSA, for the step to come
+        self.traces: list[dict[tuple[int, int], float]] = [{} for _ in self.widths]
         self._fill_tables()
         self.starts = [(s, p) for s, p in enumerate(mdp.start.tolist()) if p > 0]
         self.training, self.evaluation = Phase(), Phase()
@@ -245,7 +246,7 @@ class Twin:
         quirks, learn_value = self.config.quirks, getattr(self, f"_{self.config.algorithm}")
         own = self._own(step.action)
         self.chosen = None
-        if self.config.algorithm == "sarsa":
+        if self.config.algorithm in ("sarsa", "sarsa_lambda"):
             self.chosen = self._epsilon_greedy(step.next_state, step.episode, step.t + 1, step.step + 1)
         if step.terminated and not quirks.bootstrap_after_termination:
             discount = None  # the next state does not count
@@ -325,6 +326,42 @@ class Twin:
                 policy[a] = policy[a] - lost
                 gained += lost
         policy[greedy] = policy[greedy] + gained
+
+    def _sarsa_lambda(
+        self, step: Step, i: int, action: int, step_size: float, discount: float | None
+    ) -> None:
+        """Sutton and Barto, section 12.7, for a table, with replacing traces."""
+        if step.t == 0:
+            self.traces[i] = {}
+        decay = value_of(self.config.discount, step.episode, step.step)
+        decay *= value_of(self.config.sarsa_lambda.trace_decay, step.episode, step.step)
+        traces = {cell: trace * decay for cell, trace in self.traces[i].items()}
+        traces[step.state, action] = 1.0
+        self.traces[i] = {cell: trace for cell, trace in traces.items() if trace > 0.0}
+        td_target = step.rewards[i]
+        if discount is not None:
+            assert self.chosen is not None
+            td_target += discount * self.tables[i][step.next_state][self._own(self.chosen[0])[i]]
+        delta = td_target - self.tables[i][step.state][action]
+        for (state, own), trace in self.traces[i].items():
+            self.tables[i][state][own] = self.tables[i][state][own] + step_size * delta * trace
+
+    def _n_step_q_learning(
+        self, step: Step, i: int, action: int, step_size: float, discount: float | None
+    ) -> None:
+        """Sutton and Barto, section 7.1, with the greatest value of the state after the last reward."""
+        n, gamma = self.config.n_step.n, value_of(self.config.discount, step.episode, step.step)
+        last = [*(seen for seen, _ in self.training.begun), step][-n:]
+        bootstrap = max(self.tables[i][step.next_state]) if discount is not None else 0.0
+        returns = []  # from each of the last steps on
+        for k in range(len(last)):
+            total = bootstrap
+            for later in reversed(last[k:]):
+                total = later.rewards[i] + gamma * total
+            returns.append(total)
+        learned = range(len(last) if step.terminated or step.truncated else len(last) - n + 1)
+        for k in reversed(learned):
+            self._towards(self.tables[i][last[k].state], self._own(last[k].action)[i], returns[k], step_size)
 
     def _towards(self, row: list[float], action: int, td_target: float, step_size: float) -> None:
         row[action] = row[action] + step_size * (td_target - row[action])

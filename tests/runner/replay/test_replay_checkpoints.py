@@ -23,6 +23,8 @@ KINDS = {
     "rivals": TAXIS,
     "double": TAXIS | {"algorithm": "double_q_learning"},
     "wolf": TAXIS | {"algorithm": "wolf_phc", "evaluation": {"every": 20, "trials": 3}},
+    "traces": TAXIS | {"algorithm": "sarsa_lambda"},
+    "n-step": TAXIS | {"mode": "cooperative", "algorithm": "n_step_q_learning"},
 }
 
 

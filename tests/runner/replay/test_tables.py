@@ -140,6 +140,24 @@ def history_by_hand(recording, visits, state):
     return counts, steps, episodes
 
 
+@pytest.mark.parametrize("algorithm", ["sarsa_lambda", "n_step_q_learning"])
+def test_the_history_of_values_that_later_steps_change(tmp_path, algorithm):
+    values = {"mode": "cooperative", "algorithm": algorithm, "episodes": 9}
+    run = make_run(tmp_path, TAXIS, values, recording={"chunk_steps": 256})
+    with open_recording(run.recording) as recording:
+        steps = recording.train.steps.array()
+        state = int(steps["state"][len(steps) // 2])
+        replay, changed = TableReplay(recording), np.full(recording.mdp.joint_actions, -1)
+        for step in range(len(steps)):
+            before = replay.tables[0][state].copy()
+            replay.advance(step + 1)
+            changed[replay.tables[0][state] != before] = step
+        found = history_of(recording, state, len(steps))
+    assert found.changed_step.tolist() == [changed.tolist()]
+    assert found.visits.sum() == (steps["state"] == state).sum()
+    assert (steps["state"][changed[changed >= 0]] != state).any()
+
+
 def test_without_steps_the_error_names_where_tables_are(tmp_path):
     settings = ["episodes=20", "recording.steps=none", "snapshots.every=10"]
     done = runner.run("configs/quick.yaml", recordings=tmp_path, overrides=settings)
