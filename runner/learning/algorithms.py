@@ -19,7 +19,6 @@ does not scan a row unless the row's best value fell. Ties go to the lowest acti
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numba
@@ -443,8 +442,7 @@ def _n_step_q_learning(rules: Rules, model: Model, tables: Tables, seen: Transit
 # --- all of them --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Algorithm:
+class Algorithm(NamedTuple):
     """The definition of an algorithm; its functions are compiled into the loops of `kernel`."""
 
     settings: type[Any]
