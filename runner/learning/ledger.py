@@ -105,13 +105,13 @@ def spread(
         distance = ledger.distances[learned, cell]
         episode, step = update.episode, first + k
         step_size = schedule_value(rules.step_size, episode, step)
-        moved = rate(rules, episode, step, step_size, update.second)
+        target_weight = rate(rules, episode, step, step_size, update.second)
 
         # The reward.
         share = shares[filled]
         filled += 1
         share.step = step
-        share.weight = weight * moved
+        share.weight = weight * target_weight
         share.distance = distance / weight
         share.contribution = share.weight * model.rewards[model.outcome_class[update.outcome], i]
         ledger.outcomes[update.outcome] += share.weight
@@ -119,11 +119,11 @@ def spread(
         ledger.episodes[episode // stretch, 1] += share.contribution
 
         # The old value, and the values of the next state.
-        ledger.weights[learned, cell] = weight * (1.0 - moved)
-        ledger.distances[learned, cell] = distance * (1.0 - moved)
+        ledger.weights[learned, cell] = weight * (1.0 - target_weight)
+        ledger.distances[learned, cell] = distance * (1.0 - target_weight)
         if update.bootstrapped < 0:
             continue
-        passed = moved * schedule_value(rules.discount, episode, step)
+        passed = target_weight * schedule_value(rules.discount, episode, step)
         next_row = np.int64(model.next_state[update.outcome]) * width
         greedy = passed
         if expects(rules):

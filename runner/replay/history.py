@@ -37,13 +37,14 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     watch = _watch_of(replay, state)
     before = replay.begin_watch(watch).q
     for steps in replay.blocks(step):
-        _count(visits, replay.own_actions[steps["action"][steps["state"] == state]])
         changes = replay.watch(steps, watch)
-        bits = np.concatenate([before, changes.q]).view(np.int64)
+        _count(visits, replay.own_actions[steps["action"][steps["state"] == state]])
+        values = np.concatenate([before, changes.q])
+        bits = values.view(np.int64)
         rows, cells = np.nonzero(bits[1:] != bits[:-1])
         changed_step[cells] = steps["step"][changes.row[rows]]  # of several the last
         changed_episode[cells] = steps["episode"][changes.row[rows]]
-        before = np.concatenate([before, changes.q])[-1:]
+        before = values[-1:]
     history = StateHistory(visits, np.full(visits.shape, -1), np.full(visits.shape, -1))
     history.changed_step[is_action] = changed_step
     history.changed_episode[is_action] = changed_episode
