@@ -108,11 +108,9 @@ def _describe_update(a: Recording, b: Recording, step: int, replays: Sequence[Ta
     for replay in replays:
         replay.advance(step + 1)
     ours, theirs = (replay.tables for replay in replays)
-    learner, state, action = next(
-        (learner, *map(int, cell))
-        for learner, (left, right) in enumerate(zip(ours, theirs, strict=True))
-        for cell in np.argwhere(left != right)[:1]
-    )
+    gaps = [np.abs(left - right) for left, right in zip(ours, theirs, strict=True)]
+    learner = next(learner for learner, gap in enumerate(gaps) if gap.any())
+    state, action = map(int, np.unravel_index(gaps[learner].argmax(), gaps[learner].shape))
     return Update(
         step=step,
         episode=int(records[0]["episode"]),
