@@ -280,7 +280,7 @@ def _double_q_learning(rules: Rules, model: Model, tables: Tables, seen: Transit
 # --- Hysteretic Q-learning ----------------------------------------------------------------------------
 
 
-class Hysteretic(NamedTuple):
+class HystereticSchedules(NamedTuple):
     """The settings of Hysteretic Q-learning."""
 
     decrease: NDArray[np.float64]
@@ -295,7 +295,7 @@ def _hysteretic_rate(rules: Rules, episode: int, step: int, step_size: float, se
 # --- WoLF-PHC -----------------------------------------------------------------------------------------
 
 
-class WolfPhc(NamedTuple):
+class WolfPhcSchedules(NamedTuple):
     """The settings of WoLF-PHC: how far the policy moves in one update."""
 
     win: NDArray[np.float64]
@@ -360,7 +360,7 @@ def _wolf_phc(rules: Rules, model: Model, tables: Tables, seen: Transition) -> t
 # --- SARSA(lambda) ------------------------------------------------------------------------------------
 
 
-class SarsaLambda(NamedTuple):
+class SarsaLambdaSchedules(NamedTuple):
     """The settings of SARSA(lambda)."""
 
     trace_decay: NDArray[np.float64]
@@ -475,12 +475,12 @@ ALGORITHMS: Final = {
     "double_q_learning": Algorithm(
         DoubleQLearning, _double_q_learning, tables=("q_1", "q_2"), is_double=True
     ),
-    "hysteretic_q_learning": Algorithm(Hysteretic, _q_learning, rate=_hysteretic_rate),
+    "hysteretic_q_learning": Algorithm(HystereticSchedules, _q_learning, rate=_hysteretic_rate),
     "wolf_phc": Algorithm(
-        WolfPhc, _wolf_phc, tables=("policy", "average_policy", "visits"), draws_actions=True
+        WolfPhcSchedules, _wolf_phc, tables=("policy", "average_policy", "visits"), draws_actions=True
     ),
     "sarsa_lambda": Algorithm(
-        SarsaLambda,
+        SarsaLambdaSchedules,
         _sarsa_lambda,
         chooses_ahead=True,
         remember=_remember_traces,
