@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from runner.analysis.contents import Step
 from runner.drawing.text import Drawing
 from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
-from runner.export.contents import Step
 from runner.export.pictures import Moment, moments_of
 from runner.export.values import plain_value, step_actions_in_words, value_in_words
 from runner.recording.spaces import least_number
@@ -22,7 +22,7 @@ from runner.util.values import Json
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from runner.export.episodes import EpisodePlace
+    from runner.analysis.episodes import EpisodeRef
     from runner.recording.reader import Recording
     from runner.recording.spaces import Value
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 class Episode:
     """One episode of an open recording, read as it is needed; the title is the first line of each frame."""
 
-    def __init__(self, recording: Recording, choice: EpisodePlace, title: str) -> None:
-        self._recording, self._phase, self._number = recording, choice.phase, choice.number
-        self._length = len(recording.phase(choice.phase).episode_span(choice.number))
+    def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
+        self._recording, self._phase, self._number = recording, at.phase, at.number_in(recording)
+        self._length = len(recording.phase(self._phase).episode_span(self._number))
         self._title = title
 
     def steps(self) -> Iterator[dict[str, object]]:

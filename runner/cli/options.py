@@ -15,6 +15,7 @@ from runner.cli.parameter_types import (
     AXIS,
     COUNT,
     DIRECTORY,
+    EPISODE,
     FILTER_WORD,
     INDEX,
     NUMBERS,
@@ -29,10 +30,9 @@ from runner.runs.run import recordings_folder
 from runner.util.values import Ranges
 
 if TYPE_CHECKING:
-    from runner.export.episodes import EpisodePlace
+    from runner.analysis.episodes import EpisodeRef
     from runner.export.plots.style import CurveStyle
     from runner.export.rerun.selection import Request
-    from runner.recording.reader import Recording
 
 # --- arguments --------------------------------------------------------------------------------------------
 
@@ -139,10 +139,16 @@ normalise_option: Final = option(
 )
 all_option: Final = option("--all", is_flag=True, help="Include everything, not only a selection.")
 episode_option: Final = option(
-    "--episode", type=INDEX, metavar="N", help="A training episode, counted from 0."
+    "--episode",
+    type=EPISODE,
+    metavar="EPISODE",
+    help="An episode: N of training, counted from 0, eval:N:TRIAL, typical, best, worst or last.",
 )
 episodes_option: Final = option(
-    "--episodes", type=RANGES, metavar="RANGES", help="Episodes, such as 0:20,49980:50000."
+    "--episodes",
+    type=RANGES,
+    metavar="RANGES",
+    help="Episodes, such as 0..20,49980..50000; the second number is not included.",
 )
 trial_option: Final = option(
     "--eval",
@@ -152,40 +158,37 @@ trial_option: Final = option(
 )
 
 
-@dataclass(frozen=True)
-class EpisodeChoice:
-    """The episode that options name."""
-
-    episode: int | None = episode_option
-    trial: tuple[int, int] | None = trial_option
-    best: bool = option("--best", is_flag=True, help="The episode of the highest return.")
-    worst: bool = option("--worst", is_flag=True, help="The episode of the lowest return.")
-
-    def require_one(self, **others: object) -> None:
-        """Refuse options that exclude each other, `others` by name too; None and False are not given.
-
-        Raises:
-            UsageError: there is more than one.
-        """
-        choices = {"episode": self.episode, "eval": self.trial, "best": self.best, "worst": self.worst}
-        given = [
-            f"--{name}"
-            for name, value in (choices | others).items()
-            if value is not None and value is not False  # 0 is given
-        ]
-        if len(given) > 1:
-            raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
-
-    def find(self, recording: Recording) -> EpisodePlace:
-        """Return where the episode stands; without options, a typical one."""
-        from runner.export.episodes import chosen_episode, extreme_episode
-
-        if self.best or self.worst:
-            return extreme_episode(recording, self.best)
-        return chosen_episode(recording, self.episode, self.trial)
+EPISODE_OPTIONS: Final = ("episode", "trial", "best", "worst")
 
 
-choice_options: Final = record(EpisodeChoice)
+def require_one(*names: str) -> None:
+    """Refuse options of the command, by the names of their parameters, that exclude each other.
+
+    Raises:
+        UsageError: more than one of them is given.
+    """
+    context = click.get_current_context()
+    given = [
+        parameter.opts[0]
+        for parameter in context.command.params
+        if parameter.name in names and not any(context.params[parameter.name] is no for no in (None, False))
+    ]
+    if len(given) > 1:
+        raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
+
+
+@record
+def episode_options(
+    episode: EpisodeRef | None = episode_option,
+    trial: EpisodeRef | None = trial_option,
+    best: bool = option("--best", is_flag=True, help="The episode of the highest return."),
+    worst: bool = option("--worst", is_flag=True, help="The episode of the lowest return."),
+) -> EpisodeRef:
+    """Return the episode that the options name; without any, a typical one."""
+    require_one(*EPISODE_OPTIONS)
+    from runner.analysis.episodes import EpisodeRef
+
+    return episode or trial or EpisodeRef.parse("best" if best else "worst" if worst else "typical")
 
 
 def output_option(default: str, metavar: str = "FILE") -> Declared:

@@ -18,9 +18,7 @@ from runner.util.values import Json, ranges_in, whole_number
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
-    from runner.analysis.step_reference import StepRef
-
-"""Ranges of episodes: the first, and the one after the last or None."""
+    from runner.analysis.episodes import EpisodeRef
 
 
 class Completed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generic in newer versions only
@@ -140,11 +138,6 @@ def _keys(schema: Json, part: Json | None = None, prefix: str = "") -> dict[str,
     return keys
 
 
-def _trial(text: str) -> tuple[int, int]:
-    after, colon, trial = text.partition(":")
-    return whole_number(after), whole_number(trial) if colon else 0
-
-
 def _pair(text: str, limit: int) -> tuple[int, int]:
     first, _, second = text.partition("x")
     if not 1 <= whole_number(first) <= limit >= whole_number(second) >= 1:
@@ -152,16 +145,21 @@ def _pair(text: str, limit: int) -> tuple[int, int]:
     return whole_number(first), whole_number(second)
 
 
-def _step(text: str) -> StepRef:
-    from runner.analysis.step_reference import StepRef
+def _step(text: str) -> EpisodeRef:
+    from runner.analysis.episodes import EpisodeRef  # loads NumPy
 
-    return StepRef.parse(text)
+    return EpisodeRef.parse(text)
 
 
-def _place(text: str) -> int | StepRef:
-    from runner.analysis.step_reference import parse_step
-
-    return parse_step(text)
+def _episode(text: str) -> EpisodeRef:
+    """Return the reference to an episode, which names no step of it."""
+    try:
+        episode = _step(text)
+    except RunnerError:
+        raise ValueError(text) from None
+    if episode.t or episode.word == "step":
+        raise ValueError(text)
+    return episode
 
 
 def _target(text: str) -> tuple[str, float]:
@@ -179,8 +177,9 @@ def _axis(text: str) -> Axis:
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = Completed("filter", _filter_words)
-TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", _trial)
-RANGES: Final = Parsed("ranges", "START:STOP or N, such as 0:20,49980:50000", ranges_in)
+EPISODE: Final = Parsed("episode", "N, eval:N:TRIAL, typical, best, worst or last", _episode)
+TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", lambda text: _episode(f"eval:{text}"))
+RANGES: Final = Parsed("ranges", "START..STOP or N, such as 0..20,49980..50000", ranges_in)
 NUMBERS: Final = Parsed(
     "numbers", "numbers such as 1000,49000", lambda text: tuple(map(whole_number, text.split(",")))
 )
@@ -190,8 +189,7 @@ PICTURE_SIZE: Final = Parsed(
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
 AXIS: Final = Parsed("axis", "episodes, steps, updates, time or a logged name", _axis)
-STEP: Final = Parsed("step", "EPISODE:T, or eval:N:TRIAL:T", _step)
-PLACE: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _place)
+STEP: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _step)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
 COUNT: Final = click.IntRange(1)

@@ -137,7 +137,7 @@ def opened_run(
     run_name: str, recordings: Path | None, needs_steps: bool = False
 ) -> Iterator[tuple[Run, Recording]]:
     """Open a run to export it, and print what its recording lacks when that is done."""
-    from runner.export.contents import require_steps, shortcomings
+    from runner.analysis.contents import require_steps, shortcomings
     from runner.recording.reader import open_recording
 
     run = find_recorded(run_name, recordings)

@@ -18,10 +18,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
-from runner.analysis.evaluations import evaluation_after, evaluations_of
-from runner.analysis.step_reference import StepRef, parse_step
+from runner.analysis.episodes import STEP, EpisodeRef
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import TrainingBranch, branch_training
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action
@@ -80,7 +79,7 @@ class Branch:
 class _Task:
     """What to branch, and how."""
 
-    at: StepRef
+    at: EpisodeRef
     action: Value
     policy: str
     seed: int
@@ -94,7 +93,7 @@ class _Task:
 def branch(
     run: Run,
     *,
-    at: str | int | StepRef,
+    at: str | int | EpisodeRef,
     action: Any = None,
     overrides: Sequence[str] = (),
     episodes: int | None = None,
@@ -161,10 +160,10 @@ def branch(
             report=lambda progress: report(progress.train_steps),
             stop=stop,
         )
-    at = parse_step(at) if isinstance(at, str) else at
-    if isinstance(at, int):
+    at = EpisodeRef.parse(at)
+    if at.word == STEP:
         raise ConfigError(
-            f"at: found the number {at:,} of a step, expected EPISODE:T: the steps of a loop are "
+            f"at: found the number {at.t:,} of a step, expected EPISODE:T: the steps of a loop are "
             "counted in its episodes."
         )
     if overrides or episodes is not None:
@@ -239,12 +238,8 @@ class _Player:
 
     def __init__(self, recording: Recording, folder: Path, task: _Task) -> None:
         self._recording, self._folder, self._task = recording, folder, task
-        self.phase: Literal["train", "eval"] = "train"
-        self.episode = task.at.episode
-        if task.at.after is not None:
-            where = str(recording.path)
-            trials = evaluation_after(evaluations_of(recording), task.at.after, where)
-            self.phase, self.episode = "eval", trials.trial(task.at.episode, where)
+        self._at = task.at.resolved(recording)
+        self.phase, self.episode = self._at.phase, self._at.number_in(recording)
         self._function: Policy | None = policy_named(task.policy) if ":" in task.policy else None
         self._is_game = False
         self._actions: Iterator[Value] = iter(())
@@ -267,8 +262,8 @@ class _Player:
             recording.run_id,
             self.phase,
             self.episode,
-            task.at.t,
-            str(task.at),
+            self._at.t,
+            str(self._at),
             _text(self._action),
             task.policy,
             task.seed,

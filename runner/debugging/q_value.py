@@ -6,8 +6,8 @@ from dataclasses import asdict, dataclass, field
 from html import escape
 from typing import Final
 
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Grid, Section
-from runner.analysis.step_reference import StepRef
 from runner.drawing.svg_moves import Move
 from runner.environments.naming import spoken
 from runner.errors import MissingExtra
@@ -198,7 +198,7 @@ def why_body(found: Why, linked: bool) -> str:
     """Return the part of a page that shows a Q-value as a sum; linked, each step links to its replay."""
     parts = partials()
     whole, steps, *rest = sections_of(found)
-    steps_at = [StepRef.parse(step.at) for step in found.steps]
+    steps_at = [EpisodeRef.parse(step.at) for step in found.steps]
     links = [at.replay_address(found.run_id) for at in steps_at] if linked else []
     picture = ""
     if found.picture:

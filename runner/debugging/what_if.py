@@ -17,13 +17,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.contents import ending_of, require_steps
+from runner.analysis.episodes import EpisodeRef
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Moment
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
-from runner.export.contents import ending_of, require_steps
-from runner.export.episodes import EpisodePlace, no_step, place_of
 from runner.export.reports.playback import tabular_playback
 from runner.export.reports.player_data import Playback
 from runner.planning.evaluation import action_values, policy_values
@@ -49,8 +48,8 @@ MAX_ACTIONS: Final = 256
 class Branched:
     """The episode to which an action leads."""
 
-    place: EpisodePlace
-    """Where the recorded episode is."""
+    at: EpisodeRef
+    """The recorded step."""
     steps: NDArray[np.void]
     """Those up to the branch as they were recorded, then those played."""
     outcome: Outcome
@@ -58,12 +57,12 @@ class Branched:
     """The Q-tables of each learner that the branch was played with, [S, actions]; empty if there are none."""
 
 
-def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -> WhatIf:
+def what_if(run: Run, *, at: str | int | EpisodeRef, actions: Sequence[str | int] = ()) -> WhatIf:
     """Return where each joint action at a step of a job's episode leads, or some of them.
 
     Args:
         run: a run that was trained here, with its steps.
-        at: the step: `EPISODE:T` of training, or `eval:N:TRIAL:T`.
+        at: the step: `EPISODE:T` or `step:N` of training, or `eval:N:TRIAL:T`.
         actions: numbers or names of joint actions, such as `north + east`, or `AGENT=VALUE` each: those in
             which these agents act so; all if there are none. Of more than 256, those of the highest exact
             value are played (the learned one with a discount of 1), and the recorded one.
@@ -74,10 +73,10 @@ def what_if(run: Run, *, at: str | StepRef, actions: Sequence[str | int] = ()) -
         RunnerError: the run was recorded from a loop.
     """
     with open_recording(run.recording) as recording:
-        return what_if_in(recording, StepRef.parse(at) if isinstance(at, str) else at, actions)
+        return what_if_in(recording, EpisodeRef.parse(at), actions)
 
 
-def what_if_in(recording: Recording, at: StepRef, actions: Sequence[str | int] = ()) -> WhatIf:
+def what_if_in(recording: Recording, at: EpisodeRef, actions: Sequence[str | int] = ()) -> WhatIf:
     """Return where actions lead, as `what_if` does, from an open recording."""
     return _Branches(recording, at).compare(_chosen(recording.mdp, list(map(str, actions))))
 
@@ -97,13 +96,13 @@ def _chosen(mdp: Mdp, actions: list[str]) -> Iterable[int]:
     return chosen
 
 
-def branched(recording: Recording, at: StepRef, action: str | int) -> Branched:
+def branched(recording: Recording, at: EpisodeRef, action: str | int) -> Branched:
     """Return the whole episode to which an action leads; errors as for `what_if`."""
     return _Branches(recording, at).episode(joint_action(recording.mdp, str(action)))
 
 
 def branch_playback(
-    recording: Recording, at: StepRef, action: str | int, limit: int, first: int = 0
+    recording: Recording, at: EpisodeRef, action: str | int, limit: int, first: int = 0
 ) -> Playback:
     """Return what a page plays of the episode to which a joint action leads: at most `limit` steps.
 
@@ -112,27 +111,29 @@ def branch_playback(
     branch = branched(recording, at, action)
     shown = branch.steps[first : first + limit]
     if not len(shown):
-        raise no_step(recording, f"this branch of {branch.place.title}", len(branch.steps), first)
+        raise branch.at.no_step(recording, len(branch.steps), first, "this branch of ")
     values = tuple(table[shown["state"]] for table in branch.tables)
-    return tabular_playback(recording, branch.place, branch.steps, branch.outcome.end, values, first, limit)
+    return tabular_playback(recording, branch.at, branch.steps, branch.outcome.end, values, first, limit)
 
 
 class _Branches:
     """The branches of one step of a recorded episode of a job."""
 
-    def __init__(self, recording: Recording, at: StepRef) -> None:
+    def __init__(self, recording: Recording, at: EpisodeRef) -> None:
         recording.require_job(
             "`what_if`", "`dualtaxi branch` and runner.branch() play a loop on with one action."
         )
         require_steps(recording, "branch")
+        at = at.resolved(recording)
         self._recording, self._at, self._mdp = recording, at, recording.mdp
-        self._place = place_of(recording, at.which)
+        self._number = at.number_in(recording)
         self._read_episode()
-        is_training, step = at.after is None, int(self._step["step"])
-        self._tables = TableReplay(recording, step if is_training else self._place.table_step)
+        step = int(self._step["step"])
+        is_training = at.after is None
+        self._tables = TableReplay(recording, step if is_training else at.evaluation_in(recording).train_step)
         moment = Moment(
-            phase="train" if is_training else "eval",
-            episode=self._place.number,
+            phase=at.phase,
+            episode=self._number,
             step=step,
             t=at.t,
             state=int(self._step["state"]),
@@ -143,10 +144,10 @@ class _Branches:
 
     def _read_episode(self) -> None:
         """Read the step, what came before it, and where the episode led."""
-        recording, phase, episode, t = self._recording, self._place.phase, self._place.number, self._at.t
+        recording, phase, episode, t = self._recording, self._at.phase, self._number, self._at.t
         span = recording.phase(phase).episode_span(episode)
         if t >= len(span):
-            raise no_step(recording, self._place.title, len(span), t)
+            raise self._at.no_step(recording, len(span), t)
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
         returns = self._returns
         for block in episode_blocks(recording, phase, episode):
@@ -169,18 +170,18 @@ class _Branches:
 
     def episode(self, action: int) -> Branched:
         """Return the whole episode to which an action leads."""
-        before = steps_of(self._recording, self._place.phase, self._place.number)[: self._at.t]
+        before = steps_of(self._recording, self._at.phase, self._number)[: self._at.t]
         steps, outcome = self._play(action)
         tables = self._tables.tables if self._learns else []
-        return Branched(self._place, np.concatenate([before, steps]), outcome, tables)
+        return Branched(self._at, np.concatenate([before, steps]), outcome, tables)
 
     def _play(self, action: int) -> tuple[NDArray[np.void], Outcome]:
         """Return the steps from an action on, and where the whole episode leads."""
-        recording, place, t = self._recording, self._place, self._at.t
+        recording, phase, t = self._recording, self._at.phase, self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
         blocks = [
             blank_records(topic, recording.layout.message(topic), count).view(np.recarray)
-            for topic, count in zip(schema.PHASES[place.phase], (limit, 1), strict=True)
+            for topic, count in zip(schema.PHASES[phase], (limit, 1), strict=True)
         ]
         steps: NDArray[np.void] = blocks[0][: self._playing.play(action, *blocks)]
         times = self._step["log_time"] + np.arange(len(steps), dtype=np.uint64) * schema.STEP_NANOSECONDS
@@ -220,7 +221,7 @@ class _Branches:
         return WhatIf(
             run_id=recording.run_id,
             at=str(self._at),
-            title=self._place.title,
+            title=self._at.title,
             state=state,
             state_in_words=str(states_in_words(mdp)[state]),
             tables_step=self._tables.step,

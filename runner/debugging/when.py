@@ -17,13 +17,13 @@ from typing import Final
 
 import numpy as np
 
+from runner.analysis.contents import require_steps
+from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, training_step
 from runner.analysis.sections import Grid, Section, html
-from runner.analysis.step_reference import EXPECTED_OF_TRAINING, StepRef, parse_step, training_step
 from runner.archive.places import at_hand
 from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
 from runner.debugging.quantities import JobColumns, check_lost
 from runner.errors import RunnerError
-from runner.export.contents import require_steps
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.util.expressions import CONDITION
@@ -60,9 +60,9 @@ class Moment:
     """The quantities of the expression, and the conditions that it combines."""
 
     @property
-    def at(self) -> StepRef:
+    def at(self) -> EpisodeRef:
         """The step, as replays are addressed."""
-        return StepRef(self.episode, self.t)
+        return EpisodeRef(self.episode, self.t)
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class When:
         result = asdict(self)
         for moment in (result["last"], *(each[k] for each in result["intervals"] for k in ("start", "end"))):
             if moment is not None:
-                at = StepRef(moment["episode"], moment["t"])
+                at = EpisodeRef(moment["episode"], moment["t"])
                 moment |= {"at": str(at), "replay": at.replay_address(self.run_id)}
         return result
 
@@ -121,8 +121,8 @@ def when(
     expression: str,
     *,
     every: bool = False,
-    first: int | str | StepRef | None = None,
-    last: int | str | StepRef | None = None,
+    first: int | str | EpisodeRef | None = None,
+    last: int | str | EpisodeRef | None = None,
     report: Callable[[int], None] = lambda _: None,
 ) -> When:
     """Return the first training step after which an expression holds, or every interval in which it does.
@@ -148,8 +148,8 @@ def when_in(
     recording: Recording,
     expression: str,
     every: bool = False,
-    first: int | str | StepRef | None = None,
-    last: int | str | StepRef | None = None,
+    first: int | str | EpisodeRef | None = None,
+    last: int | str | EpisodeRef | None = None,
     report: Callable[[int], None] = lambda _: None,
     limit: int = MAX_INTERVALS,
 ) -> When:
@@ -268,8 +268,8 @@ def _scalar(term: Series, value: np.float64 | np.bool_, is_known: bool) -> Scala
     return int(value) if term.is_whole else float(value)
 
 
-def _step_number(recording: Recording, at: int | str | StepRef) -> int:
-    return training_step(recording, parse_step(at, EXPECTED_OF_TRAINING) if isinstance(at, str) else at)
+def _step_number(recording: Recording, at: int | str | EpisodeRef) -> int:
+    return training_step(recording, EpisodeRef.parse(at, EXPECTED_OF_TRAINING))
 
 
 # --- as text ----------------------------------------------------------------------------------------------

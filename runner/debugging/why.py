@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.archive.places import at_hand
 from runner.debugging.q_value import EpisodesPart, Part, RewardPart, StepPart, Why
 from runner.debugging.weights import Cell, Weights, weights_of
@@ -35,7 +35,6 @@ from runner.environments.naming import (
     states_in_words,
 )
 from runner.errors import ConfigError, RunnerError, nearest
-from runner.export.episodes import no_step, place_of
 from runner.learning.algorithms import ALGORITHMS
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -63,7 +62,7 @@ def why(
     state: int | str | None = None,
     action: int | str | None = None,
     agent: str | None = None,
-    at: str | StepRef | None = None,
+    at: str | int | EpisodeRef | None = None,
     limit: int = LIMIT,
     report: Callable[[int], None] = lambda _: None,
 ) -> Why:
@@ -75,8 +74,8 @@ def why(
         action: the learner's own action, or the joint one of a joint table: its number, or its name such as
             `north + east`; by default the one taken at the step `at`.
         agent: the learner; required where there are several.
-        at: the step before which the value is explained: `EPISODE:T` of training, or `eval:N:TRIAL:T`; by
-            default after all of training.
+        at: the step before which the value is explained: `EPISODE:T` or `step:N` of training, or
+            `eval:N:TRIAL:T`; by default after all of training.
         limit: the most steps to list, up to 100,000; 0 for that many.
         report: called with the number of steps read so far.
 
@@ -96,16 +95,16 @@ def why_in(
     state: str | None = None,
     action: str | None = None,
     agent: str | None = None,
-    at: str | StepRef | None = None,
+    at: str | int | EpisodeRef | None = None,
     limit: int = LIMIT,
     report: Callable[[int], None] = lambda _: None,
 ) -> Why:
     """Return where a Q-value comes from, as `why` does, from an open recording."""
-    at = StepRef.parse(at) if isinstance(at, str) else at
     recording.require_job(
         "`why`",
         "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
     )
+    step = None if at is None else EpisodeRef.parse(at).resolved(recording)
     algorithm = recording.config["algorithm"]
     if algorithm == "random":
         raise RunnerError(
@@ -124,7 +123,7 @@ def why_in(
     is_joint = len(recording.agents) < len(mdp.agents)
     names = actions_in_words(mdp) if is_joint else numbered_actions(mdp)[learner]
     if state is None or action is None:
-        taken = _step_at(recording, at)
+        taken = _step_at(recording, step)
         state = str(taken["state"]) if state is None else state
         own = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]
         action = str(own) if action is None else action
@@ -133,7 +132,7 @@ def why_in(
         state_of(mdp, state),
         joint_action(mdp, action) if is_joint else own_action(mdp, learner, action),
     )
-    stop = last_step(recording) if at is None else _steps_before(recording, at)
+    stop = last_step(recording) if step is None else _steps_before(recording, step)
     weights = weights_of(recording, cell, stop, limit or MAX_LIMIT, report)
     rewarded = Part(*(float(total) for total in weights.episodes.sum(axis=0)))
     initial = Part(float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum()))
@@ -183,7 +182,7 @@ def _learner(recording: Recording, agent: str | None) -> int:
     return learners.index(names[0])
 
 
-def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
+def _step_at(recording: Recording, at: EpisodeRef | None) -> NDArray[np.void]:
     """Return the record of a step.
 
     Raises:
@@ -193,24 +192,23 @@ def _step_at(recording: Recording, at: StepRef | None) -> NDArray[np.void]:
         raise ConfigError(
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
         )
-    place = place_of(recording, at.which)
-    span = recording.phase(place.phase).episode_span(place.number)
+    phase = recording.phase(at.phase)
+    span = phase.episode_span(at.number_in(recording))
     if at.t >= len(span):
-        raise no_step(recording, place.title, len(span), at.t)
-    (block,) = recording.phase(place.phase).steps.blocks(span[at.t], span[at.t] + 1)
-    check_steps(block, recording.mdp, str(recording.path), schema.PHASE_NAMES[place.phase])
+        raise at.no_step(recording, len(span), at.t)
+    (block,) = phase.steps.blocks(span[at.t], span[at.t] + 1)
+    check_steps(block, recording.mdp, str(recording.path), schema.PHASE_NAMES[at.phase])
     step: NDArray[np.void] = block[0]
     return step
 
 
-def _steps_before(recording: Recording, at: StepRef) -> int:
+def _steps_before(recording: Recording, at: EpisodeRef) -> int:
     """Return the training steps that the tables at a step have learned from."""
-    place = place_of(recording, at.which)
     if at.after is not None:
-        return place.table_step
+        return at.evaluation_in(recording).train_step
     span = recording.train.episode_span(at.episode)
     if at.t > len(span):
-        raise no_step(recording, place.title, len(span), at.t)
+        raise at.no_step(recording, len(span), at.t)
     return span.start + at.t
 
 
@@ -245,7 +243,7 @@ def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Ite
         yield StepPart(
             weight=float(share["weight"]),
             contribution=float(share["contribution"]),
-            at=str(StepRef(episode, t)),
+            at=str(EpisodeRef(episode, t)),
             step=int(share["step"]),
             episode=episode,
             state=state,

@@ -1,4 +1,4 @@
-"""Names of states, joint actions, events and trials for people.
+"""Names of states, joint actions, and events for people.
 
 They are derived from the scene that the environment, or the recording, includes:
 
@@ -147,11 +147,6 @@ def events_in_words(mdp: Mdp, mask: int) -> str:
 def spoken(name: str) -> str:
     """Return a name as people write it: `drop_off` is `drop-off`, `illegal_pickup` is `illegal pickup`."""
     return name.replace("drop_off", "drop-off").replace("_", " ")
-
-
-def trial_in_words(after: int, number: int) -> str:
-    """Return the name of a trial, counted from 0, of the evaluation after a number of episodes."""
-    return f"trial {number:,} of the evaluation after {after:,} episodes"
 
 
 def _thing_in_words(

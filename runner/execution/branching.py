@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from runner.analysis.diff.divergence import first_difference, unbroken
-from runner.analysis.step_reference import StepRef, parse_step, reference_to, training_step, training_steps
+from runner.analysis.episodes import EpisodeRef, reference_to, training_step, training_steps
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.config.sections import Branch, Changes
@@ -45,14 +45,14 @@ class TrainingBranch:
     run: Run
     """The run that it was recorded in."""
     origin: TrainingOrigin
-    at: StepRef
+    at: EpisodeRef
     """The step by its episode."""
 
 
 def branch_training(
     run: Run,
     *,
-    at: str | int | StepRef,
+    at: str | int | EpisodeRef,
     action: Action | None = None,
     overrides: Sequence[str] = (),
     episodes: int | None = None,
@@ -114,15 +114,16 @@ def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: St
 
 def branch_job(
     recording: Recording,
-    at: str | int | StepRef,
+    at: str | int | EpisodeRef,
     action: Action | None,
     overrides: Sequence[str],
     episodes: int | None,
-) -> tuple[Job, StepRef]:
+) -> tuple[Job, EpisodeRef]:
     """Return the job of a branch, and its step by its episode; arguments as for `branch_training`."""
-    at = parse_step(at) if isinstance(at, str) else at
+    at = EpisodeRef.parse(at)
     parent, taken = from_mapping(recording.config), training_steps(recording)
-    step = taken if at == taken else training_step(recording, at)  # from the end on, training can be longer
+    is_end = at == EpisodeRef.parse(taken)  # from there on, training can be longer
+    step = taken if is_end else training_step(recording, at)
     where, now = reference_to(recording, step), parent.from_step(step)
     total = [] if episodes is None else [f"episodes={episodes}"]
     wanted = from_mapping(now.to_mapping(), [*overrides, *total])

@@ -13,8 +13,8 @@ from typing import Final
 import gymnasium
 import numpy as np
 
+from runner.analysis.contents import whole_ranges
 from runner.errors import RecordingError
-from runner.export.contents import Ranges, whole_ranges
 from runner.export.minari_episodes import Episode, episodes_in
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
@@ -22,6 +22,7 @@ from runner.replay.trust import require_listed, trusting
 from runner.runs.marks import environment_of_job
 from runner.util.arrays import Array
 from runner.util.extras import require
+from runner.util.values import Ranges
 
 PATTERNS: Final = ("data/main_data.hdf5", "data/metadata.json")
 _BATCH: Final = 500

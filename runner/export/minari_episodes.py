@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.export.contents import Ranges
 from runner.export.values import acted, observed
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value, least_number
 from runner.util.arrays import Records
+from runner.util.values import Ranges
 
 MAX_EPISODE_BYTES: Final = 1 << 30
 """The limit of one episode, which Minari needs in memory."""

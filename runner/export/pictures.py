@@ -20,12 +20,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from runner.analysis.contents import ENDINGS, Step, ending_of, require_steps
 from runner.drawing import svg
 from runner.drawing.raster import Pixels, require_packages
 from runner.environments.mdp import events_of
 from runner.environments.naming import agent_actions_in_words, events_in_words, exploration_in_words, spoken
 from runner.errors import CannotRedo
-from runner.export.contents import ENDINGS, Step, ending_of, require_steps
 from runner.export.painting import (
     Painted,
     paint_observation,

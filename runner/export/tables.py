@@ -17,11 +17,12 @@ import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet
 
+from runner.analysis.contents import whole_ranges
 from runner.archive import layout
 from runner.archive.batches import Batches
-from runner.export.contents import Ranges, whole_ranges
 from runner.export.scalars import measures, wall_clock
 from runner.recording.reader import Recording
+from runner.util.values import Ranges
 
 _TABLES: Final = {
     "steps": layout.STEPS,

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.contents import Step
 from runner.drawing.raster import Pixels
 from runner.environments.naming import spoken
-from runner.export.contents import Step
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from urllib.parse import urlencode
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
+from runner.errors import RunnerError
 from runner.runs.branches import BranchOrigin, origin_in
 from runner.runs.run import Run
 
@@ -51,9 +52,21 @@ def link(path: str, values: Mapping[str, object]) -> str:
     return f"{path}?{urlencode(query, doseq=True)}" if query else path
 
 
-def places_in(runs: Sequence[Run], step: StepRef) -> list[StepRef]:
+def step_in(text: str) -> EpisodeRef:
+    """Return the step that an address names by its episode: without a recording no word can be looked up.
+
+    Raises:
+        RunnerError: the text is no such reference.
+    """
+    step = EpisodeRef.parse(text)
+    if step.word:
+        raise RunnerError(f"found {text[:60]!r}, expected EPISODE:T such as 120:5, or eval:N:TRIAL:T.")
+    return step
+
+
+def places_in(runs: Sequence[Run], step: EpisodeRef) -> list[EpisodeRef]:
     """Return the step in each of two runs: a branch of a loop has its parent's episode as its only one."""
-    alone = StepRef(0, step.t, None if step.after is None else 0)
+    alone = EpisodeRef(0, step.t, None if step.after is None else 0)
     origins = [origin_in(run.file.config) for run in runs]
     return [
         alone if isinstance(origin, BranchOrigin) and origin.run == other.run_id else step

@@ -11,7 +11,7 @@ from fastapi import Depends, Request, Response
 from fastapi import Path as InPath
 from pydantic import TypeAdapter
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.archive.places import at_hand
 from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
@@ -102,17 +102,17 @@ After = Annotated[
 ]
 
 
-def training_episode(episode: EpisodeNumber) -> StepRef:
+def training_episode(episode: EpisodeNumber) -> EpisodeRef:
     """Return the training episode that the path names."""
-    return StepRef(episode)
+    return EpisodeRef(episode)
 
 
-def trial_of_evaluation(after: After, trial: EpisodeNumber) -> StepRef:
+def trial_of_evaluation(after: After, trial: EpisodeNumber) -> EpisodeRef:
     """Return the trial that the path names."""
-    return StepRef(trial, after=after)
+    return EpisodeRef(trial, after=after)
 
 
-EPISODES: Final[dict[str, Callable[..., StepRef]]] = {
+EPISODES: Final[dict[str, Callable[..., EpisodeRef]]] = {
     "/train/{episode}": training_episode,
     "/eval/{after}/{trial}": trial_of_evaluation,
 }

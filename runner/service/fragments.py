@@ -18,10 +18,10 @@ from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATI
 from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
+from runner.analysis.episodes import TYPICAL, EpisodeRef, first_state, last_whole_evaluation, ranked_trials
 from runner.analysis.histograms import histograms
 from runner.analysis.sections import Grid, Section
 from runner.analysis.series import series_of
-from runner.analysis.step_reference import StepRef
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.q_value import why_body
 from runner.debugging.what_if import branch_playback, what_if_in
@@ -31,7 +31,6 @@ from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action
 from runner.errors import RecordingError
 from runner.export.encoded import picture_note
-from runner.export.episodes import first_state, last_episode, last_whole_evaluation, typical_trial
 from runner.export.plots.curves import Plot
 from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
 from runner.export.plots.machine import machine_facts, machine_plots
@@ -115,17 +114,17 @@ class Output:
     total: int
 
 
-def episode_part(path: Path, at: StepRef, start: int, steps: int) -> bytes:
+def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
     """Return a part of an episode as JSON for `replay.js`."""
     with open_recording(path) as recording:
-        episode = playback_of(recording, at.which, steps, max(0, start - _STEPS_BEFORE))
+        episode = playback_of(recording, at, steps, max(0, start - _STEPS_BEFORE))
         scene = recording.environment["scene"] if episode.grid else None
-        has_pictures, note = picture_note(recording, "train" if at.after is None else "eval")
+        has_pictures, note = picture_note(recording, at.phase)
         data = {"episode": asdict(episode), "scene": scene}
         return _compact(data | {"has_pictures": has_pictures, "picture_note": note})
 
 
-def branch_part(path: Path, at: StepRef, action: str, start: int, steps: int) -> bytes:
+def branch_part(path: Path, at: EpisodeRef, action: str, start: int, steps: int) -> bytes:
     """Return a part of the episode to which a joint action leads, as `episode_part` does."""
     with open_recording(path) as recording:
         return _compact(_branch_part(recording, at, action, start, steps))
@@ -136,7 +135,7 @@ def _compact(part: Json) -> bytes:
     return json.dumps(part, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 
-def what_if_page(run: Run, at: StepRef, action: str | None, start: int, steps: int) -> bytes:
+def what_if_page(run: Run, at: EpisodeRef, action: str | None, start: int, steps: int) -> bytes:
     """Return `ShownBranches` as JSON; the branch shown is that of `action`, None for the recorded one."""
 
     def address(number: int) -> str:
@@ -179,7 +178,7 @@ def why(
         return why_body(why_in(recording, state, action, agent, at, limit), linked=True).encode()
 
 
-def _branch_part(recording: Recording, at: StepRef, action: str, start: int, steps: int) -> Json:
+def _branch_part(recording: Recording, at: EpisodeRef, action: str, start: int, steps: int) -> Json:
     episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
     scene = recording.environment["scene"] if episode.grid else None
     note = "" if scene else "The environment has no scene to draw."
@@ -195,19 +194,15 @@ def random_policy(path: Path) -> bytes:
 def typical_episode(path: Path) -> bytes:
     """Return the address of the episode to show first, below that of the replay: `eval/3000/17`."""
     with open_recording(path) as recording:
-        if last_whole_evaluation(recording) is None:
-            return f"train/{last_episode(recording)}".encode()
-        after, number = typical_trial(recording)
-        return f"eval/{after}/{number}".encode()
+        return EpisodeRef(word=TYPICAL).resolved(recording).episode_path.encode()
 
 
 def latest_episode(path: Path) -> bytes:
     """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
     with open_recording(path) as recording:
         ended = recording.train.episodes.count()
-        return (
-            f"train/{ended - 1}".encode() if ended and any(phase.steps for phase in recording.phases) else b""
-        )
+        has_one = ended and any(phase.steps for phase in recording.phases)
+        return EpisodeRef(ended - 1).episode_path.encode() if has_one else b""
 
 
 def maps(path: Path) -> bytes:
@@ -244,10 +239,13 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
 
 
 def _typical_start(recording: Recording) -> int:
+    evaluation = last_whole_evaluation(recording)
     try:
-        return first_state(recording, typical_trial(recording))
-    except RecordingError:
-        return int(recording.mdp.start.argmax())
+        if evaluation is not None:
+            return first_state(recording, ranked_trials(recording, evaluation)[1])
+    except RecordingError:  # it has no steps
+        pass
+    return int(recording.mdp.start.argmax())
 
 
 def system(path: Path) -> bytes:
@@ -334,7 +332,7 @@ def difference(a: Run, b: Run) -> bytes:
     return as_json(shown_difference)
 
 
-def viewer_place(run: Run, at: StepRef | None) -> bytes:
+def viewer_place(run: Run, at: EpisodeRef | None) -> bytes:
     """Return the step of the viewer's timeline at a step, and its trial as a loop counts it, as JSON."""
     location = locate(run, Request(), at)
     return as_json({"time": location.time, "trials": location.request.trials})

@@ -171,14 +171,16 @@ def whole_number(text: str) -> int:
 
 
 def ranges_in(text: str) -> Ranges:
-    """Return the ranges in a text such as `0:20,40,49980:`; a single number is a range of one.
+    """Return the ranges in a text such as `0..20,40,49980..`, the stop not included.
+
+    A single number is a range of one; `0:20` is `0..20`.
 
     Raises:
         ValueError: the text is no list of ranges.
     """
     ranges = []
     for part in text.split(","):
-        start, colon, stop = part.strip().partition(":")
+        start, colon, stop = part.strip().replace("..", ":").partition(":")
         first = 0 if colon and not start else whole_number(start)
         end = first + 1 if not colon else whole_number(stop) if stop else None
         ranges.append((first, end))

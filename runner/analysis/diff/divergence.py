@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluations_of
-from runner.analysis.step_reference import StepRef
 from runner.errors import shortened
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
@@ -89,12 +89,12 @@ class Divergence:
     """Whether actions and ends of episodes were compared, since of a run nothing else is recorded."""
 
     @property
-    def reference(self) -> StepRef:
+    def reference(self) -> EpisodeRef:
         """The step."""
-        return StepRef(self.episode, self.t, self.after)
+        return EpisodeRef(self.episode, self.t, self.after)
 
     @property
-    def frame(self) -> StepRef:
+    def frame(self) -> EpisodeRef:
         """The first frame of a replay that differs: the one after the step, unless it began differently."""
         began = self.field == "state" or self.field.startswith("reset.")
         return self.reference if began else self.reference.outcome
@@ -324,7 +324,7 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
     divergence = _divergence(origin.phase, blocks[0], blocks[1], fields)
     if divergence is None:
         return None
-    at = StepRef.parse(origin.at)
+    at = EpisodeRef.parse(origin.at)
     return replace(divergence, episode=at.episode, after=at.after, a_step=None, b_step=None)
 
 

@@ -15,7 +15,7 @@ from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
 from runner.cli.output import draw, facts, grid_table, print_json, print_result, say
-from runner.cli.parameter_types import COUNT, INDEX, PLACE
+from runner.cli.parameter_types import COUNT, INDEX, STEP
 from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded, print_run, run_facts
 from runner.errors import ExitCode
@@ -23,7 +23,7 @@ from runner.runs.run import Run
 from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:
-    from runner.analysis.step_reference import StepRef
+    from runner.analysis.episodes import EpisodeRef
     from runner.debugging.branch import Branch
     from runner.execution.branching import TrainingBranch
 
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 @click.command("branch", cls=Command)
 def branch_command(
     run_name: str = run_argument,
-    at: int | StepRef | None = option(
+    at: EpisodeRef | None = option(
         "--at",
-        type=PLACE,
+        type=STEP,
         metavar="STEP",
         help="The step: EPISODE:T, or step:N by its number in training; eval:N:TRIAL:T of an evaluation.",
     ),
@@ -110,14 +110,8 @@ def branch_command(
             "is a branch of its own, recorded as a run. Give one action, and repeat the command for others: "
             f"`dualtaxi branch {run.run_id} --at {at} --action VALUE`."
         )
-    if run.can_train_again and ("all" in actions or (not isinstance(at, int) and at.after is not None)):
-        from runner.analysis.step_reference import reference_to, training_step
-        from runner.recording.reader import open_recording
-
+    if run.can_train_again and ("all" in actions or at.after is not None):
         _refuse_what_training_takes()
-        if isinstance(at, int):
-            with open_recording(run.recording) as recording:
-                at = reference_to(recording, training_step(recording, at))
         _print_what_if(run, at, actions, as_json)
         return
     from runner.api import Interrupt, interruptible
@@ -240,7 +234,7 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
     draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))
 
 
-def _print_what_if(run: Run, at: StepRef, actions: tuple[str, ...], as_json: bool) -> None:
+def _print_what_if(run: Run, at: EpisodeRef, actions: tuple[str, ...], as_json: bool) -> None:
     """Print where joint actions at a step lead: each of those that are named, or all."""
     from runner.debugging.what_if import what_if
 

@@ -6,7 +6,7 @@ import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -28,6 +28,9 @@ from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
 from runner.export.places import new_file, write_text_new
 from runner.util.humanize import size
+
+if TYPE_CHECKING:
+    from runner.analysis.episodes import EpisodeRef
 
 _HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest", "content")
 _LEFT: Final = ("checkpoint", "phase", "format", "digest", "content")
@@ -110,8 +113,8 @@ def get_command(
 @click.command("values", cls=Command)
 def values_command(
     run_name: str = run_argument,
-    episode: int | None = episode_option,
-    trial: tuple[int, int] | None = trial_option,
+    episode: EpisodeRef | None = episode_option,
+    trial: EpisodeRef | None = trial_option,
     checkpoint: str | None = checkpoint_option,
     policy: str | None = policy_option,
     output: Path | None = option(
@@ -133,21 +136,19 @@ def values_command(
       dualtaxi values cartpole --episode 3 --checkpoint @20000 --policy agent:values
       dualtaxi values cartpole --episode 3 --checkpoint policy@0 --policy agent:values -o values.csv
     """
-    from runner.analysis.evaluations import evaluation_after, evaluations_of
     from runner.loops.policies import values_along
     from runner.recording.reader import open_recording
     from runner.runs.checkpoints import find_checkpoint
 
     run = find_recorded(run_name, recordings)
-    if checkpoint is None or policy is None or (episode is None) == (trial is None):
+    at = episode or trial
+    if checkpoint is None or policy is None or at is None or (episode and trial):
         raise click.UsageError("expected --episode N or --eval N:TRIAL, --checkpoint and --policy.")
     chosen = find_checkpoint(run.checkpoints(), checkpoint, f"run {run.run_id}")
     with open_recording(run.recording) as recording, stage_line("computing values"):
-        phase, number, where = "train", episode or 0, str(recording.path)
-        if trial is not None:
-            evaluation = evaluation_after(evaluations_of(recording), trial[0], where)
-            phase, number = "eval", evaluation.trial(trial[1], where)
-        along = values_along(recording, phase, number, chosen, policy, trust)
+        at = at.resolved(recording)
+        number = at.number_in(recording)
+        along = values_along(recording, at.phase, number, chosen, policy, trust)
     columns: dict[str, list[object]] = {"t": list(range(len(along.rewards)))}
     columns |= _columns("action", along.actions) | _columns("reward", along.rewards.sum(axis=1))
     for name, values in along.values.items():
@@ -156,7 +157,7 @@ def values_command(
     if output is not None:
         write_text_new(output, force, "".join(csv_lines(columns, rows)))
     if as_json:
-        facts = {"phase": phase, "episode": number, "checkpoint": chosen.as_json(), "policy": policy}
+        facts = {"phase": at.phase, "episode": number, "checkpoint": chosen.as_json(), "policy": policy}
         steps = [dict(zip(columns, row, strict=True)) for row in rows]
         files = [] if output is None else files_written(output)
         print_json({"run_id": run.run_id, **facts, "steps": steps, "files": files})

@@ -9,9 +9,10 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import (
-    EpisodeChoice,
+    EPISODE_OPTIONS,
     Writing,
-    choice_options,
+    episode_options,
+    require_one,
     run_argument,
     trust_option,
     writing_options,
@@ -27,7 +28,7 @@ from runner.util.humanize import size
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from runner.export.episodes import EpisodePlace
+    from runner.analysis.episodes import EpisodeRef
     from runner.recording.reader import Recording
 
 GRID_LENGTHS = 2
@@ -42,7 +43,7 @@ _MAX_GIF_FPS = 50
 @click.command("film", cls=Command, short_help="A film of an episode: MP4, WebM, GIF or WebP.")
 def command(
     run_name: str = run_argument,
-    choice: EpisodeChoice = choice_options,
+    chosen: EpisodeRef = episode_options,
     grid: tuple[int, int] | None = option(
         "--grid",
         type=GRID,
@@ -86,7 +87,7 @@ def command(
       dualtaxi export film k3v9m2xq --eval 3000:7 -o trial.gif
       dualtaxi export film k3v9m2xq --grid 3x3 -o nine.webm --fps 60
     """
-    choice.require_one(grid=grid)
+    require_one(*EPISODE_OPTIONS, "grid")
     if whole and not grid:
         raise click.UsageError("--whole is for a grid: the film of one episode is always whole.")
     from runner.export import film
@@ -97,7 +98,7 @@ def command(
         path = to.path(run.file_stem)
         format_of(path)
         require_new(path, to.force)
-        shown = _ranked(recording, grid) if grid else [choice.find(recording)]
+        shown = _ranked(recording, grid) if grid else [chosen.resolved(recording)]
         is_scene = source_of(recording, shown[0].phase, trust)[0] is Source.SCENE
         speed = fps or (_SCENE_FPS if is_scene else _FPS)
         if path.suffix.lower() == ".gif" and speed > _MAX_GIF_FPS:
@@ -106,10 +107,10 @@ def command(
 
         def shots() -> Iterator[film.Shot]:
             for one in shown:
-                opened.append(Pictures(recording, one.phase, one.number, trust))
+                opened.append(Pictures(recording, one.phase, one.number_in(recording), trust))
                 yield film.Shot(f"{run.title}: {one.title}", opened[-1])
 
-        lengths = [len(recording.phase(one.phase).episode_span(one.number)) for one in shown]
+        lengths = [len(recording.phase(one.phase).episode_span(one.number_in(recording))) for one in shown]
         longest = (
             max(lengths) if whole or not grid else min(max(lengths), int(GRID_LENGTHS * median(lengths)))
         )
@@ -140,9 +141,9 @@ def command(
         raise SystemExit(ExitCode.DIFFERENT)
 
 
-def _ranked(recording: Recording, grid: tuple[int, int]) -> list[EpisodePlace]:
+def _ranked(recording: Recording, grid: tuple[int, int]) -> list[EpisodeRef]:
     """Return the episodes of a grid, from the best to the worst."""
-    from runner.export.episodes import named_episode, ranked_episodes
+    from runner.analysis.episodes import ranked_episodes, references
 
     phase, ranked = ranked_episodes(recording)
     cells = grid[0] * grid[1]
@@ -150,4 +151,4 @@ def _ranked(recording: Recording, grid: tuple[int, int]) -> list[EpisodePlace]:
         say(f"There are only {len(ranked):,} episodes: {cells - len(ranked)} cells of the grid are empty.")
     count = min(cells, len(ranked))
     places = [round((len(ranked) - 1) * (1 - k / max(count - 1, 1))) for k in range(count)]
-    return [named_episode(recording, phase, int(ranked[place])) for place in places]
+    return references(recording, phase, ranked[places])

@@ -39,7 +39,7 @@ def csv(
     Examples:
       dualtaxi export csv @latest
       dualtaxi export csv k3v9m2xq --gz --phase eval -o trials
-      dualtaxi export csv k3v9m2xq --episodes 0:20,2980: --force
+      dualtaxi export csv k3v9m2xq --episodes 0..20,2980.. --force
     """
     _export("csv", run_name, phase, episodes, gz, to)
 
@@ -59,7 +59,7 @@ def parquet(
 
     Examples:
       dualtaxi export parquet @latest
-      dualtaxi export parquet k3v9m2xq --episodes 0:20 -o first
+      dualtaxi export parquet k3v9m2xq --episodes 0..20 -o first
     """
     _export("parquet", run_name, phase, episodes, False, to)
 

@@ -15,8 +15,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import (
-    EpisodeChoice,
-    choice_options,
+    episode_options,
     json_option,
     recordings_option,
     run_argument,
@@ -26,6 +25,8 @@ from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
     from rich.text import Text
+
+    from runner.analysis.episodes import EpisodeRef
 
 ReadKey = Callable[[float | None], str]
 """Waits for a key, at most a number of seconds; returns its meaning, empty if none was pressed."""
@@ -47,7 +48,7 @@ _POLL_SECONDS: Final = 0.02
 @click.command("play", cls=Command)
 def play_command(
     run_name: str = run_argument,
-    choice: EpisodeChoice = choice_options,
+    chosen: EpisodeRef = episode_options,
     speed: float = option(
         "--speed",
         type=click.FloatRange(0, min_open=True),
@@ -76,15 +77,14 @@ def play_command(
       dualtaxi play k3v9m2xq --best
       dualtaxi play k3v9m2xq --episode 0 | less
     """
-    choice.require_one()
     from runner.cli.episode import Episode
     from runner.export.values import Values
     from runner.recording.reader import open_recording
 
     run, terminal = find_recorded(run_name, recordings), console()
     with open_recording(run.recording) as recording, contextlib.ExitStack() as stack:
-        place = choice.find(recording)
-        played = Episode(recording, place, f"{run.title}: {place.title}")
+        at = chosen.resolved(recording)
+        played = Episode(recording, at, f"{run.title}: {at.title}")
         if as_json:
             for step in played.steps():
                 print_json(step, indent=None)

@@ -18,7 +18,7 @@ from runner.cli.options import (
     writing_options,
 )
 from runner.cli.output import require_page, say
-from runner.cli.parameter_types import INDEX, TRIAL
+from runner.cli.parameter_types import EPISODE, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
 from runner.export.places import new_file, write_text_new
@@ -28,6 +28,7 @@ from runner.util.humanize import counted, sentence, size
 
 if TYPE_CHECKING:
     from runner.analysis.axes import Axis
+    from runner.analysis.episodes import EpisodeRef
     from runner.analysis.series import RunSeries
     from runner.export.plots.style import CurveStyle
 
@@ -59,10 +60,10 @@ def plot_command(
       dualtaxi plot ppo dqn --axis steps --normalise minmax
       dualtaxi plot hyperparameters -o hyperparameters.png
     """
+    from runner.analysis.contents import shortcomings
     from runner.analysis.groups import duplicates, groups_of
     from runner.analysis.panels import panels_of
     from runner.analysis.series import read_series, values_left_out
-    from runner.export.contents import shortcomings
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import check_suffix, save
     from runner.export.plots.style import CurveStyle
@@ -151,14 +152,15 @@ def _plot_sweep(name: str, recordings: Path, to: Writing) -> None:
 @click.command("report", cls=Command)
 def report_command(
     run_names: tuple[str, ...] = runs_argument,
-    episodes: tuple[int, ...] = option(
+    episodes: tuple[EpisodeRef, ...] = option(
         "--episode",
-        type=INDEX,
+        type=EPISODE,
         multiple=True,
-        metavar="N",
-        help="Also show this training episode, counted from 0; may be repeated.",
+        metavar="EPISODE",
+        help="Also show this episode: N of training, counted from 0, eval:N:TRIAL, best or worst; may be "
+        "repeated.",
     ),
-    trials: tuple[tuple[int, int], ...] = option(
+    trials: tuple[EpisodeRef, ...] = option(
         "--eval",
         type=TRIAL,
         multiple=True,
@@ -194,10 +196,9 @@ def report_command(
         _refuse_style(axis, style)
         _report_sweep(run_names[0], folder, to)
         return
-    replays = [*((number,) for number in episodes), *trials]
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
     with stage_line("reading") as progress:
-        page, notes = render_report(paths, replays, progress, axis, style)
+        page, notes = render_report(paths, [*episodes, *trials], progress, axis, style)
     write_text_new(output, to.force, page)
     for note in notes:
         say(note)

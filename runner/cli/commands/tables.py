@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import force_option, json_option, recordings_option, run_argument, set_option
+from runner.cli.options import (
+    force_option,
+    json_option,
+    recordings_option,
+    require_one,
+    run_argument,
+    set_option,
+)
 from runner.cli.output import draw, echo_csv, facts, files_written, print_json, say, table, title
 from runner.cli.parameter_types import FILE, INDEX
 from runner.cli.progress import stage_line
@@ -61,8 +68,7 @@ def qtable_command(
       dualtaxi qtable k3v9m2xq --step 50000 --state 17
       dualtaxi qtable k3v9m2xq --step 50000 -o table.npy
     """
-    if step is not None and episode is not None:
-        raise click.UsageError("--step and --episode exclude each other: choose one.")
+    require_one("step", "episode")
     import numpy as np
 
     from runner.analysis.qtable import describe_tables

@@ -19,7 +19,7 @@ from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new
 
 if TYPE_CHECKING:
-    from runner.analysis.step_reference import StepRef
+    from runner.analysis.episodes import EpisodeRef
     from runner.export.rerun.location import Location
     from runner.export.rerun.selection import Request
 
@@ -27,11 +27,12 @@ if TYPE_CHECKING:
 @click.command("view", cls=Command)
 def view_command(
     run_names: tuple[str, ...] = argument(metavar="RUN [RUN]", nargs=-1, required=True, type=RunName()),
-    step: StepRef | None = option(
+    step: EpisodeRef | None = option(
         "--at",
         type=STEP,
         metavar="EPISODE:T",
-        help="The step: EPISODE:T of training, or eval:N:TRIAL:T of an evaluation. T and TRIAL default to 0.",
+        help="The step: EPISODE:T of training, step:N by its number, or eval:N:TRIAL:T of an evaluation. T "
+        "and TRIAL default to 0.",
     ),
     web: bool = option(
         "--web", is_flag=True, help="Serve the web viewer on 127.0.0.1 instead of opening a window."

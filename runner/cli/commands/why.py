@@ -15,7 +15,7 @@ from runner.cli.progress import steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
 
 if TYPE_CHECKING:
-    from runner.analysis.step_reference import StepRef
+    from runner.analysis.episodes import EpisodeRef
 
 
 @click.command("why", cls=Command)
@@ -30,12 +30,12 @@ def why_command(
     agent: str | None = option(
         "--agent", metavar="NAME", help="The agent whose Q-table it is in, where each has its own."
     ),
-    at: StepRef | None = option(
+    at: EpisodeRef | None = option(
         "--at",
         type=STEP,
         metavar="STEP",
-        help="The step: EPISODE:T, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of episode 120. "
-        "The value before the step is shown.  [default: the last]",
+        help="The step: EPISODE:T, step:N, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of "
+        "episode 120. The value before the step is shown.  [default: the last]",
     ),
     limit: int = limit_option(10),
     recordings: Path | None = recordings_option,

@@ -23,10 +23,10 @@ from runner.analysis.diff.sections import (
     why_in_words,
 )
 from runner.analysis.diff.tables import common_snapshots
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
-from runner.analysis.step_reference import StepRef
 from runner.drawing import svg
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions_in_words, exploration_in_words, spoken, states_in_words
@@ -56,8 +56,8 @@ class ShownDivergence:
     """The first step that differs, on the page."""
 
     id: str
-    step: StepRef
-    frame: StepRef
+    step: EpisodeRef
+    frame: EpisodeRef
     """The first frame of the replays that differs."""
     title: str
     where: str

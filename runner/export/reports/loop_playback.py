@@ -14,10 +14,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.contents import ENDINGS, ending_of
+from runner.analysis.episodes import EpisodeRef
 from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
-from runner.export.contents import ENDINGS, ending_of
-from runner.export.episodes import EpisodePlace, no_step
 from runner.export.reports.player_data import (
     Playback,
     Series,
@@ -36,7 +36,6 @@ from runner.recording.spaces import Value, leaves_of
 from runner.replay.steps import reset_of
 from runner.replay.whole_steps import whole_steps
 from runner.util.arrays import Array, Records
-from runner.util.humanize import capitalised
 
 MAX_SERIES: Final = 32
 _LEAST_SERIES: Final = 20
@@ -75,20 +74,21 @@ class _ShownPart:
         return np.array(values).reshape(len(values), -1)[:, : len(self.names)]
 
 
-def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: int) -> Playback:
+def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
-    span = recording.phase(place.phase).episode_span(place.number)
+    phase, number = recording.phase(at.phase), at.number_in(recording)
+    span = phase.episode_span(number)
     if not 0 <= first < len(span):
-        raise no_step(recording, place.title, len(span), first)
+        raise at.no_step(recording, len(span), first)
     part = span[first : first + limit]
     parts, notes = _shown_parts(recording)
-    in_words = step_actions_in_words(recording, place.phase)
+    in_words = step_actions_in_words(recording, at.phase)
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     before = np.zeros(len(recording.agents))
     rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
     actions: list[dict[str, str]] = []
-    observations = [_observations_before(recording, place, span, first, parts)]
-    for steps in _steps(recording, place, range(span.start, part[-1] + 1, span.step)):
+    observations = [_observations_before(recording, at.phase, number, first, parts)]
+    for steps in _steps(recording, at.phase, number, range(span.start, part[-1] + 1, span.step)):
         paid = steps["rewards"].astype(np.float64)
         earlier = int(np.searchsorted(steps["step"], part.start))
         before += paid[:earlier].sum(axis=0)
@@ -102,18 +102,15 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
     if len(reward) != len(part):
         raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
     frames = frame_times(time // schema.STEP_NANOSECONDS)
-    ended = ending_of(recording, place.phase, place.number)
+    ended = ending_of(recording, at.phase, number)
     total = None
     if ended != "cut off":
-        total = float(
-            recording.phase(place.phase).episodes.array(place.number, place.number + 1)["returns"].sum()
-        )
+        total = float(phase.episodes.array(number, number + 1)["returns"].sum())
     elif first + limit >= len(span):
         total = float(before.sum() + reward.sum())
     texts, series = _frames(parts, observations)
-    title = capitalised(place.title)
     return Playback(
-        title=title if span.step == 1 else f"{title}, in environment {span.start % span.step}",
+        title=at.heading + ("" if span.step == 1 else f", in environment {span.start % span.step}"),
         description=outcome_in_words(len(span), ended, total),
         length=len(span),
         first=first,
@@ -127,31 +124,31 @@ def loop_playback(recording: Recording, place: EpisodePlace, limit: int, first: 
         ],
         texts=texts,
         time=frames,
-        series=[*series, *_extras(recording, place.phase, part, notes)],
+        series=[*series, *_extras(recording, at.phase, part, notes)],
         notes=notes,
-        logged=logged_near(recording, place.phase, frames),
+        logged=logged_near(recording, at.phase, frames),
     )
 
 
-def _steps(recording: Recording, place: EpisodePlace, numbers: range) -> Iterator[Records]:
+def _steps(recording: Recording, phase: str, episode: int, numbers: range) -> Iterator[Records]:
     """Yield the steps of an episode with these numbers, some at a time."""
-    recorded = recording.phase(place.phase).steps
+    recorded = recording.phase(phase).steps
     if not recorded.are_actions:
         yield from recorded.numbered(numbers)
         return
-    steps = whole_steps(recording, place.phase, place.number)
+    steps = whole_steps(recording, phase, episode)
     yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
 
 
 def _observations_before(
-    recording: Recording, place: EpisodePlace, span: range, first: int, parts: Sequence[_ShownPart]
+    recording: Recording, phase: str, episode: int, first: int, parts: Sequence[_ShownPart]
 ) -> list[Column]:
     """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
     if first:
-        number = span[first - 1]
-        steps = next(_steps(recording, place, range(number, number + 1, span.step)), None)
+        span = recording.phase(phase).episode_span(episode)
+        steps = next(_steps(recording, phase, episode, span[first - 1 : first]), None)
         return [] if steps is None else _observations(recording, steps, parts)
-    reset = reset_of(recording, place.phase, place.number)
+    reset = reset_of(recording, phase, episode)
     if reset is None:
         return []
     value = reset["observation"]

@@ -13,6 +13,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.contents import ENDINGS, ending_of, require_steps
+from runner.analysis.episodes import EpisodeRef
 from runner.drawing import svg
 from runner.environments.mdp import events_of
 from runner.environments.naming import (
@@ -25,8 +27,6 @@ from runner.environments.naming import (
     states_in_words,
 )
 from runner.errors import RecordingError
-from runner.export.contents import ENDINGS, ending_of, require_steps
-from runner.export.episodes import EpisodePlace, no_step, place_of
 from runner.export.reports.loop_playback import loop_playback
 from runner.export.reports.player_data import (
     Grid,
@@ -54,26 +54,21 @@ QValues = tuple[NDArray[np.float64], ...]
 """For each learner the Q-values in the states of T steps, [T, actions]; empty if they are unknown."""
 
 
-def playback_of(
-    recording: Recording, which: tuple[int, ...], limit: int = MAX_STEPS, first: int = 0
-) -> Playback:
-    """Return what a page plays of an episode, ended or not: at most `limit` steps from step `first` on.
-
-    Which episode is given as for `place_of`.
-    """
+def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, first: int = 0) -> Playback:
+    """Return what a page plays of an episode, ended or not: at most `limit` steps from step `first` on."""
     require_steps(recording, "show", may_redo=True)
-    place = place_of(recording, which)
     with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
         if not recording.tabular:
-            return loop_playback(recording, place, limit, first)
-        steps = steps_of(recording, place.phase, place.number)
+            return loop_playback(recording, at, limit, first)
+        number = at.number_in(recording)
+        steps = steps_of(recording, at.phase, number)
         shown = steps[first : first + limit]
         if not len(shown):
-            raise no_step(recording, place.title, len(steps), first)
+            raise at.no_step(recording, len(steps), first)
         check_steps(shown, recording.mdp, str(recording.path))
-        values = _values(recording, shown, place.table_step)
-        ended = ending_of(recording, place.phase, place.number)
-        return tabular_playback(recording, place, steps, ended, values, first, limit)
+        values = _values(recording, shown, at)
+        ended = ending_of(recording, at.phase, number)
+        return tabular_playback(recording, at, steps, ended, values, first, limit)
 
 
 def titled(playback: Playback, names: Sequence[str]) -> Playback:
@@ -93,7 +88,7 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
 
 def tabular_playback(
     recording: Recording,
-    place: EpisodePlace,
+    at: EpisodeRef,
     steps: NDArray[np.void],
     ended: str,
     values: QValues,
@@ -107,10 +102,10 @@ def tabular_playback(
     """
     mdp, agents, drawing = recording.mdp, recording.agents, svg.drawing_of(recording.mdp)
     shown = steps[first : first + limit]
-    distinct, at = np.unique(np.append(shown["state"], shown["next_state"][-1]), return_inverse=True)
+    distinct, state_of = np.unique(np.append(shown["state"], shown["next_state"][-1]), return_inverse=True)
     grid = None
     if drawing is not None:
-        grid = Grid(drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), at.tolist())
+        grid = Grid(drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), state_of.tolist())
     states = [str(word) for word in states_in_words(mdp)[distinct]]
     named, actions = agent_actions_in_words(mdp), shown["action"].tolist()
     taken = [actions] * len(values)
@@ -119,7 +114,7 @@ def tabular_playback(
     time = frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
     before = steps["rewards"][:first].sum(axis=0).tolist() if first else []
     return Playback(
-        title=capitalised(place.title),
+        title=at.heading,
         description=outcome_in_words(len(steps), ended, float(steps["rewards"].sum())),
         length=len(steps),
         first=first,
@@ -128,9 +123,9 @@ def tabular_playback(
         before=[short(value) for value in before],
         reward=short_rows(shown["rewards"]),
         actions=[words("", "action", [named[action] for action in actions])],
-        texts=[Words("", "state", states, at.tolist())],
+        texts=[Words("", "state", states, state_of.tolist())],
         time=time,
-        logged=logged_near(recording, place.phase, time),
+        logged=logged_near(recording, at.phase, time),
         events=[event_in_words(name) for name in mdp.event_names],
         event=events_of(mdp, shown).tolist(),
         explored=shown["explored"].tolist(),
@@ -140,13 +135,14 @@ def tabular_playback(
     )
 
 
-def _values(recording: Recording, steps: NDArray[np.void], table_step: int) -> QValues:
-    """Return each learner's Q-values in the states of steps; a trial has those after `table_step` steps."""
+def _values(recording: Recording, steps: NDArray[np.void], at: EpisodeRef) -> QValues:
+    """Return each learner's Q-values in the states of an episode's steps; those of a trial do not change."""
     if not recording.has_tables:
         return ()
     try:
-        if table_step >= 0:
-            return tuple(table[steps["state"]] for table in tables_at(recording, table_step))
+        if at.after is not None:
+            tables = tables_at(recording, at.evaluation_in(recording).train_step)
+            return tuple(table[steps["state"]] for table in tables)
         first = int(steps["step"][0])
         replay = TableReplay(recording, first)
         widths = [table.shape[1] for table in replay.tables]

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.contents import ENDINGS
 from runner.drawing import svg
-from runner.export.contents import ENDINGS
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.arrays import Array

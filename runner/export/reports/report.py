@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis
+from runner.analysis.contents import flat_text, shortcomings, why_no_steps
+from runner.analysis.episodes import EpisodeRef, first_state, last_whole_evaluation, ranked, ranked_trials
 from runner.analysis.evaluations import EvaluationRecord, evaluation_records, evaluations_section
 from runner.analysis.groups import groups_of
 from runner.analysis.sections import Section
@@ -20,9 +22,7 @@ from runner.analysis.summary import brief_provenance, random_policy_sentence
 from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
-from runner.export.contents import flat_text, shortcomings, why_no_steps
 from runner.export.encoded import Thumbnails, picture_note, thumbnails
-from runner.export.episodes import first_state, last_whole_evaluation, place_of, ranked, ranked_trials
 from runner.export.plots.curves import plots_of
 from runner.export.plots.style import PLAIN, CurveStyle
 from runner.export.reports.maps import MapRow, maps_of, stages_of
@@ -88,15 +88,15 @@ def require_packages() -> None:
 
 def render_report(
     recordings: Sequence[Path],
-    chosen: Sequence[tuple[int, ...]] = (),
+    chosen: Sequence[EpisodeRef] = (),
     progress: Callable[[str], None] = lambda _: None,
     axis: Axis = EPISODES,
     style: CurveStyle = PLAIN,
 ) -> tuple[str, list[str]]:
     """Return the page about some recordings, and what is missing from it, a sentence each.
 
-    The chosen episodes, given as for `place_of`, are shown in addition to those that are always shown;
-    `progress` is called with the next stage of the work; axis and style are those of the plots.
+    The chosen episodes are shown in addition to those that are always shown; `progress` is called with the
+    next stage of the work; axis and style are those of the plots.
     """
     require_packages()
     series: list[RunSeries] = []
@@ -130,7 +130,7 @@ def render_report(
 
 
 def _run(
-    recording: Recording, number: int, chosen: Sequence[tuple[int, ...]], progress: Callable[[str], None]
+    recording: Recording, number: int, chosen: Sequence[EpisodeRef], progress: Callable[[str], None]
 ) -> ReportedRun:
     evaluations = evaluation_records(recording)
     environment = recording.environment
@@ -206,7 +206,7 @@ def _facts(recording: Recording) -> dict[str, str]:
     return {key: str(value) for key, value in facts.items()}
 
 
-def _episodes(recording: Recording, chosen: Sequence[tuple[int, ...]]) -> dict[tuple[int, ...], list[str]]:
+def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[EpisodeRef, list[str]]:
     """Return the episodes to show, each with the reasons for it.
 
     They are the chosen ones; the typical, the best and the worst one of the last evaluation, or else of the
@@ -214,31 +214,27 @@ def _episodes(recording: Recording, chosen: Sequence[tuple[int, ...]]) -> dict[t
     """
     if not recording.has_actions:
         return {}
-    after, ended = last_whole_evaluation(recording), recording.train.episodes.count()
-    reasons = [(which, "chosen") for which in chosen]
-    if after is not None:
-        worst, typical, best = ranked_trials(recording, after)
-        reasons += [
-            ((after, typical), "typical trial"),
-            ((after, best), "best trial"),
-            ((after, worst), "worst trial"),
-        ]
+    last, ended = last_whole_evaluation(recording), recording.train.episodes.count()
+    reasons = [(at.resolved(recording), "chosen") for at in chosen]
+    if last is not None:
+        worst, typical, best = ranked_trials(recording, last)
+        reasons += [(typical, "typical trial"), (best, "best trial"), (worst, "worst trial")]
     elif ended:
         worst, typical, best = ranked(recording, "train", ended - max(1, ended // 10), ended)
         reasons += [
-            ((typical,), "typical of the last tenth"),
-            ((best,), "best of the last tenth"),
-            ((worst,), "worst of the last tenth"),
+            (typical, "typical of the last tenth"),
+            (best, "best of the last tenth"),
+            (worst, "worst of the last tenth"),
         ]
     if recording.tabular:
-        reasons += [((0,), "first of training"), ((max(0, ended - 1),), "last of training")]
-    episodes: dict[tuple[int, ...], list[str]] = {}
-    for which, reason in reasons:
-        episodes.setdefault(which, []).append(reason)
+        reasons += [(EpisodeRef(0), "first of training"), (EpisodeRef(max(0, ended - 1)), "last of training")]
+    episodes: dict[EpisodeRef, list[str]] = {}
+    for at, reason in reasons:
+        episodes.setdefault(at, []).append(reason)
     return episodes
 
 
-def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]:
+def _maps(recording: Recording, episode: EpisodeRef | None) -> list[MapRow]:
     """Return the maps, for the situation in which an episode begins."""
     if not recording.tabular:
         return []
@@ -253,13 +249,13 @@ def _maps(recording: Recording, episode: tuple[int, ...] | None) -> list[MapRow]
 
 
 def _replay(
-    recording: Recording, episodes: Mapping[tuple[int, ...], list[str]], progress: Callable[[str], None]
+    recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Callable[[str], None]
 ) -> Replay | None:
     """Return what the page replays; None if no episode can be."""
     shown = []
-    for which, names in episodes.items():
+    for at, names in episodes.items():
         try:
-            shown.append((which, titled(playback_of(recording, which), names)))
+            shown.append((at, titled(playback_of(recording, at), names)))
         except RecordingError:  # its steps may have been cut off, or never recorded
             if "chosen" in names:
                 raise
@@ -272,13 +268,12 @@ def _replay(
         picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
         key = drawing.key()
     data, has_frames = [], False
-    for number, (which, episode) in enumerate(shown, 1):
+    for number, (at, episode) in enumerate(shown, 1):
         own = Thumbnails()
         if episode.grid is None:
             progress(f"pictures of episode {number} of {len(shown)}")
-            place = place_of(recording, which)
-            own = thumbnails(recording.path, place.phase, place.number, len(episode.reward) + 1)
-            own.picture_note = own.picture_note or picture_note(recording, place.phase)[1]
+            own = thumbnails(recording.path, at.phase, at.number_in(recording), len(episode.reward) + 1)
+            own.picture_note = own.picture_note or picture_note(recording, at.phase)[1]
         has_frames = has_frames or bool(own.pictures)
         data.append(asdict(episode) | asdict(own))
     return Replay([episode.title for _, episode in shown], picture, key, embedded(data), has_frames)

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from runner.analysis.contents import require_steps
 from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluation_after
-from runner.analysis.step_reference import StepRef
 from runner.errors import NotInRecording
-from runner.export.contents import require_steps
 from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select, time_of
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
@@ -28,7 +28,7 @@ class Location:
     request: Request
 
 
-def locate(run: Run, request: Request, step: StepRef | None) -> Location:
+def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
     """Return where a step is on the timeline, and a request that adds it to what is exported anyway.
 
     Without a step it is the first one of the last evaluation exported, or of the last training episode if
@@ -38,7 +38,7 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
         if step is None:
             return Location(_default_time(recording, request), request)
         require_steps(recording, "look at")
-        phase = "train" if step.after is None else "eval"
+        step = step.resolved(recording)
         number, episode = step.episode, (step.episode, step.episode + 1)
         added: dict[str, Any] = {"episodes": (*request.episodes, episode)}
         if step.after is not None:
@@ -46,18 +46,18 @@ def locate(run: Run, request: Request, step: StepRef | None) -> Location:
             evaluations, where = evaluations_with_steps(recording, train, evals), str(recording.path)
             number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
             added = {"evaluations": (*request.evaluations, step.after), "trials": (number,)}
-        steps = recording.phase(phase).episode_span(number)
+        steps = recording.phase(step.phase).episode_span(number)
         if step.t >= len(steps):
             raise NotInRecording(
                 f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
             )
-        time = time_of(recording, phase, steps[step.t])
+        time = time_of(recording, step.phase, steps[step.t])
     if not request.everything:
         request = dataclasses.replace(request, with_default=request.is_default, **added)
     return Location(time, request)
 
 
-def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
+def locate_divergence(runs: Sequence[Run]) -> tuple[EpisodeRef | None, str]:
     """Return the step at which two runs diverge, as `locate` takes it, and a sentence about it.
 
     That is the first step of training that differs, or else the first evaluation's. None if they do not
@@ -78,7 +78,7 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[StepRef | None, str]:
         if a.environments == 1:
             return both[0].reference, words
         number = ended_episode(a, both[0].phase, both[0].step % a.environments, both[0].step)
-    return None if number is None or both[0].after is not None else StepRef(number, both[0].t), words
+    return None if number is None or both[0].after is not None else EpisodeRef(number, both[0].t), words
 
 
 def _default_time(recording: Recording, request: Request) -> int:

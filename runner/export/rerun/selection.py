@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from runner.analysis.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
-from runner.export.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.arrays import Ints
@@ -270,7 +270,7 @@ def _describe_job(
     if len(numbers) < count:
         selection.left_out.append(
             f"the steps of {count - len(numbers):,} training episodes "
-            "(--episodes START:STOP or --every N includes them; --all: everything)"
+            "(--episodes START..STOP or --every N includes them; --all: everything)"
         )
     if rest := [one.after for one in available if one not in evaluations]:
         selection.left_out.append(
@@ -298,7 +298,7 @@ def _complete_loop(
     of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""
     selection.exported.append(f"{trained:,} of {total:,} training steps{of_evaluation}{environments}")
     if rest := total + tested - trained - evaluated:
-        selection.left_out.append(f"{rest:,} steps (--episodes START:STOP selects; --all: everything)")
+        selection.left_out.append(f"{rest:,} steps (--episodes START..STOP selects; --all: everything)")
 
 
 def _select_drawn(
@@ -323,5 +323,5 @@ def _select_drawn(
     selection.exported.append(f"pictures of {drawn:,} of {total:,} episodes")
     if drawn < total:
         selection.left_out.append(
-            f"pictures of {total - drawn:,} episodes (--episodes START:STOP selects; --all: everything)"
+            f"pictures of {total - drawn:,} episodes (--episodes START..STOP selects; --all: everything)"
         )

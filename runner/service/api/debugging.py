@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
-from runner.analysis.step_reference import EXPECTED, StepRef
+from runner.analysis.episodes import EXPECTED, EpisodeRef
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
 from runner.debugging.expressions import MAX_CHARACTERS
 from runner.debugging.what_if import what_if_in
@@ -78,7 +78,7 @@ async def what_if(
 ) -> Response:
     """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
     return await compute.json(
-        computed.answer, run.recording, what_if_in, StepRef.parse(at), tuple(action or ())
+        computed.answer, run.recording, what_if_in, EpisodeRef.parse(at), tuple(action or ())
     )
 
 
@@ -94,7 +94,9 @@ async def branch(
     steps: Steps = STEPS,
 ) -> Response:
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
-    return await compute.json(fragments.branch_part, run.recording, StepRef.parse(at), action, start, steps)
+    return await compute.json(
+        fragments.branch_part, run.recording, EpisodeRef.parse(at), action, start, steps
+    )
 
 
 @router.get(

@@ -106,7 +106,7 @@ async def replay(
     cache: CacheOf,
     processes: ProcessesOf,
     episodes: Annotated[
-        str, Query(max_length=1000, description="Training episodes, such as `0:20,49980:`.")
+        str, Query(max_length=1000, description="Training episodes, such as `0..20,49980..`.")
     ] = "",
     evaluations: Annotated[
         list[int] | None,
@@ -178,5 +178,5 @@ def _ranges(text: str) -> Ranges:
     except ValueError as error:
         raise Refused(
             HTTPStatus.UNPROCESSABLE_ENTITY,
-            f"query.episodes: found {text!r}, expected START:STOP or N, such as 0:20,49980:",
+            f"query.episodes: found {text!r}, expected START..STOP or N, such as 0..20,49980..",
         ) from error

@@ -12,10 +12,9 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.errors import RunnerError
 from runner.export.encoded import encoded_pictures
-from runner.export.episodes import place_of
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
@@ -53,12 +52,12 @@ class Part(BaseModel):
     """Why there are none, or no better ones; may be empty."""
 
 
-def _add_routes(path: str, episode: Callable[..., StepRef], kind: str) -> None:
+def _add_routes(path: str, episode: Callable[..., EpisodeRef], kind: str) -> None:
     @router.get(path, name=kind, response_model=Part, summary=f"A part of a {kind}, to be replayed.")
     async def part(
         run: RecordedRun,
         compute: ComputationOf,
-        at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
+        at: EpisodeRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
         start: Start = 0,
         steps: Steps = STEPS,
     ) -> Response:
@@ -75,7 +74,7 @@ def _add_routes(path: str, episode: Callable[..., StepRef], kind: str) -> None:
     async def pictures(
         run: RecordedRun,
         streams: PicturesOf,
-        at: StepRef = Depends(episode),  # noqa: B008
+        at: EpisodeRef = Depends(episode),  # noqa: B008
         start: Start = 0,
         steps: Pictures = PICTURES,
     ) -> Response:
@@ -95,7 +94,7 @@ for (_path, _episode), _kind in zip(EPISODES.items(), ("training episode", "tria
     _add_routes(_path, _episode, _kind)
 
 
-async def prepare_pictures(run: Run, streams: PictureStreams, at: StepRef) -> None:
+async def prepare_pictures(run: Run, streams: PictureStreams, at: EpisodeRef) -> None:
     """Begin to make the pictures of an episode, whose page will request them soon."""
     with contextlib.suppress(RunnerError, OSError):  # its page shows the reason
         episode = await run_in_threadpool(_pictured_episode, run, at)
@@ -110,9 +109,9 @@ class _PicturedEpisode(NamedTuple):
     """Steps of the episode."""
 
 
-def _pictured_episode(run: Run, at: StepRef) -> _PicturedEpisode:
+def _pictured_episode(run: Run, at: EpisodeRef) -> _PicturedEpisode:
     with open_recording(run.recording) as recording:
-        place = place_of(recording, at.which)
-        length = len(recording.phase(place.phase).episode_span(place.number))
-    make = partial(encoded_pictures, run.recording, place.phase, place.number)
-    return _PicturedEpisode((recording_state(run), place.phase, place.number), make, length)
+        number = at.number_in(recording)
+        length = len(recording.phase(at.phase).episode_span(number))
+    make = partial(encoded_pictures, run.recording, at.phase, number)
+    return _PicturedEpisode((recording_state(run), at.phase, number), make, length)

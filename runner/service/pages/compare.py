@@ -13,8 +13,8 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.diff.sections import made_sections
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.groups import flat_config
-from runner.analysis.step_reference import StepRef
 from runner.errors import RunnerError
 from runner.export.plots.comparisons import letter
 from runner.recording.metrics import METRICS
@@ -22,7 +22,7 @@ from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.addresses import link, places_in
+from runner.service.addresses import link, places_in, step_in
 from runner.service.api.comparing import MAX_SCORES, found_runs
 from runner.service.api.reading import AxisName
 from runner.service.dependencies import CatalogueOf, ComputationOf
@@ -184,10 +184,10 @@ async def replay(
 ) -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
     if at:
-        step = StepRef.parse(at)
+        step = step_in(at)
     else:
         first = (await compute.shown(ShownDifference, fragments.difference, *runs)).first_frame
-        step = StepRef.parse(first) if first else StepRef(0)
+        step = EpisodeRef.parse(first) if first else EpisodeRef(0)
     names, places = [each.run_id for each in runs], places_in(runs, step)
 
     def neighbour(by: int) -> str:
@@ -200,12 +200,11 @@ async def replay(
         for one, place in zip(head.runs, places, strict=True):
             source = f"/api/v1/runs/{one.head.id}/replay/{place.episode_path}"
             with open_recording(one.recording) as recording:
-                phase = "train" if place.after is None else "eval"
-                shown.append(panel_of(recording, phase, source, one.label, one.number))
+                shown.append(panel_of(recording, place.phase, source, one.label, one.number))
         values = {
             "compared": head,
             "shown": shown,
-            "episode": step.episode_name,
+            "episode": step.heading,
             "prefix": step.episode_text,
             "t": step.t,
             "before": neighbour(-1),

@@ -9,10 +9,10 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.step_reference import StepRef
 from runner.debugging.expressions import MAX_CHARACTERS
 from runner.errors import RunnerError
 from runner.service import fragments
+from runner.service.addresses import step_in
 from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, OpenRecording, RecordedRun
@@ -92,7 +92,7 @@ async def what_if(
     t: T | None = None,
 ) -> Response:
     """Show where each joint action leads, and the replay of one: the recorded one unless it is named."""
-    step = StepRef.parse(at)
+    step = step_in(at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
     branches = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
@@ -100,7 +100,7 @@ async def what_if(
     def show() -> Response:
         values = {
             "at": str(step),
-            "title": f"What if? {step.episode_name}, step {step.t:,}",
+            "title": f"What if? {step.heading}, step {step.t:,}",
             "found": branches,
             "stage": stage_of(branches.part, shown_t),
             "source": f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",

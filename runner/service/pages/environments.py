@@ -8,14 +8,12 @@ from typing import Final
 
 from fastapi import APIRouter, Depends, Request, Response
 
-from runner.analysis.step_reference import StepRef
-from runner.export.episodes import EpisodePlace, place_of
+from runner.analysis.episodes import EpisodeRef
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.dependencies import EPISODES, RecordedRun
 from runner.service.pages.frame import run_page
 from runner.service.pages.replay import T, panel_of
-from runner.util.humanize import capitalised
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 
@@ -23,12 +21,12 @@ MAX_PANELS: Final = 8
 """Environments of a vector that a page shows side by side."""
 
 
-def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
+def _add_route(path: str, episode: Callable[..., EpisodeRef]) -> None:
     @router.get(f"{path}/environments")
     def environments(
         request: Request,
         run: RecordedRun,
-        at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
+        at: EpisodeRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
         t: T = 0,
     ) -> Response:
         """Show all environments of a vector during an episode of one of them."""
@@ -40,22 +38,22 @@ for _path, _episode in EPISODES.items():
     _add_route(_path, _episode)
 
 
-def _environments(run: Run, at: StepRef) -> dict[str, object]:
+def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
     """Return the values of the page of an episode and those of the other environments at its first step."""
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
-        place = place_of(recording, at.which)
-        span = recording.phase(place.phase).episode_span(place.number)
+        shown = at.number_in(recording)
+        span = recording.phase(at.phase).episode_span(shown)
         # Trials are numbered within their evaluation, whose first one this is.
-        first = place.number - at.episode
+        first = shown - at.episode
         panels = []
-        for environment, number in _episodes_at(recording, place, span)[:MAX_PANELS]:
-            own = recording.phase(place.phase).episode_span(number)
+        for environment, number in _episodes_at(recording, at.phase, shown, span)[:MAX_PANELS]:
+            own = recording.phase(at.phase).episode_span(number)
             path = replace(at, episode=number - first, t=0).episode_path
             name = "trial" if at.after is not None else "episode"
             panel = panel_of(
                 recording,
-                place.phase,
+                at.phase,
                 f"/api/v1{base}/{path}",
                 f"Environment {environment}: {name} {number - first:,}",
                 offset=own.start // own.step - span.start // span.step,
@@ -63,7 +61,7 @@ def _environments(run: Run, at: StepRef) -> dict[str, object]:
             )
             panels.append(panel)
         return {
-            "title": capitalised(place.title),
+            "title": at.heading,
             "alone": f"{base}/{at.episode_path}",  # the replay of the episode alone
             "shown": panels,
             "length": len(span),
@@ -72,11 +70,11 @@ def _environments(run: Run, at: StepRef) -> dict[str, object]:
         }
 
 
-def _episodes_at(recording: Recording, place: EpisodePlace, span: range) -> list[tuple[int, int]]:
+def _episodes_at(recording: Recording, phase: str, episode: int, span: range) -> list[tuple[int, int]]:
     """Return each environment and the number of its episode at the first step of another one, if it ended."""
-    episodes, n = recording.phase(place.phase).episodes, span.step
+    episodes, n = recording.phase(phase).episodes, span.step
     begin = span.start // n * n
-    by_environment = {span.start % n: place.number}
+    by_environment = {span.start % n: episode}
     for block in episodes.blocks(episodes.first_from("last_step", begin)):
         for last, number in zip(block["last_step"].tolist(), block["episode"].tolist(), strict=True):
             if last >= begin:

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.debugging.explain import DEFAULT_SEEDS
 from runner.debugging.explanation import Explanation, plots, sections
 from runner.errors import RunnerError
@@ -64,6 +64,6 @@ def _links(found: Explanation) -> list[Link]:
     first = found.first_step
     if first is None or first.episode is None:
         return []
-    step = StepRef(first.episode, first.t or 0)
+    step = EpisodeRef(first.episode, first.t or 0)
     runs = (("without", first.run_a), ("with", first.run_b))
     return [Link(f"Replay {word} {first.setting}", step.replay_address(run)) for word, run in runs]

@@ -14,8 +14,8 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.episodes import EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
-from runner.analysis.step_reference import StepRef, reference_to
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.encoded import picture_note
@@ -106,12 +106,12 @@ async def chosen_replay(
 ) -> Response:
     """Redirect to the episode that a form names, or to a typical one."""
     if phase == "train":
-        place = f"train/{_whole(episode)}"
+        path = EpisodeRef(_whole(episode)).episode_path
     elif phase == "eval" and after:
-        place = f"eval/{_whole(after)}/{_whole(trial)}"
+        path = EpisodeRef(_whole(trial), after=_whole(after)).episode_path
     else:
-        place = (await compute(fragments.typical_episode, run.recording)).decode()
-    return RedirectResponse(f"/runs/{run.run_id}/replay/{place}", HTTPStatus.FOUND)
+        path = (await compute(fragments.typical_episode, run.recording)).decode()
+    return RedirectResponse(f"/runs/{run.run_id}/replay/{path}", HTTPStatus.FOUND)
 
 
 @router.get("/latest")
@@ -142,7 +142,7 @@ async def latest(
     return await run_in_threadpool(show)
 
 
-def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
+def _add_route(path: str, episode: Callable[..., EpisodeRef]) -> None:
     @router.get(path)
     async def replay(
         request: Request,
@@ -150,7 +150,7 @@ def _add_route(path: str, episode: Callable[..., StepRef]) -> None:
         compute: ComputationOf,
         streams: PicturesOf,
         catalogue: CatalogueOf,
-        at: StepRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
+        at: EpisodeRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
         t: T = 0,
     ) -> Response:
         """Show a step of an episode."""
@@ -195,7 +195,7 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
 
 
 def _values(
-    run: Run, at: StepRef, branches: list[Link], stage: Stage | None, problem: str = ""
+    run: Run, at: EpisodeRef, branches: list[Link], stage: Stage | None, problem: str = ""
 ) -> dict[str, object]:
     with open_recording(run.recording) as recording:
         episodes = recording.train.episodes.count()
@@ -211,7 +211,7 @@ def _values(
         return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, at.episode) else ""
 
     return {
-        "which": at.which,
+        "at": at,
         "stage": stage,
         "problem": problem,
         "episodes": episodes,
@@ -219,8 +219,6 @@ def _values(
         "before": neighbour(at.episode - 1),
         "after": neighbour(at.episode + 1),
         "source": f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
-        "reference": at.episode_text,
-        "episode_path": at.episode_path,
         "environments": environments,
         "what_if": f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
         "branches": branches,

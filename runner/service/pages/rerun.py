@@ -18,10 +18,9 @@ from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
 
-from runner.analysis.step_reference import StepRef
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
-from runner.service.addresses import link
+from runner.service.addresses import link, step_in
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
 from runner.service.pages.frame import run_page
@@ -45,8 +44,8 @@ _SECONDS: Final = 60
 @router.get("/runs/{run}/rerun")
 def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the Rerun viewer, opened at a step."""
-    step = StepRef.parse(at) if at else None
-    content = f"{step.episode_name}, step {step.t}." if step else OVERVIEW
+    step = step_in(at) if at else None
+    content = f"{step.heading}, step {step.t}." if step else OVERVIEW
     back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
     values = {"content": content, "back": back, "frame": frame}
@@ -58,7 +57,7 @@ async def frame(
     request: Request, run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show the viewer alone, opened at a step."""
-    step = StepRef.parse(at) if at else None
+    step = step_in(at) if at else None
     place = json.loads(await compute(fragments.viewer_place, run, step))
     query: dict[str, object] = {}
     if step:

@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner
 
 import runner
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluations_of
-from runner.analysis.step_reference import StepRef
 from runner.cli import cli
 from runner.debugging.what_if import branched, what_if_in
 from runner.errors import ConfigError, RecordingError, RunnerError
@@ -54,7 +54,7 @@ def trials(recording):
     """Yield the phase's number of each trial, and its reference."""
     for evaluation in evaluations_of(recording):
         for number in range(evaluation.start, evaluation.stop):
-            yield number, StepRef(number - evaluation.start, after=evaluation.after)
+            yield number, EpisodeRef(number - evaluation.start, after=evaluation.after)
 
 
 def steps_at(length):
@@ -68,7 +68,7 @@ def test_the_recorded_action_of_a_trial_leads_exactly_where_it_did(run):
             steps = recording.eval.episode_steps(number)
             (record,) = recording.eval.episodes.array(number, number + 1)
             for t in steps_at(len(steps)):
-                at = StepRef(place.episode, t, place.after)
+                at = EpisodeRef(place.episode, t, place.after)
                 found = branched(recording, at, int(steps[t]["action"]))
                 assert found.steps.tobytes() == steps.tobytes()
                 assert found.outcome.returns == tuple(record["returns"].tolist())
@@ -81,7 +81,7 @@ def test_each_action_leads_where_its_own_episode_says(run):
     with open_recording(run.recording) as recording:
         number, place = list(trials(recording))[-1]
         steps = recording.eval.episode_steps(number)
-        at = StepRef(place.episode, len(steps) // 2, place.after)
+        at = EpisodeRef(place.episode, len(steps) // 2, place.after)
         found = what_if_in(recording, at)
         assert sorted(row.action for row in found.actions) == list(range(recording.mdp.joint_actions))
         before = steps["rewards"][: at.t].sum(axis=0)
@@ -104,7 +104,7 @@ def test_training_is_played_on_with_the_same_draws(run):
         for episode in (0, 7, recording.config["episodes"] - 1):
             steps = recording.train.episode_steps(episode)
             for t in steps_at(len(steps)):
-                played = branched(recording, StepRef(episode, t), int(steps[t]["action"])).steps[t:]
+                played = branched(recording, EpisodeRef(episode, t), int(steps[t]["action"])).steps[t:]
                 common = min(len(played), len(steps) - t)
                 known = slice(t, t + common)
                 assert (played["explored"][:common] == steps["explored"][known]).all()
@@ -268,7 +268,7 @@ def test_a_damaged_step_is_refused(taxis, tmp_path):
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(data)
     with open_recording(damaged) as recording, pytest.raises(RecordingError):
-        list(map(what_if_in, [recording] * 60, map(StepRef, range(60))))
+        list(map(what_if_in, [recording] * 60, map(EpisodeRef, range(60))))
 
 
 def test_the_command_prints_a_table_and_json(taxis):

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 import runner
 from runner.analysis.diff import diff
 from runner.analysis.diff.sections import summary
-from runner.analysis.step_reference import reference_to, training_step
+from runner.analysis.episodes import reference_to, training_step
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.config.job import Job
@@ -176,7 +176,7 @@ def test_draws_that_the_change_does_not_touch_are_the_same(parent, tmp_path):
 def test_a_joint_action_is_named_or_numbered(parent_of, tmp_path):
     run = parent_of("cooperative", "q_learning")
     with open_recording(run.recording) as recording:
-        step = training_step(recording, runner.analysis.step_reference.StepRef(3, 4))
+        step = training_step(recording, runner.analysis.episodes.EpisodeRef(3, 4))
     branches = [
         branch_training(run, at=at, action=action, recordings=tmp_path)
         for at, action in (("3:4", "north + drop-off"), (step, {"taxi 1": "north", "taxi_2": "drop_off"}))

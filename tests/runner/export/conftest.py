@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 import runner
+from runner.analysis.episodes import EpisodeRef
 from runner.export.reports.report import render_report
 from runner.recording.reader import open_recording
 
@@ -41,7 +42,7 @@ def page_of(pictured):
 
     def page(world):
         if world not in made:
-            chosen = [(7,), (30,)]
+            chosen = [EpisodeRef(7), EpisodeRef(30)]
             made[world] = render_report([pictured(world).recording], chosen)[0]
         return made[world]
 

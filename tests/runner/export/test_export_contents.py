@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from runner.export.contents import shortcomings
+from runner.analysis.contents import shortcomings
 from runner.recording.reader import Recording, open_recording
 
 

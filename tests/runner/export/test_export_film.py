@@ -18,10 +18,10 @@ from click.testing import CliRunner
 from PIL import Image
 
 import runner
+from runner.analysis.episodes import EpisodeRef, ranked_episodes
 from runner.cli import cli
 from runner.errors import RunnerError
 from runner.export.encoder import FORMATS, Encoder
-from runner.export.episodes import ranked_episodes, typical_trial
 from runner.export.pictures import Pictures
 from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise
@@ -311,11 +311,12 @@ def test_without_a_choice_it_is_the_median_trial(pictured, tmp_path):
     run = pictured("lake")
     result = film(run.recording, "-o", tmp_path / "film.gif")
     with open_recording(run.recording) as recording:
-        after, number = typical_trial(recording)
+        typical = EpisodeRef.parse("typical").resolved(recording)
         records = recording.eval.episodes.array(12, 18)
-    assert f"trial {number} of the evaluation after {after} episodes" in result.stdout
+    assert f"trial {typical.episode} of the evaluation after 40 episodes" in result.stdout
+    assert typical.after == 40
     ranks = [(r["success"], r["returns"].sum(), -int(r["length"])) for r in records]
-    assert sorted(ranks)[3] == ranks[number]
+    assert sorted(ranks)[3] == ranks[typical.episode]
 
 
 def test_a_run_without_evaluations_shows_its_last_training_episode(pictured, tmp_path):

@@ -15,10 +15,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 import runner
+from runner.analysis.episodes import last_whole_evaluation, ranked_trials
 from runner.cli import cli
 from runner.drawing.svg import Drawing, trail_points, transform
 from runner.environments.naming import agent_actions_in_words, states_in_words
-from runner.export.episodes import ranked_trials
 from runner.export.reports.report import render_report
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording.reader import open_recording
@@ -45,13 +45,12 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
     page = page_of(recording.run["name"])
     episodes = data_of(page)
     titles = [episode["title"] for episode in episodes]
-    worst, _, best = ranked_trials(recording, 40)
+    worst, _, best = ranked_trials(recording, last_whole_evaluation(recording))
     assert titles[0] == "Chosen: training episode 7"
     assert any(
-        title.startswith(("Best trial", "Typical trial and best")) and f"trial {best} " in title
-        for title in titles
+        title.startswith(("Best trial", "Typical trial and best")) and best.title in title for title in titles
     )
-    assert any("worst trial" in title.lower() and f"trial {worst} " in title for title in titles)
+    assert any("worst trial" in title.lower() and worst.title in title for title in titles)
     steps, words = recording.train.episode_steps(7), states_in_words(recording.mdp)
     shown = episodes[0]
     (state,), (action,) = shown["texts"], shown["actions"]
@@ -173,8 +172,8 @@ def test_the_slider_is_moved_by_keys_and_shows_the_recorded_frames(opened, pictu
     driver = opened(world)
     with open_recording(pictured(world).recording) as recording:
         mdp, words = recording.mdp, states_in_words(recording.mdp)
-        _, typical, _ = ranked_trials(recording, 40)
-        steps = recording.eval.episode_steps(12 + typical)
+        _, typical, _ = ranked_trials(recording, last_whole_evaluation(recording))
+        steps = recording.eval.episode_steps(typical.number_in(recording))
     states = np.append(steps["state"], steps["next_state"][-1])
     places = Drawing(mdp.scene).places(mdp, states)
     choose = Select(driver.find_element(By.CSS_SELECTOR, ".episode"))

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.analysis.diff import diff
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
 from runner.export.rerun.location import locate, locate_divergence
@@ -72,16 +72,16 @@ class TestSelection:
 
     def test_the_step_to_view_is_exported(self, pictured):
         run = pictured("rivals")
-        location = locate(run, Request(), StepRef(7, 2))
+        location = locate(run, Request(), EpisodeRef(7, 2))
         with open_recording(run.recording) as recording:
             step = recording.train.episode_steps(7)[2]
             spans = select(recording, location.request).train
         assert location.time == step["log_time"] // schema.STEP_NANOSECONDS
         assert any(span.start <= step["step"] < span.stop for span in spans)
         with pytest.raises(RecordingError, match="no t = 999"):
-            locate(run, Request(), StepRef(7, 999))
+            locate(run, Request(), EpisodeRef(7, 999))
         with pytest.raises(RecordingError, match="no trial 6 "):
-            locate(run, Request(), StepRef(6, after=20))
+            locate(run, Request(), EpisodeRef(6, after=20))
 
 
 def test_an_environment_without_a_scene_is_reported(pictured):
@@ -153,7 +153,7 @@ class TestCommand:
     def test_texts_that_are_no_ranges(self, pictured, text):
         result = invoke("export", "rerun", pictured("lake").folder, "--episodes", text)
         assert result.exit_code == 2
-        assert "START:STOP" in result.output
+        assert "START..STOP" in result.output
 
     def test_rerun_is_needed(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "rerun", None)
@@ -183,7 +183,7 @@ class TestTwoRuns:
         with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
             divergence = diff(a, b).divergence
             record = next(a.train.steps.blocks(divergence.step, divergence.step + 1))[0]
-        assert step == StepRef(divergence.episode, divergence.t)
+        assert step == EpisodeRef(divergence.episode, divergence.t)
         assert f"training step {divergence.step:,}" in message
         location = locate(runs[0], Request(), step)
         assert location.time == record["log_time"] // schema.STEP_NANOSECONDS
@@ -207,7 +207,7 @@ class TestTwoRuns:
                         env.step(action)
             runs.append(env.run)
         step, message = locate_divergence(runs)
-        assert step == StepRef(2, 2)
+        assert step == EpisodeRef(2, 2)
         assert "training episode 2, at t = 2" in message
         assert locate(runs[0], Request(), step).time == 9
         assert locate_divergence([runs[0], runs[0]])[0] is None

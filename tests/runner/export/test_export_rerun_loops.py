@@ -13,7 +13,7 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 import runner
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.errors import RecordingError
 from runner.export.encoded import encoded_picture
 from runner.export.pictures import Pictures
@@ -153,11 +153,11 @@ def test_episodes_of_a_vector_are_selected_and_located(tmp_path):
         assert chosen.start % N == chosen.stop % N == 0
         assert chosen.stop - chosen.start < len(span) * N + N
         time = steps_of(recording)["log_time"][steps_of(recording)["step"] == span[2]]
-    assert locate(run, Request(), StepRef(4, 2, None)).time * schema.STEP_NANOSECONDS == time
+    assert locate(run, Request(), EpisodeRef(4, 2, None)).time * schema.STEP_NANOSECONDS == time
     with pytest.raises(RecordingError, match="found no t = 9999"):
-        locate(run, Request(), StepRef(4, 9999, None))
+        locate(run, Request(), EpisodeRef(4, 9999, None))
     with pytest.raises(RecordingError, match="no training episode 999"):
-        locate(run, Request(), StepRef(999, 0, None))
+        locate(run, Request(), EpisodeRef(999, 0, None))
 
 
 def picture_rows(exported, entity):
@@ -293,7 +293,7 @@ def test_evaluations_of_a_loop_are_selected_by_number(tmp_path, monkeypatch):
         assert not set(spans[0]) & {step for _, steps in chosen.evaluations for step in steps}
         with pytest.raises(RecordingError, match="found no evaluation after 7 episodes"):
             select(recording, Request(evaluations=(7,)))
-    assert locate(env.run, Request(), StepRef(0, 1, 0)).request.evaluations == (0,)
+    assert locate(env.run, Request(), EpisodeRef(0, 1, 0)).request.evaluations == (0,)
 
 
 def play_episode(env):

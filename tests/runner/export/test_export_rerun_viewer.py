@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import pytest
 from click.testing import CliRunner
 
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.cli import cli
 from runner.cli.commands import view
 from runner.errors import RunnerError, StorageError
@@ -47,7 +47,7 @@ def drawn(path, step):
 
 def test_every_view_of_the_default_blueprint_is_drawn_without_an_error(pictured):
     run = pictured("rivals")
-    location = locate(run, Request(), StepRef(39, 3))
+    location = locate(run, Request(), EpisodeRef(39, 3))
     path, _ = cached_export([run], location.request)
     views = drawn(path, location.time)
     maps = {f"taxi {i}: max Q, greedy moves" for i in (1, 2)}

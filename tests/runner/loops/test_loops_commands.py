@@ -12,9 +12,9 @@ import pytest
 from starlette.testclient import TestClient
 
 import runner
+from runner.analysis.contents import shortcomings
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.series import read_series
-from runner.export.contents import shortcomings
 from runner.recording.reader import open_recording
 from runner.recording.run_file import Summary
 from runner.service.app import create_app

@@ -14,8 +14,8 @@ from gymnasium.vector import SyncVectorEnv
 from making import Leaving, dualtaxi
 
 import runner
+from runner.analysis.contents import shortcomings
 from runner.errors import RunnerError
-from runner.export.contents import shortcomings
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
 

@@ -11,7 +11,7 @@ from selenium.webdriver.common.keys import Keys
 from served import Served, wait
 
 import runner
-from runner.analysis.step_reference import StepRef
+from runner.analysis.episodes import EpisodeRef
 from runner.debugging.what_if import branched
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
@@ -35,7 +35,7 @@ def test_the_api_returns_what_python_does(client, recordings):
     one = client.get(API, params={"action": ["north+east", "3"]}).json()["actions"]
     assert one == [row for row in expected["actions"] if row["name"] in ("north + east", "south + west")]
     with open_recording(run.recording) as recording:
-        branch = branched(recording, StepRef.parse(AT), "north + east")
+        branch = branched(recording, EpisodeRef.parse(AT), "north + east")
     part = client.get(f"{API}/north + east", params={"start": 1, "steps": 4}).json()["episode"]
     assert part["length"] == branch.outcome.length
     assert [reward for (reward,) in part["reward"]] == branch.steps["rewards"][0:4, 0].tolist()

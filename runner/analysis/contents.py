@@ -28,8 +28,6 @@ ENDINGS: Final = {
 
 Step = np.void | Message
 """A step: a record, or the fields of a message where values vary in size."""
-Ranges = tuple[tuple[int, int | None], ...]
-"""Ranges of episodes: the first, and the one after the last or None for the end."""
 
 
 def shortcomings(recording: Recording) -> list[str]:
@@ -93,8 +91,8 @@ def whole_ranges(
     for start, stop in whole:
         if not start < stop <= count:
             raise NotInRecording(
-                f"{where}: found no {schema.PHASE_NAMES[phase]} episodes {start}:{stop}; "
-                f"there are {count:,}, from 0. Ranges are START:STOP, STOP not included."
+                f"{where}: found no {schema.PHASE_NAMES[phase]} episodes {start}..{stop}; "
+                f"there are {count:,}, from 0. Ranges are START..STOP, STOP not included."
             )
     return whole
 

@@ -1,0 +1,307 @@
+"""Which episode of a recording, and which of its steps: one reference, and one grammar for all forms.
+
+120:5 or train:120:5      step 5 of training episode 120; `120` is its first step
+eval:3000:17:5            step 5 of trial 17 of the evaluation after 3,000 training episodes;
+`eval:3000` is the first step of its first trial
+step:100000               a training step by its number, counted over the run; of runs that were trained here
+typical, best, worst      the episode that a page or film shows first, or the extremes by success and return;
+`last` is the last training episode that ended; `:T` may follow
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.analysis.contents import require_steps
+from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
+from runner.errors import NotInRecording, RecordingError, RunnerError
+from runner.replay.steps import check_steps, step_of_episode, steps_of
+from runner.util.humanize import capitalised
+
+if TYPE_CHECKING:
+    from runner.recording.reader import Recording
+
+EXPECTED_OF_TRAINING: Final = "EPISODE:T such as 120:5, or step:N, a training step by its number"
+EXPECTED: Final = (
+    "EPISODE:T such as 120:5, step:N, or eval:N:TRIAL:T, where a TRIAL or T that is left out is 0; or "
+    "typical, best, worst or last"
+)
+STEP: Final = "step"
+"""The word of a reference that has only the number of a training step, as its `t`."""
+TYPICAL: Final = "typical"
+BEST: Final = "best"
+UNKNOWN_EVALUATION: Final = -1
+"""Stands for an evaluation that was cut off: its trials are counted over the phase."""
+
+_NUMBER: Final = "([0-9]{1,15})"
+_TRAINING: Final = re.compile(f"(?:train:)?{_NUMBER}(?::{_NUMBER})?")
+_EVALUATION: Final = re.compile(f"eval:{_NUMBER}(?::{_NUMBER})?(?::{_NUMBER})?")
+_WORD: Final = re.compile(f"(?:(step)(?=:)|({TYPICAL}|{BEST}|worst|last))(?::{_NUMBER})?")
+
+
+@dataclass(frozen=True)
+class EpisodeRef:
+    """A training episode or a trial of an evaluation, and one of its steps."""
+
+    episode: int = 0
+    """The training episode, or the trial within its evaluation."""
+    t: int = 0
+    after: int | None = None
+    """The training episodes before the evaluation; None for a training episode."""
+    word: str = ""
+    """What stands for the episode until it is looked up in a recording, see `resolved`."""
+
+    @classmethod
+    def parse(cls, at: str | int | Self, expected: str = EXPECTED) -> Self:
+        """Return the reference that a text or the number of a training step is.
+
+        Args:
+            at: the text or the number; a reference is returned as it is.
+            expected: what an error says that was expected.
+
+        Raises:
+            RunnerError: the text is no reference.
+        """
+        if isinstance(at, cls):
+            return at
+        if isinstance(at, int):
+            return cls(t=at, word=STEP)
+        if match := _TRAINING.fullmatch(str(at)):
+            episode, t = (int(part or 0) for part in match.groups())
+            return cls(episode, t)
+        if match := _EVALUATION.fullmatch(str(at)):
+            after, trial, t = (int(part or 0) for part in match.groups())
+            return cls(trial, t, after)
+        if match := _WORD.fullmatch(str(at)):
+            return cls(t=int(match[3] or 0), word=match[1] or match[2])
+        raise RunnerError(f"found {str(at)[:60]!r}, expected {expected}.")
+
+    def __str__(self) -> str:
+        """Return the text that `parse` takes."""
+        return f"{self.episode_text}:{self.t}"
+
+    @property
+    def phase(self) -> Literal["train", "eval"]:
+        """The phase of the episode."""
+        return "train" if self.after is None else "eval"
+
+    @property
+    def episode_text(self) -> str:
+        """The part of the text that names the episode: all without the `:T`."""
+        return self.word or (str(self.episode) if self.after is None else f"eval:{self.after}:{self.episode}")
+
+    @property
+    def episode_path(self) -> str:
+        """The address of the episode, below that of its run's replay: `train/120`, `eval/3000/17`."""
+        return f"train/{self.episode}" if self.after is None else f"eval/{self.after}/{self.episode}"
+
+    @property
+    def title(self) -> str:
+        """The name of the episode, within a sentence."""
+        if self.after is None:
+            return f"training episode {self.episode:,}"
+        if self.after == UNKNOWN_EVALUATION:
+            return f"evaluation episode {self.episode:,}"
+        return f"trial {self.episode:,} of the evaluation after {self.after:,} episodes"
+
+    @property
+    def heading(self) -> str:
+        """The name of the episode as a title."""
+        return capitalised(self.title)
+
+    @property
+    def outcome(self) -> EpisodeRef:
+        """The frame after the step, which shows its outcome."""
+        return replace(self, t=self.t + 1)
+
+    def replay_address(self, run_id: str) -> str:
+        """Return the page of the replay of a run at the frame after the step."""
+        return f"/runs/{run_id}/replay/{self.episode_path}?t={self.outcome.t}"
+
+    def resolved(self, recording: Recording) -> EpisodeRef:
+        """Return the reference with an episode of a recording in place of a word.
+
+        Raises:
+            RecordingError: the recording has no such episode.
+        """
+        if not self.word:
+            return self
+        if self.word == STEP:
+            return reference_to(recording, training_step(recording, self))
+        return replace(_episode_named(recording, self.word), t=self.t)
+
+    def evaluation_in(self, recording: Recording) -> Evaluation:
+        """Return the evaluation of a trial.
+
+        Raises:
+            NotInRecording: there is none after so many training episodes.
+        """
+        return evaluation_after(evaluations_of(recording), self.after or 0, str(recording.path))
+
+    def number_in(self, recording: Recording) -> int:
+        """Return the number of the episode, counted over its phase.
+
+        Raises:
+            NotInRecording: there is no such evaluation or trial.
+        """
+        if self.after in (None, UNKNOWN_EVALUATION):
+            return self.episode
+        return self.evaluation_in(recording).trial(self.episode, str(recording.path))
+
+    def no_step(self, recording: Recording, steps: int, t: int, part: str = "") -> NotInRecording:
+        """Return the error that the episode, or a `part` of it, has `steps` steps and thus no step `t`."""
+        return NotInRecording(
+            f"{recording.path}: {part}{self.title} has {steps:,} steps, from 0; found no step {t:,}."
+        )
+
+
+# --- training steps ---------------------------------------------------------------------------------------
+
+
+def training_steps(recording: Recording) -> int:
+    """Return the number of training steps of a job, also if they were not recorded."""
+    ended = step_of_episode(recording, recording.train.episodes.count())
+    return max(recording.done()["train_steps"], ended)
+
+
+def training_step(recording: Recording, at: EpisodeRef) -> int:
+    """Return the number of a training step of a job, also of one that recorded no steps.
+
+    Raises:
+        RunnerError: the reference is to a step of an evaluation.
+    """
+    taken = training_steps(recording)
+    if at.word == STEP:
+        if not 0 <= at.t < taken:
+            raise NotInRecording(
+                f"{recording.path}: found no training step {at.t:,}; there are {taken:,}, from 0 to "
+                f"{taken - 1:,}."
+            )
+        return at.t
+    at = at.resolved(recording)
+    if at.after is not None:
+        raise RunnerError(f"found {at}, expected a step of training: {EXPECTED_OF_TRAINING}.")
+    ended = recording.train.episodes.count()
+    start = step_of_episode(recording, min(at.episode, ended))
+    stop = taken if at.episode >= ended else step_of_episode(recording, at.episode + 1)
+    if at.episode > ended or start == stop:
+        raise NotInRecording(
+            f"{recording.path}: found no training episode {at.episode:,}; there are {ended:,}, from 0."
+        )
+    if start + at.t >= stop:
+        raise NotInRecording(
+            f"{recording.path}: found no step {at.t:,} of training episode {at.episode:,}, which has "
+            f"{stop - start:,}, from 0."
+        )
+    return start + at.t
+
+
+def reference_to(recording: Recording, step: int) -> EpisodeRef:
+    """Return the reference to a training step of a job, by its episode and its place in it."""
+    episode = recording.train.episodes.first_from("last_step", step)
+    return EpisodeRef(episode, step - step_of_episode(recording, episode))
+
+
+def first_state(recording: Recording, at: EpisodeRef) -> int:
+    """Return the state in which an episode of a tabular environment begins."""
+    require_steps(recording, "show", may_redo=True)
+    steps = steps_of(recording, at.phase, at.number_in(recording))[:1]
+    check_steps(steps, recording.mdp, str(recording.path))
+    return int(steps["state"][0])
+
+
+# --- the episodes that words stand for --------------------------------------------------------------------
+
+
+def _episode_named(recording: Recording, word: str) -> EpisodeRef:
+    """Return the episode that a word stands for.
+
+    The typical one is the typical trial of the last whole evaluation; of a loop, where the number of trials
+    of an evaluation is unknown, the first trial after the last training. Without such a trial it is the
+    last training episode.
+    """
+    require_steps(recording, "show", may_redo=True)
+    last = EpisodeRef(max(0, recording.train.episodes.count() - 1))
+    if word not in ("last", TYPICAL):
+        phase, ranked = ranked_episodes(recording)
+        return references(recording, phase, ranked[[-1 if word == BEST else 0]])[0]
+    if word == TYPICAL and recording.eval.has_metrics:
+        evaluation = last_whole_evaluation(recording)
+        return last if evaluation is None else ranked_trials(recording, evaluation)[1]
+    evaluations = evaluations_of(recording) if word == TYPICAL else []
+    return EpisodeRef(after=evaluations[-1].after) if evaluations else last
+
+
+def references(
+    recording: Recording, phase: str, numbers: Sequence[int] | NDArray[np.int64]
+) -> list[EpisodeRef]:
+    """Return the references to episodes, counted over their phase; trials are counted in their evaluation."""
+    if phase == "train":
+        return [EpisodeRef(int(number)) for number in numbers]
+    evaluations = evaluations_of(recording)
+    at = np.searchsorted([one.stop for one in evaluations], numbers, side="right").tolist()
+    return [
+        EpisodeRef(int(number), after=UNKNOWN_EVALUATION)
+        if index == len(evaluations) or number < evaluations[index].start
+        else EpisodeRef(int(number) - evaluations[index].start, after=evaluations[index].after)
+        for number, index in zip(numbers, at, strict=True)
+    ]
+
+
+def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
+    """Return the phase and the numbers of its episodes from worst to best: by success, return and length.
+
+    They are the trials of all evaluations; of a run without trials the training episodes.
+
+    Raises:
+        RecordingError: no episode ended, or there are no steps.
+    """
+    require_steps(recording, "show", may_redo=True)
+    phase = "eval" if recording.eval.episodes.count() else "train"
+    records = recording.phase(phase).episodes.array()
+    records = records[records["last_step"] < recording.phase(phase).steps.total()]
+    if not len(records):
+        raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
+    return phase, _by_rank(records)
+
+
+def ranked_trials(recording: Recording, evaluation: Evaluation) -> list[EpisodeRef]:
+    """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
+    return ranked(recording, "eval", evaluation.start, evaluation.stop)
+
+
+def ranked(recording: Recording, phase: str, start: int, stop: int) -> list[EpisodeRef]:
+    """Return the worst, the median and the best of some episodes: by success, return and length."""
+    numbers = _by_rank(recording.phase(phase).episodes.array(start, stop))
+    return references(recording, phase, numbers[[0, len(numbers) // 2, -1]])
+
+
+def _by_rank(records: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the numbers of episodes from worst to best; a return that is no number is the worst."""
+    with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
+        returns = records["returns"].sum(axis=1)
+    returns[np.isnan(returns)] = -np.inf
+    order = np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
+    return records["episode"][order].astype(np.int64)
+
+
+def last_whole_evaluation(recording: Recording) -> Evaluation | None:
+    """Return the last evaluation of which all trials were recorded; None if there is none.
+
+    A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
+    loop are the trials that were recorded.
+    """
+    episodes, steps = recording.eval.episodes.count(), recording.eval.steps.total()
+    for one in reversed(evaluations_of(recording)):
+        if (
+            one.stop <= episodes
+            and recording.eval.episodes.array(one.stop - 1, one.stop)[0]["last_step"] < steps
+        ):
+            return one
+    return None

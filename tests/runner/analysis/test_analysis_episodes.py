@@ -1,0 +1,57 @@
+"""One grammar for references to steps, of commands and pages."""
+
+from __future__ import annotations
+
+import pytest
+
+from runner.analysis.episodes import EpisodeRef
+from runner.errors import RunnerError
+
+
+@pytest.mark.parametrize(
+    ("text", "step"),
+    [
+        ("120", EpisodeRef(120)),
+        ("train:120", EpisodeRef(120)),
+        ("train:120:5", EpisodeRef(120, 5)),
+        ("120:5", EpisodeRef(120, 5)),
+        ("eval:3000", EpisodeRef(0, after=3000)),
+        ("eval:3000:17", EpisodeRef(17, after=3000)),
+        ("eval:3000:17:5", EpisodeRef(17, 5, 3000)),
+        ("best", EpisodeRef(word="best")),
+        ("last:5", EpisodeRef(t=5, word="last")),
+    ],
+)
+def test_what_is_left_out_is_0(text, step):
+    assert EpisodeRef.parse(text) == step
+    assert EpisodeRef.parse(str(step)) == step
+
+
+def test_a_training_step_by_its_number_is_named_as_such():
+    assert EpisodeRef.parse("step:120") == EpisodeRef.parse(120) == EpisodeRef(t=120, word="step")
+    assert str(EpisodeRef.parse("step:120")) == "step:120"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "x",
+        "step:",
+        "step:1:2",
+        "1:",
+        ":5",
+        "1:2:3",
+        "bestest",
+        "train:",
+        "eval:",
+        "eval:1:2:3:4",
+        "-1",
+        "1_0",
+        "٣",
+        " 1",
+    ],
+)
+def test_anything_else_is_refused_with_what_is_expected(text):
+    with pytest.raises(RunnerError, match="expected EPISODE:T such as 120:5, step:N, or eval:N:TRIAL:T"):
+        EpisodeRef.parse(text)
