@@ -31,6 +31,7 @@ ORDER = """
     loops
     integrations
     debugging
+    views
     golden
     service
     api

@@ -120,9 +120,14 @@ class EpisodeRef:
         """The frame after the step, which shows its outcome."""
         return replace(self, t=self.t + 1)
 
+    @property
+    def replay(self) -> str:
+        """The address of the replay at the frame after the step, below that of the run."""
+        return f"replay/{self.episode_path}?t={self.outcome.t}"
+
     def replay_address(self, run_id: str) -> str:
-        """Return the page of the replay of a run at the frame after the step."""
-        return f"/runs/{run_id}/replay/{self.episode_path}?t={self.outcome.t}"
+        """Return the address of the replay of a run at the frame after the step."""
+        return f"/runs/{run_id}/{self.replay}"
 
     def resolved(self, recording: Recording) -> EpisodeRef:
         """Return the reference with an episode of a recording in place of a word.

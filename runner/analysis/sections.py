@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from typing import Final
@@ -20,6 +20,10 @@ class Grid:
 
     headings: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
+    title: str = ""
+    """What a page calls it, where the section has another one."""
+    links: Sequence[str] = ()
+    """What each row is about: an address below that of the run."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:
@@ -40,6 +44,13 @@ class Section:
     grids: list[Grid] = field(default_factory=list)
     diffs: list[list[str]] = field(default_factory=list)
     """Unified diffs, each as its lines."""
+    facts: Mapping[str, str] = field(default_factory=dict)
+    """Names and values, alone in their section."""
+    figure: str = ""
+    """A picture as SVG, and its caption."""
+    caption: str = ""
+    replay: str = ""
+    """A step to look at: the address of its replay, below that of the run."""
 
     @property
     def anchor(self) -> str:
@@ -51,6 +62,8 @@ def markdown(made: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of sections in Markdown."""
     for section in made:
         yield from (f"## {section.title}", "")
+        yield from (f"- {name}: {text}" for name, text in section.facts.items())
+        yield from [""] * bool(section.facts)
         for sentence in section.sentences:
             yield from (sentence, "")
         for grid in section.grids:

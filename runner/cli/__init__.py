@@ -48,8 +48,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     },
     "Debug": {
         "branch": ("branch", "Change a recorded step, and see where that leads."),
-        "when": ("when", "Find the training steps after which something holds, such as a Q-value."),
-        "why": ("why", "Show the rewards and initial values that a Q-value is the sum of."),
+        "when": ("views", "Find the training steps after which something holds, such as a Q-value."),
+        "why": ("views", "Show the rewards and initial values that a Q-value is the sum of."),
         "explain": ("explain", "Find which settings make the difference between two runs."),
     },
     "Manage": {

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import click
@@ -45,10 +45,10 @@ def record(make: Callable[..., object]) -> Declared:
 class _Record:
     """What a function returns, given the values of the arguments and options that its parameters declare."""
 
-    def __init__(self, make: Callable[..., object]) -> None:
+    def __init__(self, make: Callable[..., object], declared: Mapping[str, Declared] | None = None) -> None:
         self._make = make
-        declared = inspect.signature(make).parameters.values()
-        self._declared = {parameter.name: parameter.default for parameter in declared}
+        parameters = inspect.signature(make).parameters.values()
+        self._declared = declared or {parameter.name: parameter.default for parameter in parameters}
 
     def parameters(self) -> Iterator[click.Parameter]:
         """Yield the arguments and options."""
@@ -73,10 +73,19 @@ def _with_examples(text: str | None) -> str | None:
 
 
 class Command(click.Command):
-    """A command of a function that declares its parameters; its help keeps the lines of its examples."""
+    """A command of a function; its help keeps the lines of its examples.
 
-    def __init__(self, name: str | None, callback: Callable[..., object], **attributes: Any) -> None:
-        call = _Record(callback)
+    The defaults of the function's parameters declare them, unless they are `declared`.
+    """
+
+    def __init__(
+        self,
+        name: str | None,
+        callback: Callable[..., object],
+        declared: Mapping[str, Declared] | None = None,
+        **attributes: Any,
+    ) -> None:
+        call = _Record(callback, declared)
         super().__init__(name, **attributes | {"callback": call, "params": list(call.parameters())})
         self.help = _with_examples(self.help)
 

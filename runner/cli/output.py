@@ -267,7 +267,7 @@ def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
         echo("\n".join(markdown(sections)))
         return
     for section in sections:
-        draw(title(section.title), *section.sentences)
+        draw(facts(section.facts) if section.facts else title(section.title), *section.sentences)
         for part in section.grids:
             draw(grid_table(part, shrinking=console().is_terminal))
         for lines in section.diffs:

@@ -123,6 +123,15 @@ class Why:
         del fields["picture"]
         return fields
 
+    @property
+    def step_to_look_at(self) -> EpisodeRef | None:
+        """The step that adds or takes most."""
+        return EpisodeRef.parse(self.steps[0].at) if self.steps else None
+
+    def sections(self) -> list[Section]:
+        """Return the value, and all parts of the sum."""
+        return [Section("The value", facts=facts_of(self)), *_parts_of(self)]
+
     def _repr_html_(self) -> str:
         return why_frame(self)
 
@@ -137,8 +146,7 @@ def facts_of(found: Why) -> dict[str, str]:
     }
 
 
-def sections_of(found: Why) -> list[Section]:
-    """Return all parts of the sum; the section of steps is the second one."""
+def _parts_of(found: Why) -> list[Section]:
     whole = found.rewarded.weight + found.initial.weight
 
     def cells(part: Part) -> tuple[str, str, str]:
@@ -164,6 +172,8 @@ def sections_of(found: Why) -> list[Section]:
         off = f"It differs from the table's value by {abs(found.total - found.value):.1g}, by rounding."
     headings = ("step", "state", "action", "reward", *columns, "steps away")
     steps = [_step(part, cells(part)) for part in found.steps]
+    links = [EpisodeRef.parse(part.at).replay for part in found.steps]
+    listed = [Grid(headings, steps, links=links)] if steps else []
     none = [] if steps else ["No reward adds to the value or takes from it."]
     episodes = [part for part in found.episodes if part.weight or part.contribution]
     without = len(found.episodes) - len(episodes)
@@ -172,9 +182,13 @@ def sections_of(found: Why) -> list[Section]:
     )
     return [
         Section(
-            "The sum", [off, EXPLANATION, *([found.note] if found.note else [])], [Grid(("", *columns), sums)]
+            "The sum",
+            [off, EXPLANATION, *([found.note] if found.note else [])],
+            [Grid(("", *columns), sums)],
+            figure=found.picture,
+            caption=KEY,
         ),
-        Section("The steps that add or take most", none, [Grid(headings, steps)] if steps else []),
+        Section("The steps that add or take most", none, listed),
         Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]),
         Section(
             "By episode",
@@ -194,29 +208,10 @@ def _step(part: StepPart, cells: tuple[str, str, str]) -> tuple[str, ...]:
     return part.at, f"{part.state}: {part.state_in_words}", action, reward, *cells, f"{part.distance:.1f}"
 
 
-def why_body(found: Why, linked: bool) -> str:
-    """Return the part of a page that shows a Q-value as a sum; linked, each step links to its replay."""
-    parts = partials()
-    whole, steps, *rest = sections_of(found)
-    steps_at = [EpisodeRef.parse(step.at) for step in found.steps]
-    links = [at.replay_address(found.run_id) for at in steps_at] if linked else []
-    picture = ""
-    if found.picture:
-        picture = f'<figure class="moves">{found.picture}<figcaption>{escape(KEY)}</figcaption></figure>'
-    first, *others = [parts.section(f"why-{k}", body.title, body) for k, body in enumerate([whole, *rest])]
-    listed = "".join(str(parts.grid(grid, steps.title, "list", links)) for grid in steps.grids)
-    return (
-        f'{parts.pairs("The value", facts_of(found))}<div class="why">{picture}<div>{first}</div></div>'
-        f'<section id="why-steps" class="words"><h2>{escape(steps.title)}</h2>'
-        f"{parts.paragraphs(steps.sentences)}{listed}</section>"
-        f"{''.join(map(str, others))}"
-    )
-
-
 def why_frame(found: Why) -> str:
     """Return a Q-value as a sum in a frame of its own; the value alone if packages are missing."""
     try:
-        page = f"<style>{page_style()}</style><main>{why_body(found, linked=False)}</main>"
+        page = f"<style>{page_style()}</style><main>{partials().answer(found.sections())}</main>"
     except MissingExtra as error:
         facts = "; ".join(f"{name} {text}" for name, text in facts_of(found).items())
         return f"<p>{escape(facts)}</p><p>{escape(str(error))}</p>"

@@ -112,8 +112,17 @@ class When:
                 moment |= {"at": str(at), "replay": at.replay_address(self.run_id)}
         return result
 
+    @property
+    def step_to_look_at(self) -> EpisodeRef | None:
+        """The first step after which the expression holds."""
+        return None if self.first is None else self.first.at
+
+    def sections(self) -> list[Section]:
+        """Return the result as sentences and tables: the first moment, and the intervals."""
+        return [_section_of(self)]
+
     def _repr_html_(self) -> str:
-        return html([section_of(self)])
+        return html(self.sections())
 
 
 def when(
@@ -275,8 +284,7 @@ def _step_number(recording: Recording, at: int | str | EpisodeRef) -> int:
 # --- as text ----------------------------------------------------------------------------------------------
 
 
-def section_of(found: When) -> Section:
-    """Return a result as sentences and tables: the first moment, and the intervals."""
+def _section_of(found: When) -> Section:
     first, last = found.searched
     sentences = [f"State {number}: {name}." for number, name in found.states]
     if found.first is None:
@@ -297,7 +305,7 @@ def section_of(found: When) -> Section:
         grids.append(_intervals_grid(found.intervals, last))
         if len(found.intervals) < found.count:
             sentences.append(f"The first {len(found.intervals):,} intervals are listed.")
-    return Section(found.expression, sentences, grids)
+    return Section(found.expression, sentences, grids, replay=found.first.at.replay)
 
 
 def _named(moment: Moment) -> str:
@@ -318,7 +326,8 @@ def _intervals_grid(intervals: Sequence[Interval], last: int) -> Grid:
         steps = (last + 1 if end is None else end.step) - each.start.step
         lost = (UNKNOWN, UNKNOWN) if end is None else (f"{end.step:,}", str(end.at))
         rows.append((f"{each.start.step:,}", str(each.start.at), *lost, f"{steps:,}"))
-    return Grid(("from step", "episode:t", "lost at step", "episode:t", "steps"), rows)
+    headings = ("from step", "episode:t", "lost at step", "episode:t", "steps")
+    return Grid(headings, rows, "Intervals", [each.start.at.replay for each in intervals])
 
 
 def _text(value: Scalar) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,21 +47,14 @@ from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service.errors import Refused
 from runner.util.extras import require
-from runner.util.values import Json, finite
+from runner.util.values import finite
+from runner.views.view import Answer
 
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
 RecordKind = Literal["evaluations", "training", "optimality"]
-
-
-class Answer(Protocol):
-    """What a question about a recording returns."""
-
-    def as_json(self) -> Json:
-        """Return it as JSON can hold it."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -255,10 +248,10 @@ def q_table(path: Path, step: int | None, episode: int | None, state: int | None
         return stream.getvalue()
 
 
-def answer(path: Path, question: Callable[..., Answer], *args: object) -> bytes:
+def answer(path: Path, question: Callable[..., Answer], values: tuple[tuple[str, object], ...]) -> bytes:
     """Return the answer to a question about a recording, as the command prints it with --json."""
     with open_recording(path) as recording:
-        return as_json(question(recording, *args).as_json())
+        return as_json(question(recording, **dict(values)).as_json())
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -20,13 +20,10 @@ from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.episodes import TYPICAL, EpisodeRef, first_state, last_whole_evaluation, ranked_trials
 from runner.analysis.histograms import histograms
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Grid
 from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
-from runner.debugging.q_value import why_body
 from runner.debugging.what_if import branch_playback, what_if_in
-from runner.debugging.when import section_of, when_in
-from runner.debugging.why import why_in
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action
 from runner.errors import RecordingError
@@ -52,6 +49,7 @@ from runner.runs.run import Run
 from runner.service.addresses import link, places_in
 from runner.service.computed import TABLE_NAME, as_json
 from runner.util.values import Json
+from runner.views.view import Answer
 
 MAX_OUTPUT_LINES: Final = 1000
 """Lines of output that a page shows."""
@@ -80,15 +78,6 @@ class ShownBranches:
     """The page of each action's branch."""
     part: Json
     """As for `episode_part`."""
-
-
-@dataclass(frozen=True)
-class ShownWhen:
-    """When an expression held."""
-
-    section: Section
-    replays: list[str]
-    """Address of the replay of each interval's first step."""
 
 
 @dataclass(frozen=True)
@@ -160,22 +149,11 @@ def what_if_page(run: Run, at: EpisodeRef, action: str | None, start: int, steps
         return as_json(shown)
 
 
-def when(
-    path: Path, expression: str, every: bool, first: str | None, last: str | None, intervals: int
-) -> bytes:
-    """Return `ShownWhen` as JSON, with at most some intervals."""
+def answer(path: Path, question: Callable[..., Answer], values: tuple[tuple[str, object], ...]) -> bytes:
+    """Return the answer to a question about a recording as HTML."""
     with open_recording(path) as recording:
-        result = when_in(recording, expression, every, first, last, limit=intervals)
-    replays = [each.start.at.replay_address(result.run_id) for each in result.intervals]
-    return as_json(ShownWhen(section_of(result), replays))
-
-
-def why(
-    path: Path, state: str | None, action: str | None, agent: str | None, at: str | None, limit: int
-) -> bytes:
-    """Return where a Q-value comes from, as HTML."""
-    with open_recording(path) as recording:
-        return why_body(why_in(recording, state, action, agent, at, limit), linked=True).encode()
+        sections = question(recording, **dict(values)).sections()
+        return str(partials().answer(sections, recording.run_id)).encode()
 
 
 def _branch_part(recording: Recording, at: EpisodeRef, action: str, start: int, steps: int) -> Json:

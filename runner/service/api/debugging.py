@@ -1,4 +1,4 @@
-"""What if, when and why: questions about how a run learned, answered from its recording."""
+"""What if another action had been taken: where each leads."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ from pydantic import BaseModel
 
 from runner.analysis.episodes import EXPECTED, EpisodeRef
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
-from runner.debugging.expressions import MAX_CHARACTERS
 from runner.debugging.what_if import what_if_in
-from runner.debugging.when import when_in
-from runner.debugging.why import LIMIT, MAX_LIMIT, why_in
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, Part, Start, Steps
 from runner.service.dependencies import ComputationOf, RecordedRun
@@ -26,22 +23,6 @@ router = APIRouter(
 )
 MAX_ACTIONS = 1000
 At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
-Expression = Annotated[
-    str, Query(max_length=MAX_CHARACTERS, description="A condition.", examples=["max(q[300]) > 20"])
-]
-StepText = Annotated[str | None, Query(max_length=40, description="A training step: EPISODE:T, or step:N.")]
-StateName = Annotated[
-    str | None, Query(max_length=1000, description="A state, by number or name; default: that of `at`.")
-]
-ActionName = Annotated[
-    str | None, Query(max_length=1000, description="An action, by number or name; default: that of `at`.")
-]
-AgentName = Annotated[
-    str | None, Query(max_length=200, description="The agent whose Q-table it is in, where each has its own.")
-]
-StepName = Annotated[
-    str | None, Query(max_length=60, description="The value before this step, EPISODE:T or eval:N:TRIAL:T.")
-]
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 
 
@@ -78,7 +59,10 @@ async def what_if(
 ) -> Response:
     """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
     return await compute.json(
-        computed.answer, run.recording, what_if_in, EpisodeRef.parse(at), tuple(action or ())
+        computed.answer,
+        run.recording,
+        what_if_in,
+        (("at", EpisodeRef.parse(at)), ("actions", tuple(action or ()))),
     )
 
 
@@ -96,41 +80,4 @@ async def branch(
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
     return await compute.json(
         fragments.branch_part, run.recording, EpisodeRef.parse(at), action, start, steps
-    )
-
-
-@router.get(
-    "/when",
-    response_model=dict[str, object],
-    summary="The training steps after which an expression holds.",
-)
-async def when(
-    run: RecordedRun,
-    compute: ComputationOf,
-    expression: Expression,
-    every: Annotated[bool, Query(alias="all", description="Find every interval.")] = False,
-    first: Annotated[StepText, Query(alias="from")] = None,
-    last: Annotated[StepText, Query(alias="to")] = None,
-) -> Response:
-    """Return what `dualtaxi when --json` prints; of a run that was trained here."""
-    return await compute.json(computed.answer, run.recording, when_in, expression, every, first, last)
-
-
-@router.get(
-    "/why",
-    response_model=dict[str, object],
-    summary="The rewards that a Q-value is the sum of.",
-)
-async def why(
-    run: RecordedRun,
-    compute: ComputationOf,
-    state: StateName = None,
-    action: ActionName = None,
-    agent: AgentName = None,
-    at: StepName = None,
-    limit: Annotated[int, Query(ge=0, le=MAX_LIMIT, description="Most steps, 0 for all.")] = LIMIT,
-) -> Response:
-    """Return where a Q-value comes from, as `dualtaxi why --json` prints it; of a run trained here."""
-    return await compute.json(
-        computed.answer, run.recording, why_in, state, action, agent, at, limit, alone=True
     )

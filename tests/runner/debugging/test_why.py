@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 from runner.debugging import weights
-from runner.debugging.q_value import EpisodesPart, sections_of
+from runner.debugging.q_value import EpisodesPart
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
@@ -168,11 +168,11 @@ def test_values_that_many_steps_change_are_not_explained(tmp_path):
 def test_the_answer_says_whether_the_sum_is_the_value_and_leaves_out_episodes_without_weight(tmp_path):
     run = make_run(tmp_path, PLAIN)
     found = runner.why(run, at=STEP)
-    exact, *_ = sections_of(replace(found, total=found.value))
+    exact, *_ = replace(found, total=found.value).sections()[1:]
     assert exact.sentences[0] == "It equals the table's value."
-    assert sections_of(replace(found, total=found.value + 1e-9))[0].sentences[0].startswith("It differs")
+    assert replace(found, total=found.value + 1e-9).sections()[1].sentences[0].startswith("It differs")
     parts = (EpisodesPart(0.5, 2.0, 0, 10), EpisodesPart(0.0, 0.0, 10, 20), EpisodesPart(0.5, 0.0, 20, 30))
-    *_, episodes = sections_of(replace(found, episodes=parts))
+    *_, episodes = replace(found, episodes=parts).sections()
     assert [row[0] for grid in episodes.grids for row in grid.rows] == ["0 to 9", "20 to 29"]
     assert episodes.sentences == ["1 of 3 stretches of episodes have no weight and are left out."]
 

@@ -8,7 +8,7 @@ import json
 import runner
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from runner.service.pages.debugging import WHY_STEPS
+from runner.views.why import VIEW
 from tests.runner.export.outline import Outline
 
 RUN = "/runs/first"
@@ -84,6 +84,8 @@ def test_the_page_and_the_api_do_not_share_what_is_cached(client, recordings):
     _, asked = question(recordings)
     assert client.get(f"{RUN}/why", params=asked).status_code == 200
     answer = client.get(
-        f"/api/v1{RUN}/why", params={name: str(value) for name, value in asked.items()} | {"limit": WHY_STEPS}
+        f"/api/v1{RUN}/why",
+        params={name: str(value) for name, value in asked.items()}
+        | {"limit": dict(VIEW.page_values)["limit"]},
     )
     assert answer.json()["run_id"]

@@ -1,0 +1,96 @@
+"""What a view consists of: a function, the inputs that people give it, and words for its page."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from runner.analysis.episodes import EpisodeRef
+    from runner.analysis.sections import Section
+    from runner.recording.reader import Recording
+    from runner.util.values import Json
+
+
+class Answer(Protocol):
+    """What the function of a view returns."""
+
+    @property
+    def step_to_look_at(self) -> EpisodeRef | None:
+        """The step to look at next; None if the answer has none."""
+
+    def as_json(self) -> Json:
+        """Return the answer as JSON can hold it."""
+
+    def sections(self) -> list[Section]:
+        """Return what people see of the answer."""
+
+
+@dataclass(frozen=True)
+class Input:
+    """An input of a view: an option of its command, a parameter of its route, a field of its page."""
+
+    name: str
+    """As people write it: `from` is the option `--from` and the parameter `from`."""
+    help: str
+    default: str | int | bool | None = None
+    required: bool = False
+    metavar: str = ""
+    max_length: int = 1000
+    maximum: int | None = None
+    label: str = ""
+    """Label of the field; empty if the page has none."""
+    placeholder: str = ""
+    button: str = ""
+    """Text of a button that sends the form with this flag."""
+    choices: Callable[[Recording], Sequence[str]] | None = None
+    """Returns the texts to choose from."""
+
+
+def view_input(name: str, text: str, **attributes: Any) -> Any:
+    """Return the default of a parameter that is an `Input`, explained by a text."""
+    return Input(name, text, **attributes)
+
+
+@dataclass(frozen=True)
+class View:
+    """A question about a recording."""
+
+    name: str
+    """Name of the command, and last part of the addresses of route and page."""
+    title: str
+    compute: Callable[..., Answer]
+    """Takes the open recording, the inputs by name, and `report`, which is called with the steps done."""
+    summary: str
+    """What the route returns."""
+    button: str
+    """Text of the button that sends the form."""
+    lead: str = ""
+    """What the page says first."""
+    list_title: str = ""
+    """Title of the list of the help that the page shows; empty if it shows none."""
+    page_values: tuple[tuple[str, object], ...] = ()
+    """Arguments of the function that a page gives instead of a person."""
+    exclusive_spool: bool = False
+    """Whether the function writes large temporary files, so that one computation runs at a time."""
+
+    @cached_property
+    def inputs(self) -> Mapping[str, Input]:
+        """The inputs, by the name of their parameter."""
+        declared = inspect.signature(self.compute).parameters.values()
+        return {each.name: each.default for each in declared if isinstance(each.default, Input)}
+
+    @property
+    def help(self) -> str:
+        """The help of the command."""
+        return inspect.getdoc(self.compute) or ""
+
+    @property
+    def list_rows(self) -> dict[str, str]:
+        """The rows of the list that the page shows: what may be written, and what it means."""
+        lines = self.help.partition(f"{self.list_title}:\n")[2].partition("\n\n")[0].splitlines()
+        return dict(re.split(" {2,}", line.strip(), maxsplit=1) for line in lines if self.list_title)

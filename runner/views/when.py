@@ -1,0 +1,87 @@
+"""`when`: the training steps after which something holds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from runner.views.view import View, view_input
+
+if TYPE_CHECKING:
+    from runner.debugging.when import When
+    from runner.recording.reader import Recording
+
+_INTERVALS: Final = 200
+"""The most intervals that the page lists."""
+
+
+def when(
+    recording: Recording,
+    expression: str = view_input(
+        "expression",
+        "A condition, such as max(q[300]) > 20.",
+        required=True,
+        label="Expression",
+        placeholder='max(q[300]) > 20 and greedy[300] == "pickup + east"',
+    ),
+    every: bool = view_input(
+        "all",
+        "Include everything, not only a selection: every interval in which it holds, with its end.",
+        default=False,
+        button="Find every interval",
+    ),
+    first: str | None = view_input(
+        "from",
+        "The first training step: EPISODE:T, or step:N by its number.",
+        metavar="STEP",
+        max_length=40,
+        label="From step",
+        placeholder="0:0",
+    ),
+    last: str | None = view_input(
+        "to",
+        "The last training step, as for --from.",
+        metavar="STEP",
+        max_length=40,
+        label="To step",
+        placeholder="the last",
+    ),
+    report: Callable[[int], None] = lambda _: None,
+    **limits: int,
+) -> When:
+    """Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
+
+    --all lists every interval in which it holds.
+
+    In an expression:
+      q[S, A], max(q[S])   a Q-value; the highest in a state, or the lowest: min(q[S])
+      greedy[S]            the greedy action, compared with a name or a number
+      greedy_success[S]    whether the greedy path from S succeeds within the step limit
+      visits[S]            how often a step began in S; visits[S, A] with action A
+      step, episode        numbers of the training step and of its episode
+      reward, epsilon      of the training step
+
+    S and A are numbers or names, as `dualtaxi table` prints them. There are and, or, not, comparisons, also
+    chained, + - * / // %, max(), min() and abs(). Where each agent has a table of its own, q.taxi_1[S, A] and
+    reward.taxi_1 say whose; greedy[S] and visits[S, A] are of joint actions.
+
+    Examples:
+      dualtaxi when @latest 'greedy[300] == "pickup + east"'
+      dualtaxi when k3v9m2xq 'q[300, "north + east"] > q[300, "west + east"]' --all
+      dualtaxi when k3v9m2xq 'greedy_success[300] and visits[300] < 100' --from 2000:0
+      dualtaxi when rivals 'max(q.taxi_1[300]) > max(q.taxi_2[300]) > 0' --to step:50000
+    """
+    from runner.debugging.when import when_in
+
+    return when_in(recording, expression, every, first, last, report, **limits)
+
+
+VIEW: Final = View(
+    "when",
+    "When?",
+    when,
+    summary="The training steps after which an expression holds.",
+    button="Find the first step",
+    list_title="In an expression",
+    page_values=(("limit", _INTERVALS),),
+)

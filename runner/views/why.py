@@ -1,0 +1,83 @@
+"""`why`: the rewards and initial values that a Q-value is the sum of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+from runner.views.view import View, view_input
+
+if TYPE_CHECKING:
+    from runner.debugging.q_value import Why
+    from runner.recording.reader import Recording
+
+_STEPS: Final = 30
+"""Steps that the page lists."""
+_OF_STEP: Final = "number or name; that of the step"
+
+
+def why(
+    recording: Recording,
+    state: str | None = view_input(
+        "state",
+        "The state: a number or a name.  [default: that of --at]",
+        metavar="S",
+        label="State",
+        placeholder=_OF_STEP,
+    ),
+    action: str | None = view_input(
+        "action",
+        "The action: a number or a name.  [default: that of --at]",
+        metavar="A",
+        label="Action",
+        placeholder=_OF_STEP,
+    ),
+    agent: str | None = view_input(
+        "agent",
+        "The agent whose Q-table it is in, where each has its own.",
+        metavar="NAME",
+        label="Agent",
+        choices=lambda recording: recording.agents,
+    ),
+    at: str | None = view_input(
+        "at",
+        "The step: EPISODE:T, step:N, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of episode "
+        "120. The value before the step is shown.  [default: the last]",
+        metavar="STEP",
+        max_length=60,
+        label="Before step",
+        placeholder="EPISODE:T, or eval:N:TRIAL:T; the end",
+    ),
+    limit: int = view_input(
+        "limit", "Maximum number of rows, 0 for all.  [default: 10]", default=10, metavar="N", maximum=100_000
+    ),
+    report: Callable[[int], None] = lambda _: None,
+) -> Why:
+    """Show where a Q-value of RUN comes from: the recorded rewards and initial values that it is the sum of.
+
+    Each update is linear in the tables once its greedy action is known, so a value is exactly a weighted sum
+    of the rewards before it and of the initial values. It is listed by reward, by episode, and by the steps
+    that add or take most. This is a decomposition along the path that training took, not a counterfactual:
+    `dualtaxi branch` shows what would have happened otherwise. In Python: runner.why().
+
+    Examples:
+      dualtaxi why @latest --state 300 --action north+south
+      dualtaxi why rivals --state 300 --action pickup --agent taxi_2 --at 2000:0
+      dualtaxi why k3v9m2xq --at eval:3000:7:5 --limit 30
+    """
+    from runner.debugging.why import why_in
+
+    return why_in(recording, state, action, agent, at, limit, report)
+
+
+VIEW: Final = View(
+    "why",
+    "Why?",
+    why,
+    summary="The rewards that a Q-value is the sum of.",
+    button="Explain the value",
+    lead="A Q-value is exactly a weighted sum of recorded rewards and initial values. This page shows which "
+    "ones, and by which moves they came.",
+    page_values=(("limit", _STEPS),),
+    exclusive_spool=True,
+)
