@@ -190,7 +190,8 @@ def maps(path: Path) -> bytes:
         drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
         if recording.tabular:
             rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
-        return str(partials().maps(rows, drawing is not None and drawing.width > svg.BROAD)).encode()
+        broad = drawing is not None and drawing.width > svg.BROAD
+        return f"<h2>What was learned</h2>{partials().maps(rows, broad)}".encode()
 
 
 def distributions(path: Path, axis: str) -> bytes:

@@ -1,11 +1,14 @@
-"""The pages of how a run went: what it used of its machine over time, what it printed, and its pictures."""
+"""The pages of how a run went: its machine over time, its output, its pictures, and what was learned."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from http import HTTPStatus
+from pathlib import Path
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.runs.run import Run
@@ -23,28 +26,28 @@ Stream = Literal["", "stdout", "stderr"]
 Status = Annotated[str, Query(max_length=20)]
 
 
-@router.get("/system")
-async def system(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
-    """Show steps a second, and the use of the machine, over time."""
-    body = (await compute(fragments.system, run.recording)).decode()
-    values = {"body": body, "live": _live(run, "system/part")}
-    return await run_in_threadpool(run_page, request, run, "system", "run_system.html", values)
+def _add_page(tab: str, body_of: Callable[[Path], bytes], is_live: bool = False) -> None:
+    """Add a page of the HTML that a function returns; a live one loads it again while the run is running."""
+
+    @router.get(f"/{tab}")
+    async def body_page(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
+        body = (await compute(body_of, run.recording)).decode()
+        values = {"body": body, "live": _live(run, f"{tab}/part") if is_live else ""}
+        return await run_in_threadpool(run_page, request, run, tab, "run_body.html", values)
+
+    if is_live:
+
+        @router.get(f"/{tab}/part")
+        async def part(run: RecordedRun, compute: ComputationOf, status: Status = "running") -> Response:
+            """Return what changes of the page; 204 if the run no longer has this status."""
+            if run.status != status:
+                return Response(status_code=HTTPStatus.NO_CONTENT)
+            return HTMLResponse(await compute(body_of, run.recording))
 
 
-@router.get("/system/part")
-async def system_part(run: RecordedRun, compute: ComputationOf, status: Status = "running") -> Response:
-    """Return what changes of the page; 204 if the run no longer has this status."""
-    if run.status != status:
-        return Response(status_code=HTTPStatus.NO_CONTENT)
-    return Response(await compute(fragments.system, run.recording), media_type="text/html")
-
-
-@router.get("/pictures")
-async def pictures(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
-    """Show the last pictures and films that were logged."""
-    body = (await compute(fragments.pictures, run.recording)).decode()
-    values = {"body": body, "live": ""}
-    return await run_in_threadpool(run_page, request, run, "pictures", "run_system.html", values)
+_add_page("system", fragments.system, is_live=True)
+_add_page("pictures", fragments.pictures)
+_add_page("learned", fragments.maps)
 
 
 @router.get("/console")

@@ -13,7 +13,6 @@ from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
@@ -159,13 +158,6 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
     section = evaluations_section(recording, records) if records else None
     values = {"section": section, "links": links, "total": total}
     return run_page(request, run, "evaluations", "run_evaluations.html", values)
-
-
-@router.get("/learned")
-async def learned(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
-    """Show policy and values at stages of learning."""
-    maps = (await compute(fragments.maps, run.recording)).decode()
-    return await run_in_threadpool(run_page, request, run, "learned", "run_learned.html", {"maps": maps})
 
 
 def _overview(request: Request, run: Run, jobs: JobQueue, settings: Settings, problem: str = "") -> Response:
