@@ -7,18 +7,23 @@ recorded by `snapshot`, of each name the latest.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NotRequired, TypedDict
+from dataclasses import dataclass
+from typing import BinaryIO, NotRequired, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.episodes import EpisodeRef
+from runner.analysis.sections import Grid, Section
 from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
-from runner.errors import NotInRecording, RunnerError
+from runner.errors import ConfigError, NotInRecording
 from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
 from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode
 from runner.replay.tables import TableReplay
+from runner.util.humanize import UNKNOWN, number
+from runner.util.values import Json
 
 
 class TableSummary(TypedDict):
@@ -64,33 +69,97 @@ class TablesDescription(TypedDict):
     values: NotRequired[list[ActionValue]]
 
 
-def describe_tables(
-    recording: Recording, step: int | None = None, episode: int | None = None, state: int | str | None = None
-) -> tuple[TablesDescription, NDArray[np.float64]]:
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """The Q-tables at a step."""
+
+    description: TablesDescription
+    array: NDArray[np.float64]
+    """As `one_array` returns them."""
+
+    step_to_look_at: EpisodeRef | None = None
+
+    def as_json(self) -> Json:
+        """Return the description of the tables."""
+        return dict(self.description)
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the tables as a NumPy file."""
+        np.save(stream, self.array)
+
+    def sections(self) -> list[Section]:
+        """Return the facts of the tables; of a state also the values of each table."""
+        own = self.description
+        facts = {"run": own["run_id"], "step": f"after {own['step']:,} training steps"}
+        for each in own["tables"]:
+            facts[each["agent"]] = (
+                f"{each['states']:,} states, {each['actions']} actions, {each['percent_filled']:.1f} % "
+                f"filled, values from {each['lowest']:.4g} to {each['highest']:.4g}"
+            )
+            if "snapshot_step" in each:
+                facts[each["agent"]] += f"; the latest snapshot, after {each['snapshot_step']:,} steps"
+        if "state" not in own:
+            return [Section("The table", facts=facts)]
+        facts |= {"state": f"{own['state']}: {own['state_in_words']}", "visits": _count(own["visits"])}
+        by_agent = [
+            (each["agent"], [row for row in own["values"] if row["agent"] == each["agent"]])
+            for each in own["tables"]
+        ]
+        return [
+            Section("The table", facts=facts),
+            *(Section(agent, grids=[_state_grid(rows)]) for agent, rows in by_agent),
+        ]
+
+
+def _state_grid(rows: Sequence[ActionValue]) -> Grid:
+    """Return a learner's values in a state."""
+    policy = ("policy",) if "policy" in rows[0] else ()
+    cells = [
+        (
+            str(row["action"]),
+            row["action_in_words"],
+            number(row["value"], 4),
+            *([number(row["policy"], 4)] if policy else []),
+            "greedy" if row["greedy"] else "",
+            *map(_count, (row["visits"], row["changed_step"], row["changed_episode"])),
+        )
+        for row in rows
+    ]
+    return Grid(
+        ("action", "", "value", *policy, "greedy", "visits", "changed\nby step", "in\nepisode"), cells
+    )
+
+
+def _count(count: int | None) -> str:
+    return UNKNOWN if count is None else f"{count:,}"
+
+
+def tables_of(
+    recording: Recording, step: int | None = None, episode: int | None = None, state: str | None = None
+) -> Tables:
     """Return the tables after a number of training steps, or episodes, by default after the last.
 
     Args:
         state: a number or a name; its values are part of the description.
 
-    Returns:
-        What JSON can hold, and the tables as `one_array` returns them.
-
     Raises:
+        ConfigError: there is no such state, or both a step and an episode are given.
         RecordingError: they are not recorded.
-        RunnerError: there is no such state.
     """
+    if step is not None and episode is not None:
+        raise ConfigError("found step and episode, expected one of them.")
     if episode is not None:
         step = step_of_episode(recording, episode)
     if not recording.can_train_again:
         return _describe_snapshots(recording, step, state)
     step = last_step(recording) if step is None else step
-    number = state_of(recording.mdp, state) if isinstance(state, str) else state
+    chosen = None if state is None else state_of(recording.mdp, state)
     replay = TableReplay(recording, step)
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
     description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
-    if number is not None:
-        _add_state(description, recording, replay, number)
-    return description, one_array(replay.tables)
+    if chosen is not None:
+        _add_state(description, recording, replay, chosen)
+    return Tables(description, one_array(replay.tables))
 
 
 def recorded_tables(recording: Recording) -> Iterator[Snapshot]:
@@ -112,9 +181,7 @@ def _shape(recording: Recording) -> tuple[int, int]:
     return recording.spaces["observation"]["n"], recording.spaces["action"]["n"]
 
 
-def _describe_snapshots(
-    recording: Recording, step: int | None, state: int | str | None
-) -> tuple[TablesDescription, NDArray[np.float64]]:
+def _describe_snapshots(recording: Recording, step: int | None, state: str | None) -> Tables:
     """Return the latest tables that a loop recorded, or those at a step."""
     arrays = list(recorded_tables(recording))
     last = max([recording.train.steps.total(), *(array.step for array in arrays)])
@@ -134,7 +201,7 @@ def _describe_snapshots(
     if state is not None:
         shape = _shape(recording)
         states = states_in_words(recording.mdp) if recording.tabular else range(shape[0])
-        number = numbered(str(state), list(map(str, states)), "a state", 1)
+        number = numbered(state, list(map(str, states)), "a state", 1)
         stop = max(array.step for array in latest.values())
         taken = None
         if recording.train.steps and recording.train.steps.count() >= stop:  # else steps are missing
@@ -150,7 +217,7 @@ def _describe_snapshots(
             for table, q in tables.items()
             for value in _action_values(table, names, q[number], int(q[number].argmax()), taken)
         ]
-    return description, one_array(list(tables.values()))
+    return Tables(description, one_array(list(tables.values())))
 
 
 def _action_values(
@@ -203,8 +270,6 @@ def summarize(agent: str, q: NDArray[np.float64]) -> TableSummary:
 
 def _add_state(description: TablesDescription, recording: Recording, replay: TableReplay, state: int) -> None:
     mdp = recording.mdp
-    if state >= mdp.states:
-        raise RunnerError(f"state: found {state}, expected one of 0 to {mdp.states - 1}.")
     history = history_of(recording, state, replay.step)
     joint, own = actions_in_words(mdp), action_names(mdp)
     values: list[ActionValue] = []

@@ -43,7 +43,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "checkpoints": ("checkpoints", "List the checkpoints that a loop recorded."),
         "checkpoint": ("checkpoints", "Write a checkpoint of a run into a file."),
         "values": ("checkpoints", "Compute what a checkpoint's agent returns along a recorded episode."),
-        "qtable": ("tables", "Show the exact Q-table of a run at any step."),
+        "qtable": ("views", "Show the exact Q-table of a run at any step."),
         "table": ("tables", "Print an environment's transition table with names."),
     },
     "Debug": {

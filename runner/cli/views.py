@@ -1,16 +1,23 @@
-"""The command of a view: its inputs are arguments and options, its answer is text, JSON or Markdown."""
+"""The command of a view: its inputs are arguments and options, its answer text, JSON, Markdown or a file."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from runner.cli.command import Command, Declared, argument, option
-from runner.cli.options import json_option, markdown_option, recordings_option, require_one, run_argument
-from runner.cli.output import draw, facts, print_json, print_sections
-from runner.cli.parameter_types import INDEX
-from runner.cli.progress import steps_line
+from runner.cli.options import (
+    force_option,
+    json_option,
+    markdown_option,
+    recordings_option,
+    require_one,
+    run_argument,
+)
+from runner.cli.output import draw, facts, files_written, print_json, print_sections, say
+from runner.cli.parameter_types import FILE, INDEX
+from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
+from runner.export.places import new_file, require_new
 from runner.views.view import Input, View
 
 
@@ -18,36 +25,55 @@ def command_of(view: View) -> Command:
     """Return the command of a view."""
 
     def call(
-        run_name: str, recordings: Path | None, as_json: bool, as_markdown: bool, **values: object
+        run_name: str,
+        recordings: Path | None,
+        as_json: bool,
+        as_markdown: bool,
+        output: Path | None = None,
+        force: bool = False,
+        **values: object,
     ) -> None:
         require_one("as_json", "as_markdown")
+        require_one(*view.exclusive)
+        if output is not None:
+            require_new(output, force)
         run = find_recorded(run_name, recordings)
         from runner.recording.reader import open_recording
 
-        with compilation_notice(), steps_line("read") as report, open_recording(run.recording) as recording:
-            answer = view.compute(recording, **values, report=report)
+        line = steps_line if view.counts_steps else stage_line
+        with compilation_notice(), line(view.stage) as report, open_recording(run.recording) as recording:
+            answer = view.compute(recording, **values, **({"report": report} if view.counts_steps else {}))
+        if output is not None:
+            with new_file(output, force) as temporary, temporary.open("wb") as stream:
+                answer.write(stream)
         if as_json:
-            print_json(answer.as_json())
+            files = {} if output is None else {"files": files_written(output)}
+            print_json(answer.as_json() | files)
             return
         print_sections(answer.sections(), as_markdown)
         if answer.step_to_look_at is not None and not as_markdown:
             draw(facts({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))}))
+        if output is not None:
+            say(f"Written: {output.absolute()}")
 
-    shared: dict[str, Any] = {
+    declared = {"run_name": run_argument, **{name: _declared(each) for name, each in view.inputs.items()}}
+    if view.file_ending:
+        output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=view.file_help)
+        declared |= {"output": output, "force": force_option}
+    declared |= {
         "recordings": recordings_option,
         "as_json": json_option,
         "as_markdown": markdown_option,
     }
-    inputs = {name: _declared(each) for name, each in view.inputs.items()}
-    return Command(view.name, call, {"run_name": run_argument} | inputs | shared, help=view.help)
+    return Command(view.name, call, declared, help=view.help)
 
 
 def _declared(given: Input) -> Declared:
     """Return the argument or option of an input."""
     if given.required:
         return argument(metavar=given.name.upper())
-    if isinstance(given.default, bool):
-        return option(f"--{given.name}", is_flag=True, help=given.help)
-    kind = INDEX if isinstance(given.default, int) else None
     flag = f"--{given.name}"
+    if given.kind is bool:
+        return option(flag, is_flag=True, help=given.help)
+    kind = INDEX if given.kind is int else None
     return option(flag, type=kind, default=given.default, metavar=given.metavar, help=given.help)

@@ -28,7 +28,6 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
-from runner.analysis.qtable import describe_tables
 from runner.analysis.series import (
     RunSeries,
     parse_target,
@@ -48,7 +47,7 @@ from runner.runs.run import Run
 from runner.service.errors import Refused
 from runner.util.extras import require
 from runner.util.values import finite
-from runner.views.view import Answer
+from runner.views.view import Answer, FileAnswer, Given
 
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
@@ -237,21 +236,17 @@ def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
     return np.unique([*lowest, *highest])
 
 
-def q_table(path: Path, step: int | None, episode: int | None, state: int | None, form: str) -> bytes:
-    """Return the Q-table of a moment: its summary and a state's history as `json`, or all of it as `npy`."""
-    with open_recording(path) as recording:
-        description, table = describe_tables(recording, step, episode, state)
-        if form == "json":
-            return as_json(description)
-        stream = io.BytesIO()
-        np.save(stream, table)
-        return stream.getvalue()
-
-
-def answer(path: Path, question: Callable[..., Answer], values: tuple[tuple[str, object], ...]) -> bytes:
+def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
     """Return the answer to a question about a recording, as the command prints it with --json."""
     with open_recording(path) as recording:
         return as_json(question(recording, **dict(values)).as_json())
+
+
+def answer_file(path: Path, question: Callable[..., FileAnswer], values: Given) -> bytes:
+    """Return the file of the answer to a question about a recording."""
+    with open_recording(path) as recording, io.BytesIO() as stream:
+        question(recording, **dict(values)).write(stream)
+        return stream.getvalue()
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

@@ -49,7 +49,7 @@ from runner.runs.run import Run
 from runner.service.addresses import link, places_in
 from runner.service.computed import TABLE_NAME, as_json
 from runner.util.values import Json
-from runner.views.view import Answer
+from runner.views.view import Answer, Given
 
 MAX_OUTPUT_LINES: Final = 1000
 """Lines of output that a page shows."""
@@ -149,7 +149,7 @@ def what_if_page(run: Run, at: EpisodeRef, action: str | None, start: int, steps
         return as_json(shown)
 
 
-def answer(path: Path, question: Callable[..., Answer], values: tuple[tuple[str, object], ...]) -> bytes:
+def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
     """Return the answer to a question about a recording as HTML."""
     with open_recording(path) as recording:
         sections = question(recording, **dict(values)).sections()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from http import HTTPStatus
 from typing import Annotated, Any
 
@@ -14,12 +15,13 @@ from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed, fragments
-from runner.service.dependencies import ComputationOf, RecordedRun
+from runner.service.api.replay import OCTETS
+from runner.service.dependencies import Computation, ComputationOf, RecordedRun
 from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import message_of
-from runner.service.problems import RUN_ERRORS, error_docs
+from runner.service.problems import RUN_ERRORS, error_docs, media_docs
 from runner.views import VIEWS
-from runner.views.view import Input, View
+from runner.views.view import Given, Input, View
 
 api = APIRouter(
     prefix="/runs/{run}",
@@ -32,20 +34,27 @@ pages = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 def _add_routes(view: View) -> None:
     given_type = _type_of(view)
 
-    async def answer(run: RecordedRun, compute: ComputationOf, given: BaseModel) -> Response:
-        values = tuple(given.model_dump().items())
-        alone = view.exclusive_spool
-        return await compute.json(computed.answer, run.recording, view.compute, values, alone=alone)
+    def add(
+        function: Callable[..., bytes], ending: str, media_type: str, summary: str, **options: Any
+    ) -> None:
+        async def answer(run: RecordedRun, compute: ComputationOf, given: BaseModel) -> Response:
+            body = await _computed(compute, function, run, view, given)
+            return Response(body, media_type=media_type)
 
-    answer.__annotations__["given"] = Annotated[given_type, Query()]
-    description = f"Return what `dualtaxi {view.name} --json` prints; of a run that was trained here."
-    api.get(
-        f"/{view.name}",
-        name=view.name,
+        answer.__annotations__["given"] = Annotated[given_type, Query()]
+        path, description = f"/{view.name}{ending}", f"As `dualtaxi {view.name}` returns it."
+        api.get(path, name=path[1:], summary=summary, description=description, **options)(answer)
+
+    add(
+        computed.answer,
+        "",
+        "application/json",
+        view.help.partition("\n")[0],
         response_model=dict[str, object],
-        summary=view.summary,
-        description=description,
-    )(answer)
+    )
+    if view.file_ending:
+        documented = {"response_class": Response, "responses": media_docs(OCTETS)}
+        add(computed.answer_file, view.file_ending, OCTETS, view.file_help, **documented)
 
     @pages.get(f"/{view.name}")
     async def page(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
@@ -54,14 +63,11 @@ def _add_routes(view: View) -> None:
         form = {each.name: query.get(each.name, "").strip() for each in view.inputs.values()}
         body, problem = b"", ""
         try:
-            given = given_type.model_validate({name: text for name, text in form.items() if text})
-            values = tuple((given.model_dump() | dict(view.page_values)).items())
-            if any(form.values()):
-                alone = view.exclusive_spool
-                body = await compute(fragments.answer, run.recording, view.compute, values, alone=alone)
+            if view.has_default or any(form.values()):
+                given = given_type.model_validate({name: text for name, text in form.items() if text})
+                body = await _computed(compute, fragments.answer, run, view, given, view.page_values)
         except ValidationError as error:
-            if any(form.values()):
-                raise RequestValidationError(error.errors()) from error
+            raise RequestValidationError(error.errors()) from error
         except RunnerError as error:
             problem = message_of(error, request)
         shown = {"view": view, "form": form, "body": body.decode(), "problem": problem}
@@ -69,13 +75,26 @@ def _add_routes(view: View) -> None:
         return await run_in_threadpool(_page, request, run, shown, status)
 
 
+async def _computed(
+    compute: Computation,
+    function: Callable[..., bytes],
+    run: Run,
+    view: View,
+    given: BaseModel,
+    more: Given = (),
+) -> bytes:
+    """Return what a function makes of the answer to what is given, and to more values."""
+    values = tuple((given.model_dump() | dict(more)).items())
+    return await compute(function, run.recording, view.compute, values, alone=view.exclusive_spool)
+
+
 def _type_of(view: View) -> type[BaseModel]:
     """Return the type of the inputs of a view in the query of a request."""
 
     def declared(given: Input) -> tuple[Any, Any]:
-        kind: Any = str if given.required else str | None if given.default is None else type(given.default)
-        limits: dict[str, Any] = {} if kind is bool else {"max_length": given.max_length}
-        if kind is int:
+        kind: Any = given.kind if given.required or given.default is not None else given.kind | None
+        limits: dict[str, Any] = {} if given.kind is bool else {"max_length": given.max_length}
+        if given.kind is int:
             limits = {"ge": 0, "le": given.maximum}
         default = ... if given.required else given.default
         return kind, Field(default, alias=given.name, description=given.help, **limits)

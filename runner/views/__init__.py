@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from runner.views import when, why
+from runner.views import qtable, when, why
 
-VIEWS: Final = {module.VIEW.name: module.VIEW for module in (when, why)}
+VIEWS: Final = {module.VIEW.name: module.VIEW for module in (qtable, when, why)}
 """Name of a view -> the view."""

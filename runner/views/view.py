@@ -7,13 +7,17 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
     from runner.analysis.sections import Section
     from runner.recording.reader import Recording
     from runner.util.values import Json
+
+
+Given = tuple[tuple[str, object], ...]
+"""Inputs of a view by the name of their parameter."""
 
 
 class Answer(Protocol):
@@ -30,6 +34,13 @@ class Answer(Protocol):
         """Return what people see of the answer."""
 
 
+class FileAnswer(Answer, Protocol):
+    """An answer that can be written as a file, too."""
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the file."""
+
+
 @dataclass(frozen=True)
 class Input:
     """An input of a view: an option of its command, a parameter of its route, a field of its page."""
@@ -37,6 +48,7 @@ class Input:
     name: str
     """As people write it: `from` is the option `--from` and the parameter `from`."""
     help: str
+    kind: type = str
     default: str | int | bool | None = None
     required: bool = False
     metavar: str = ""
@@ -63,18 +75,27 @@ class View:
     name: str
     """Name of the command, and last part of the addresses of route and page."""
     title: str
-    compute: Callable[..., Answer]
-    """Takes the open recording, the inputs by name, and `report`, which is called with the steps done."""
-    summary: str
-    """What the route returns."""
+    compute: Callable[..., Any]
+    """Takes the recording, the inputs and `report`, called with the steps done; returns an `Answer`."""
     button: str
     """Text of the button that sends the form."""
     lead: str = ""
     """What the page says first."""
     list_title: str = ""
     """Title of the list of the help that the page shows; empty if it shows none."""
-    page_values: tuple[tuple[str, object], ...] = ()
+    page_values: Given = ()
     """Arguments of the function that a page gives instead of a person."""
+    stage: str = "reading"
+    """What the command says that it does."""
+    counts_steps: bool = True
+    """Whether the function has the parameter `report`."""
+    exclusive: tuple[str, ...] = ()
+    """Inputs that exclude each other."""
+    has_default: bool = False
+    """Whether the page has an answer before anything is asked."""
+    file_ending: str = ""
+    """Ending of the file that the answer, a `FileAnswer`, is written as; `file_help` says what is in it."""
+    file_help: str = ""
     exclusive_spool: bool = False
     """Whether the function writes large temporary files, so that one computation runs at a time."""
 

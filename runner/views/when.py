@@ -27,6 +27,7 @@ def when(
     every: bool = view_input(
         "all",
         "Include everything, not only a selection: every interval in which it holds, with its end.",
+        kind=bool,
         default=False,
         button="Find every interval",
     ),
@@ -80,8 +81,8 @@ VIEW: Final = View(
     "when",
     "When?",
     when,
-    summary="The training steps after which an expression holds.",
     button="Find the first step",
+    stage="searched",
     list_title="In an expression",
     page_values=(("limit", _INTERVALS),),
 )

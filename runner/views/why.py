@@ -49,7 +49,12 @@ def why(
         placeholder="EPISODE:T, or eval:N:TRIAL:T; the end",
     ),
     limit: int = view_input(
-        "limit", "Maximum number of rows, 0 for all.  [default: 10]", default=10, metavar="N", maximum=100_000
+        "limit",
+        "Maximum number of rows, 0 for all.  [default: 10]",
+        kind=int,
+        default=10,
+        metavar="N",
+        maximum=100_000,
     ),
     report: Callable[[int], None] = lambda _: None,
 ) -> Why:
@@ -74,7 +79,6 @@ VIEW: Final = View(
     "why",
     "Why?",
     why,
-    summary="The rewards that a Q-value is the sum of.",
     button="Explain the value",
     lead="A Q-value is exactly a weighted sum of recorded rewards and initial values. This page shows which "
     "ones, and by which moves they came.",

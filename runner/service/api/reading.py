@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from http import HTTPStatus
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Path, Query, Response
@@ -23,7 +22,6 @@ from runner.service.dependencies import (
     SettingsOf,
     json_response,
 )
-from runner.service.errors import Refused
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
 from runner.util.arrays import Array
 
@@ -227,41 +225,6 @@ def steps(
 
 
 @router.get(
-    "/qtable",
-    response_model=dict[str, object],
-    responses=BUSY_ERRORS,
-    summary="A summary of the Q-table at any step.",
-)
-async def q_table(
-    run: RecordedRun,
-    compute: ComputationOf,
-    step: Step = None,
-    episode: Episode = None,
-    state: Annotated[
-        int | None, Query(ge=0, lt=2**31, description="Also the values of this state, with their history.")
-    ] = None,
-) -> Response:
-    """Return size, fill and range of each learner's exact table, as `dualtaxi qtable --json` prints it."""
-    _refuse_both(step, episode)
-    return await compute.json(computed.q_table, run.recording, step, episode, state, "json")
-
-
-@router.get(
-    "/qtable.npy",
-    response_class=Response,
-    responses=media_docs(OCTETS) | BUSY_ERRORS,
-    summary="The whole Q-table at any step.",
-)
-async def whole_q_table(
-    run: RecordedRun, compute: ComputationOf, step: Step = None, episode: Episode = None
-) -> Response:
-    """Return the exact table as a NumPy file: float64 [states, actions], or [learners, states, actions]."""
-    _refuse_both(step, episode)
-    body = await compute(computed.q_table, run.recording, step, episode, None, "npy")
-    return Response(body, media_type=OCTETS)
-
-
-@router.get(
     "/plot.svg",
     response_class=Response,
     responses=media_docs(SVG) | BUSY_ERRORS,
@@ -278,11 +241,6 @@ async def plot(
     """Return the figure that `dualtaxi plot` draws."""
     style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
     return Response(await compute(computed.plot, run.recording, axis, style), media_type=SVG)
-
-
-def _refuse_both(step: int | None, episode: int | None) -> None:
-    if step is not None and episode is not None:
-        raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, "query: found step and episode, expected one of them.")
 
 
 def _stop(start: int, stop: int | None, total: int, limit: int) -> int:

@@ -28,6 +28,7 @@ TABS: Final = (
     ("episodes", "Episodes"),
     ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
+    ("qtable", "Q-table"),
     ("when", "When?"),
     ("why", "Why?"),
     ("config", "Configuration"),
@@ -68,12 +69,14 @@ def run_page(
 def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_episodes = has_environment(run.file.config)
+    has_tables = run.can_train_again or _has_recorded_tables(run)
     has_tab = {
         "replay": has_episodes,
         "episodes": has_episodes,
         "evaluations": has_episodes,
         "rerun": has_episodes,
-        "learned": run.can_train_again or _has_recorded_tables(run),
+        "learned": has_tables,
+        "qtable": has_tables,
         "when": run.can_train_again,
         "why": run.can_train_again,
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))

@@ -91,7 +91,7 @@ def test_the_q_table_at_a_step_is_the_exact_one(client, recording, recordings):
 def test_a_moment_that_does_not_exist_is_refused(client):
     assert client.get(f"{RUN}/qtable", params={"step": 10**9}).status_code == 404
     assert client.get(f"{RUN}/qtable", params={"step": 1, "episode": 1}).status_code == 422
-    assert client.get(f"{RUN}/qtable", params={"step": 1, "state": 10**6}).status_code == 400
+    assert client.get(f"{RUN}/qtable", params={"step": 1, "state": 10**6}).status_code == 422
     assert client.get(f"{RUN}/steps/train", params={"episode": 10**6}).status_code == 404
     assert client.get(f"{RUN}/steps/test").status_code == 422
 
