@@ -34,7 +34,6 @@ def command_of(view: View) -> Command:
         **values: object,
     ) -> None:
         require_one("as_json", "as_markdown")
-        require_one(*view.exclusive)
         if output is not None:
             require_new(output, force)
         run = find_recorded(run_name, recordings)

@@ -93,16 +93,6 @@ class ShownDifference:
     """Their Q-tables, as HTML as the body is."""
 
 
-@dataclass(frozen=True)
-class Output:
-    """Lines of output."""
-
-    lines: list[tuple[float, int, str, str]]
-    """Seconds, number of steps, stream and text of the last lines that were found."""
-    found: int
-    total: int
-
-
 def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
     """Return a part of an episode as JSON for `replay.js`."""
     with open_recording(path) as recording:
@@ -270,7 +260,7 @@ def pictures(path: Path) -> bytes:
 
 
 def console(path: Path, sought: str, stream: str) -> bytes:
-    """Return `Output` as JSON: the lines with the text that is sought, in any case.
+    """Return the last lines of the output that have the text that is sought, in any case, as HTML.
 
     `stream` is `stdout`, `stderr`, or empty for both.
     """
@@ -281,7 +271,7 @@ def console(path: Path, sought: str, stream: str) -> bytes:
         line for line in every if sought.casefold() in line.text.casefold() and stream in ("", line.stream)
     ]
     lines = [(line.seconds, line.position, line.stream, line.text) for line in matching[-MAX_OUTPUT_LINES:]]
-    return as_json(Output(lines, len(matching), len(every)))
+    return str(partials().output(lines, len(matching), len(every))).encode()
 
 
 def difference(a: Run, b: Run) -> bytes:

@@ -67,7 +67,6 @@ VIEW: Final = View(
     button="Show the table",
     stage="replaying recorded steps",
     counts_steps=False,
-    exclusive=("step", "episode"),
     has_default=True,
     file_ending=".npy",
     file_help="Write the whole table: float64 [states, actions], of several agents [agents, states, "

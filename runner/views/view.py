@@ -89,8 +89,6 @@ class View:
     """What the command says that it does."""
     counts_steps: bool = True
     """Whether the function has the parameter `report`."""
-    exclusive: tuple[str, ...] = ()
-    """Inputs that exclude each other."""
     has_default: bool = False
     """Whether the page has an answer before anything is asked."""
     file_ending: str = ""

@@ -85,6 +85,7 @@ def environment_of(folders: Sequence[Traversable]) -> Environment:
         "number": humanize.number,
         "count": lambda value: humanize.number(value, 0),
         "code": code,
+        "duration": humanize.duration,
         "sentence": humanize.sentence,
     }
     environment.filters |= filters

@@ -15,9 +15,7 @@ from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
-from runner.service.fragments import Output
 from runner.service.pages.frame import run_page
-from runner.service.pages.rendering import page
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -55,15 +53,14 @@ async def console(
     request: Request, run: RecordedRun, compute: ComputationOf, sought: Sought = "", stream: Stream = ""
 ) -> Response:
     """Show the last lines of the output, or the last that have a text."""
-    output = await compute.shown(Output, fragments.console, run.recording, sought, stream)
+    body = (await compute(fragments.console, run.recording, sought, stream)).decode()
     live = _live(run, "console/part", q=sought, stream=stream)
-    values = {"output": output, "sought": sought, "stream": stream, "live": live}
+    values = {"body": body, "sought": sought, "stream": stream, "live": live}
     return await run_in_threadpool(run_page, request, run, "console", "run_console.html", values)
 
 
 @router.get("/console/part")
 async def console_part(
-    request: Request,
     run: RecordedRun,
     compute: ComputationOf,
     sought: Sought = "",
@@ -73,8 +70,7 @@ async def console_part(
     """Return the lines alone; 204 if the run no longer has this status."""
     if run.status != status:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    output = await compute.shown(Output, fragments.console, run.recording, sought, stream)
-    return page(request, "run_console_lines.html", {"output": output})
+    return HTMLResponse(await compute(fragments.console, run.recording, sought, stream))
 
 
 def _live(run: Run, path: str, **query: str) -> str:

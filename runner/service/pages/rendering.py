@@ -72,7 +72,6 @@ def templates() -> jinja2.Environment:
     environment = environment_of((TEMPLATES, REPORT_TEMPLATES))
     environment.filters |= {
         "size": humanize.size,
-        "duration": humanize.duration,
         "age": _age,
         "problem": _problem,
     }
