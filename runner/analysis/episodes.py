@@ -231,7 +231,6 @@ def _episode_named(recording: Recording, word: str) -> EpisodeRef:
     of an evaluation is unknown, the first trial after the last training. Without such a trial it is the
     last training episode.
     """
-    require_steps(recording, "show", may_redo=True)
     last = EpisodeRef(max(0, recording.train.episodes.count() - 1))
     if word not in ("last", TYPICAL):
         phase, ranked = ranked_episodes(recording)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from runner.analysis.contents import Step
+from runner.analysis.contents import Step, require_steps
 from runner.drawing.text import Drawing
 from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
@@ -31,6 +31,7 @@ class Episode:
     """One episode of an open recording, read as it is needed; the title is the first line of each frame."""
 
     def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
+        require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._number = recording, at.phase, at.number_in(recording)
         self._length = len(recording.phase(self._phase).episode_span(self._number))
         self._title = title

@@ -54,17 +54,19 @@ def when(
 
     --all lists every interval in which it holds.
 
-    In an expression:
-      q[S, A], max(q[S])   a Q-value; the highest in a state, or the lowest: min(q[S])
-      greedy[S]            the greedy action, compared with a name or a number
-      greedy_success[S]    whether the greedy path from S succeeds within the step limit
-      visits[S]            how often a step began in S; visits[S, A] with action A
-      step, episode        numbers of the training step and of its episode
-      reward, epsilon      of the training step
+    What an expression may contain:
+      q[S, A]                         a Q-value; max(q[S]) and min(q[S]) the highest and lowest of a state
+      greedy[S]                       the greedy action, such as greedy[S] == "pickup + east"
+      greedy_success[S]               whether the greedy path from S succeeds within the step limit
+      visits[S], visits[S, A]         training steps that began in S, with action A
+      step, episode                   numbers of the training step and of its episode
+      reward, epsilon                 of the training step
+      q.taxi_1[S, A], reward.taxi_1   those of one agent, where each has its own table
+      and or not < <= > >= == !=      comparisons can be chained
+      + - * / // % max() min() abs()  arithmetic
 
-    S and A are numbers or names, as `dualtaxi table` prints them. There are and, or, not, comparisons, also
-    chained, + - * / // %, max(), min() and abs(). Where each agent has a table of its own, q.taxi_1[S, A] and
-    reward.taxi_1 say whose; greedy[S] and visits[S, A] are of joint actions.
+    S and A are numbers or names, as `dualtaxi table` prints them; in greedy[S] and visits[S, A] they are of
+    joint actions.
 
     Examples:
       dualtaxi when @latest 'greedy[300] == "pickup + east"'
@@ -82,7 +84,9 @@ VIEW: Final = View(
     "When?",
     when,
     button="Find the first step",
+    lead="The expression is evaluated after every training step. S and A are a state and an action, by "
+    "number or by name; a step is EPISODE:T, or step:N by its number in training.",
     stage="searched",
-    list_title="In an expression",
+    list_title="What an expression may contain",
     page_values=(("limit", _INTERVALS),),
 )

@@ -45,7 +45,7 @@ def rerun(
       dualtaxi export rerun @latest
       dualtaxi export rerun k3v9m2xq -o look.rrd --episodes 0..20,49980.. --evaluations 49000
       dualtaxi export rerun k3v9m2xq --all --force
-      dualtaxi export rerun my-loop --episodes 0:5 --frames
+      dualtaxi export rerun my-loop --episodes 0..5 --frames
     """
     from runner.recording.reader import open_recording
 

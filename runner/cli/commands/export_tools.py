@@ -39,7 +39,7 @@ def minari(
 
     Examples:
       dualtaxi export minari @latest --phase eval
-      dualtaxi export minari k3v9m2xq --episodes 49000: -o datasets
+      dualtaxi export minari k3v9m2xq --episodes 49000.. -o datasets
     """
     from runner.export.minari import PATTERNS, dataset_id, require_packages, write_dataset
 
