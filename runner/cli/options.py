@@ -168,11 +168,9 @@ def require_one(*names: str) -> None:
         UsageError: more than one of them is given.
     """
     context = click.get_current_context()
-    given = [
-        parameter.opts[0]
-        for parameter in context.command.params
-        if parameter.name in names and not any(context.params[parameter.name] is no for no in (None, False))
-    ]
+    flags = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    values = context.params
+    given = [flags[name] for name in names if values[name] is not None and values[name] is not False]
     if len(given) > 1:
         raise click.UsageError(f"{' and '.join(given[:2])} exclude each other: choose one.")
 

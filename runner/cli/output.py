@@ -274,12 +274,6 @@ def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
             draw(patch_text(lines))
 
 
-def require_one_form(as_json: bool, as_markdown: bool) -> None:
-    """Refuse --json together with --markdown."""
-    if as_json and as_markdown:
-        raise click.UsageError("--json and --markdown exclude each other: choose one.")
-
-
 def require_page(path: Path, force: bool) -> None:
     """Refuse a page that could not be written in the end, before anything is computed."""
     from runner.export.reports.report import require_packages

@@ -107,8 +107,11 @@ def _type_of(view: View) -> type[BaseModel]:
 def _page(request: Request, run: Run, shown: dict[str, Any], status: HTTPStatus) -> Response:
     """Return the page of a view, with the texts to choose from in its form."""
     view: View = shown["view"]
-    with open_recording(run.recording) as recording:
-        choices = {each.name: each.choices(recording) for each in view.inputs.values() if each.choices}
+    choices = {}
+    for each in view.inputs.values():
+        if each.choices is not None:
+            with open_recording(run.recording) as recording:
+                choices[each.name] = each.choices(recording)
     return run_page(request, run, view.name, "run_view.html", shown | {"choices": choices}, status)
 
 

@@ -18,10 +18,11 @@ from runner.cli.options import (
     markdown_option,
     normalise_option,
     recordings_option,
+    require_one,
     runs_argument,
     target_option,
 )
-from runner.cli.output import echo, print_json, print_sections, require_one_form, require_page, say
+from runner.cli.output import echo, print_json, print_sections, require_page, say
 from runner.cli.parameter_types import INDEX, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_all_recorded, find_recorded
@@ -99,7 +100,7 @@ def compare_command(
     from runner.analysis.compare.statistics import require_scipy
     from runner.analysis.series import series_of
 
-    require_one_form(as_json, as_markdown)
+    require_one("as_json", "as_markdown")
     require_scipy()
     if html is not None:
         require_page(html, force)
@@ -204,7 +205,7 @@ def diff_command(
     from runner.analysis.diff.sections import sections
     from runner.recording.reader import open_recording
 
-    require_one_form(as_json, as_markdown)
+    require_one("as_json", "as_markdown")
     if html is not None:
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)

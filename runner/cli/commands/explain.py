@@ -16,10 +16,11 @@ from runner.cli.options import (
     markdown_option,
     ray_option,
     recordings_option,
+    require_one,
     trust_option,
     workers_option,
 )
-from runner.cli.output import draw, facts, print_json, print_sections, require_one_form, say
+from runner.cli.output import draw, facts, print_json, print_sections, say
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import total_line
 from runner.util.humanize import counted, duration
@@ -87,7 +88,7 @@ def explain_command(
     from runner.debugging.explain import explain
     from runner.debugging.explanation import sections
 
-    require_one_form(as_json, as_markdown)
+    require_one("as_json", "as_markdown")
 
     def planned(plan: Plan) -> None:
         if dry_run:

@@ -21,9 +21,10 @@ from runner.cli.options import (
     markdown_option,
     ray_option,
     recordings_option,
+    require_one,
     workers_option,
 )
-from runner.cli.output import console, draw, echo, facts, print_json, print_sections, require_one_form, say
+from runner.cli.output import console, draw, echo, facts, print_json, print_sections, say
 from runner.cli.parameter_types import ConfigName
 from runner.cli.progress import seldom, stage_line
 from runner.errors import ExitCode, RunnerError
@@ -159,7 +160,7 @@ def show(
     from runner.sweep.results import DEFAULT_SHOWN, results_of, sections
     from runner.sweep.state import read_sweep
 
-    require_one_form(as_json, as_markdown)
+    require_one("as_json", "as_markdown")
     folder = recordings_folder(recordings)
     if best is not None:
         require_new(best, force)
