@@ -72,15 +72,16 @@ class EpisodeRef:
             return at
         if isinstance(at, int):
             return cls(t=at, word=STEP)
-        if match := _TRAINING.fullmatch(str(at)):
+        text = str(at)
+        if match := _TRAINING.fullmatch(text):
             episode, t = (int(part or 0) for part in match.groups())
             return cls(episode, t)
-        if match := _EVALUATION.fullmatch(str(at)):
+        if match := _EVALUATION.fullmatch(text):
             after, trial, t = (int(part or 0) for part in match.groups())
             return cls(trial, t, after)
-        if match := _WORD.fullmatch(str(at)):
+        if match := _WORD.fullmatch(text):
             return cls(t=int(match[3] or 0), word=match[1] or match[2])
-        raise RunnerError(f"found {str(at)[:60]!r}, expected {expected}.")
+        raise RunnerError(f"found {text[:60]!r}, expected {expected}.")
 
     def __str__(self) -> str:
         """Return the text that `parse` takes."""
@@ -164,6 +165,10 @@ class EpisodeRef:
         return NotInRecording(
             f"{recording.path}: {part}{self.title} has {steps:,} steps, from 0; found no step {t:,}."
         )
+
+
+StepLike = EpisodeRef | str | int
+"""What names a step: a reference, the text of one, or the number of a training step."""
 
 
 # --- training steps ---------------------------------------------------------------------------------------

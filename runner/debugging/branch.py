@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from runner.analysis.episodes import STEP, EpisodeRef
+from runner.analysis.episodes import STEP, EpisodeRef, StepLike
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import TrainingBranch, branch_training
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action
@@ -93,7 +93,7 @@ class _Task:
 def branch(
     run: Run,
     *,
-    at: str | int | EpisodeRef,
+    at: StepLike,
     action: Any = None,
     overrides: Sequence[str] = (),
     episodes: int | None = None,

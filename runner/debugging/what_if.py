@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.contents import ending_of, require_steps
-from runner.analysis.episodes import EpisodeRef
+from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Moment
 from runner.environments.mdp import Mdp, events_of
@@ -57,7 +57,7 @@ class Branched:
     """The Q-tables of each learner that the branch was played with, [S, actions]; empty if there are none."""
 
 
-def what_if(run: Run, *, at: str | int | EpisodeRef, actions: Sequence[str | int] = ()) -> WhatIf:
+def what_if(run: Run, *, at: StepLike, actions: Sequence[str | int] = ()) -> WhatIf:
     """Return where each joint action at a step of a job's episode leads, or some of them.
 
     Args:
@@ -73,10 +73,10 @@ def what_if(run: Run, *, at: str | int | EpisodeRef, actions: Sequence[str | int
         RunnerError: the run was recorded from a loop.
     """
     with open_recording(run.recording) as recording:
-        return what_if_in(recording, EpisodeRef.parse(at), actions)
+        return what_if_in(recording, at, actions)
 
 
-def what_if_in(recording: Recording, at: EpisodeRef, actions: Sequence[str | int] = ()) -> WhatIf:
+def what_if_in(recording: Recording, at: StepLike, actions: Sequence[str | int] = ()) -> WhatIf:
     """Return where actions lead, as `what_if` does, from an open recording."""
     return _Branches(recording, at).compare(_chosen(recording.mdp, list(map(str, actions))))
 
@@ -96,13 +96,13 @@ def _chosen(mdp: Mdp, actions: list[str]) -> Iterable[int]:
     return chosen
 
 
-def branched(recording: Recording, at: EpisodeRef, action: str | int) -> Branched:
+def branched(recording: Recording, at: StepLike, action: str | int) -> Branched:
     """Return the whole episode to which an action leads; errors as for `what_if`."""
     return _Branches(recording, at).episode(joint_action(recording.mdp, str(action)))
 
 
 def branch_playback(
-    recording: Recording, at: EpisodeRef, action: str | int, limit: int, first: int = 0
+    recording: Recording, at: StepLike, action: str | int, limit: int, first: int = 0
 ) -> Playback:
     """Return what a page plays of the episode to which a joint action leads: at most `limit` steps.
 
@@ -119,12 +119,12 @@ def branch_playback(
 class _Branches:
     """The branches of one step of a recorded episode of a job."""
 
-    def __init__(self, recording: Recording, at: EpisodeRef) -> None:
+    def __init__(self, recording: Recording, reference: StepLike) -> None:
         recording.require_job(
             "`what_if`", "`dualtaxi branch` and runner.branch() play a loop on with one action."
         )
         require_steps(recording, "branch")
-        at = at.resolved(recording)
+        at = EpisodeRef.parse(reference).resolved(recording)
         self._recording, self._at, self._mdp = recording, at, recording.mdp
         self._number = at.number_in(recording)
         self._read_episode()

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.contents import require_steps
-from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, training_step
+from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, StepLike, training_step
 from runner.analysis.sections import Grid, Section, html
 from runner.archive.places import at_hand
 from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
@@ -130,8 +130,8 @@ def when(
     expression: str,
     *,
     every: bool = False,
-    first: int | str | EpisodeRef | None = None,
-    last: int | str | EpisodeRef | None = None,
+    first: StepLike | None = None,
+    last: StepLike | None = None,
     report: Callable[[int], None] = lambda _: None,
 ) -> When:
     """Return the first training step after which an expression holds, or every interval in which it does.
@@ -157,8 +157,8 @@ def when_in(
     recording: Recording,
     expression: str,
     every: bool = False,
-    first: int | str | EpisodeRef | None = None,
-    last: int | str | EpisodeRef | None = None,
+    first: StepLike | None = None,
+    last: StepLike | None = None,
     report: Callable[[int], None] = lambda _: None,
     limit: int = MAX_INTERVALS,
 ) -> When:
@@ -277,7 +277,7 @@ def _scalar(term: Series, value: np.float64 | np.bool_, is_known: bool) -> Scala
     return int(value) if term.is_whole else float(value)
 
 
-def _step_number(recording: Recording, at: int | str | EpisodeRef) -> int:
+def _step_number(recording: Recording, at: StepLike) -> int:
     return training_step(recording, EpisodeRef.parse(at, EXPECTED_OF_TRAINING))
 
 

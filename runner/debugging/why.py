@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.episodes import EpisodeRef
+from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import at_hand
 from runner.debugging.q_value import EpisodesPart, Part, RewardPart, StepPart, Why
 from runner.debugging.weights import Cell, Weights, weights_of
@@ -62,7 +62,7 @@ def why(
     state: int | str | None = None,
     action: int | str | None = None,
     agent: str | None = None,
-    at: str | int | EpisodeRef | None = None,
+    at: StepLike | None = None,
     limit: int = LIMIT,
     report: Callable[[int], None] = lambda _: None,
 ) -> Why:
@@ -95,7 +95,7 @@ def why_in(
     state: str | None = None,
     action: str | None = None,
     agent: str | None = None,
-    at: str | int | EpisodeRef | None = None,
+    at: StepLike | None = None,
     limit: int = LIMIT,
     report: Callable[[int], None] = lambda _: None,
 ) -> Why:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from runner.analysis.diff.divergence import first_difference, unbroken
-from runner.analysis.episodes import EpisodeRef, reference_to, training_step, training_steps
+from runner.analysis.episodes import EpisodeRef, StepLike, reference_to, training_step, training_steps
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.config.sections import Branch, Changes
@@ -52,7 +52,7 @@ class TrainingBranch:
 def branch_training(
     run: Run,
     *,
-    at: str | int | EpisodeRef,
+    at: StepLike,
     action: Action | None = None,
     overrides: Sequence[str] = (),
     episodes: int | None = None,
@@ -114,7 +114,7 @@ def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: St
 
 def branch_job(
     recording: Recording,
-    at: str | int | EpisodeRef,
+    at: StepLike,
     action: Action | None,
     overrides: Sequence[str],
     episodes: int | None,

@@ -18,7 +18,14 @@ from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATI
 from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
-from runner.analysis.episodes import TYPICAL, EpisodeRef, first_state, last_whole_evaluation, ranked_trials
+from runner.analysis.episodes import (
+    TYPICAL,
+    EpisodeRef,
+    StepLike,
+    first_state,
+    last_whole_evaluation,
+    ranked_trials,
+)
 from runner.analysis.histograms import histograms
 from runner.analysis.sections import Grid
 from runner.analysis.series import series_of
@@ -103,7 +110,7 @@ def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
         return _compact(data | {"has_pictures": has_pictures, "picture_note": note})
 
 
-def branch_part(path: Path, at: EpisodeRef, action: str, start: int, steps: int) -> bytes:
+def branch_part(path: Path, at: str, action: str, start: int, steps: int) -> bytes:
     """Return a part of the episode to which a joint action leads, as `episode_part` does."""
     with open_recording(path) as recording:
         return _compact(_branch_part(recording, at, action, start, steps))
@@ -146,7 +153,7 @@ def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
         return str(partials().answer(sections, recording.run_id)).encode()
 
 
-def _branch_part(recording: Recording, at: EpisodeRef, action: str, start: int, steps: int) -> Json:
+def _branch_part(recording: Recording, at: StepLike, action: str, start: int, steps: int) -> Json:
     episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
     scene = recording.environment["scene"] if episode.grid else None
     note = "" if scene else "The environment has no scene to draw."

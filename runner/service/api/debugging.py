@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
-from runner.analysis.episodes import EXPECTED, EpisodeRef
+from runner.analysis.episodes import EXPECTED
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
 from runner.debugging.what_if import what_if_in
 from runner.service import computed, fragments
@@ -62,7 +62,7 @@ async def what_if(
         computed.answer,
         run.recording,
         what_if_in,
-        (("at", EpisodeRef.parse(at)), ("actions", tuple(action or ()))),
+        (("at", at), ("actions", tuple(action or ()))),
     )
 
 
@@ -78,6 +78,4 @@ async def branch(
     steps: Steps = STEPS,
 ) -> Response:
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
-    return await compute.json(
-        fragments.branch_part, run.recording, EpisodeRef.parse(at), action, start, steps
-    )
+    return await compute.json(fragments.branch_part, run.recording, at, action, start, steps)
