@@ -72,6 +72,17 @@ class RunProgress:
     last_evaluation: dict[str, object] | None
     """Its episode, and the value of each metric by name; None before the first."""
 
+    @property
+    def share(self) -> float:
+        """Share of the job's work that is done."""
+        return (self.run - 1 + self.episode / max(1, self.episodes)) / self.runs
+
+    @property
+    def text(self) -> str:
+        """The work that is done, as `job.js` writes it."""
+        run = f", run {self.run} of {self.runs}" if self.runs > 1 else ""
+        return f"{self.episode:,} of {self.episodes:,} episodes{run}"
+
 
 @dataclass(frozen=True)
 class BestTrial:
@@ -96,6 +107,16 @@ class SweepProgress:
     bytes: int
     best: BestTrial | None
 
+    @property
+    def share(self) -> float:
+        """Share of the runs that are done."""
+        return self.done / max(1, self.runs)
+
+    @property
+    def text(self) -> str:
+        """The runs that are done, as `job.js` writes it."""
+        return f"{self.done:,} of {self.runs:,} runs"
+
 
 JobProgress = RunProgress | SweepProgress
 EventData = StateEvent | RunEvent | LogEvent | JobProgress
@@ -105,12 +126,12 @@ _TYPES: Final[Mapping[str, Any]] = {
     "log": LogEvent,
     "progress": JobProgress,
 }
-"""The types of events, as they are named in a stream of events and in the server's database."""
+"""The types of events, as they are named in a stream of events and in the server's logs."""
 
 
 @dataclass(frozen=True)
 class JobEvent:
-    """An event of a job. Only the latest progress counts, so it is not stored."""
+    """An event of a job. Only the latest progress counts, so no log has it."""
 
     data: EventData
     id: str = ""
@@ -130,7 +151,7 @@ class JobEvent:
 
     @classmethod
     def from_json(cls, kind: str, values: JsonView, event_id: str = "") -> JobEvent:
-        """Return an event from a stream or the database.
+        """Return an event from a stream or a log.
 
         Raises:
             RunnerError: it is none.

@@ -138,7 +138,7 @@ async def submit(
     checked = await jobs.checker.check(text, source)  # may take long, so no thread waits for it
 
     def add() -> JobResponse:
-        return created(jobs.add(text, checked, workers), jobs, request, response)
+        return created(jobs.add(text, checked, workers), request, response)
 
     return await run_sync(add)
 
@@ -164,7 +164,7 @@ def list_jobs(
     """List the jobs, and return the state of the queue."""
     matching = [job for job in reversed(jobs.store.jobs()) if not state or job.state in state]
     return JobsPage(
-        jobs=[job_response(job, jobs) for job in matching[offset : offset + limit]],
+        jobs=[job_response(job) for job in matching[offset : offset + limit]],
         total=len(matching),
         offset=offset,
         limit=limit,
@@ -180,7 +180,7 @@ def list_jobs(
 )
 def one(jobs: JobsOf, number: Number) -> JobResponse:
     """Return a job."""
-    return job_response(jobs.store.job(number), jobs)
+    return job_response(jobs.store.job(number))
 
 
 @router.get(
@@ -202,7 +202,7 @@ def submitted(jobs: JobsOf, number: Number) -> Response:
 )
 def cancel(jobs: JobsOf, number: Number) -> JobResponse:
     """Cancel a job; its worker closes its recording."""
-    return job_response(jobs.cancel(number), jobs)
+    return job_response(jobs.cancel(number))
 
 
 @router.post(
@@ -219,7 +219,7 @@ def resume(
     ] = False,
 ) -> JobResponse:
     """Queue a job again: it continues where it stopped, and ends as if it never had."""
-    return job_response(jobs.resume(number, accept_changes), jobs)
+    return job_response(jobs.resume(number, accept_changes))
 
 
 @router.get(
@@ -244,7 +244,7 @@ async def watch(
     `state`, `run` and `log` have ids; `progress` has none, because only the latest counts.
     """
     last = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else after
-    if jobs.store.job(number).is_over and last and not (await run_sync(jobs.store.events, number, last))[0]:
+    if jobs.store.job(number).is_over and last == jobs.store.log_size(number):
         return Response(status_code=HTTPStatus.NO_CONTENT)  # which stops a browser from reconnecting
     if jobs.watchers >= MAX_WATCHERS:
         raise Refused(
@@ -261,26 +261,23 @@ async def _events(jobs: JobQueue, number: int, last: int, stopping: asyncio.Even
     jobs.watchers += 1
     try:
         yield f"retry: {RETRY_MILLISECONDS}\n\n"
-        progress, sent, all_read, events = None, time.monotonic(), -1, list[JobEvent]()
+        progress, sent = None, time.monotonic()
         while not stopping.is_set():
-            job, count = jobs.store.job(number), jobs.store.event_count(number)  # before it reads its events
-            before, progress = progress, jobs.pool.progress(number)
-            if count != all_read:
+            job, events = jobs.store.job(number), list[JobEvent]()
+            if last != jobs.store.log_size(number):
                 events, last = await run_sync(jobs.store.events, number, last)
-                all_read = all_read if events else count
-            has_moved = progress is not None and progress is not before
-            if progress is not None and has_moved:
-                yield _as_text(JobEvent(progress))
+            before, progress = progress, job.progress
+            if progress is not None and progress is not before:
+                events.insert(0, JobEvent(progress))
             for event in events:
                 yield _as_text(event)
-            if not events and job.is_over:
+            if events:
+                sent = time.monotonic()
+            elif job.is_over:
                 return
-            if not (events or has_moved):
-                if time.monotonic() - sent < KEEP_ALIVE_SECONDS:
-                    await asyncio.sleep(POLL_SECONDS)
-                    continue
+            elif time.monotonic() - sent >= KEEP_ALIVE_SECONDS:
                 yield ": still here\n\n"
-            sent = time.monotonic()
+                sent = time.monotonic()
             await asyncio.sleep(0 if events else POLL_SECONDS)
     except JobNotFound:  # it was forgotten in the meantime
         return
@@ -294,14 +291,14 @@ def _as_text(event: JobEvent) -> str:
     return f"{head}event: {event.kind}\ndata: {json.dumps(event.as_json(), ensure_ascii=False)}\n\n"
 
 
-def created(job: Job, jobs: JobQueue, request: Request, response: Response) -> JobResponse:
+def created(job: Job, request: Request, response: Response) -> JobResponse:
     """Return the response about a new job, with its address in the header `location`."""
     response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
-    return job_response(job, jobs)
+    return job_response(job)
 
 
-def job_response(job: Job, jobs: JobQueue) -> JobResponse:
+def job_response(job: Job) -> JobResponse:
     """Return the response about a job."""
-    begun = [{"seed": seed, "run_id": run_id} for seed, run_id in jobs.store.run_ids(job.number).items()]
-    progress = jobs.pool.progress(job.number) if job.state == "running" else None
+    begun = [{"seed": seed, "run_id": run_id} for seed, run_id in job.started_runs.items()]
+    progress = job.progress if job.state == "running" else None
     return JobResponse.model_validate(vars(job) | {"progress": progress, "begun": begun})

@@ -32,7 +32,7 @@ async def branch(
 ) -> JobResponse:
     """Queue a branch of training, as `dualtaxi branch` records it; of a run that was trained here."""
     job = await queue_branch(run, jobs, sent)
-    return await run_in_threadpool(created, job, jobs, request, response)
+    return created(job, request, response)
 
 
 @router.post(
@@ -44,7 +44,7 @@ async def branch(
 async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, response: Response) -> JobResponse:
     """Queue an explanation, as `dualtaxi explain` computes it."""
     job = await queue_explanation(jobs, sent)
-    return await run_in_threadpool(created, job, jobs, request, response)
+    return created(job, request, response)
 
 
 async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Job:

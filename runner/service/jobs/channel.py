@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
-from runner.client.jobs import JobProgress, LogEvent, RunEvent
+from runner.client.jobs import EventData
 from runner.errors import RunnerError
 from runner.runs.listing import run_at
 from runner.runs.run import Run
-from runner.service.jobs.store import Job
+from runner.service.jobs.store import Job, read_values
 
 REPORT_SECONDS: Final = 0.25
 OTHER_OWNER_SECONDS: Final = 60.0
@@ -27,34 +27,22 @@ class JobSpec:
     """What a worker process needs to know of a job."""
 
     job: Job
-    values: dict[str, object]
-    """The configuration or sweep, every value present."""
-    run_ids: dict[int, str]
-    """The run ids reserved for a configuration, by seed."""
     recordings: Path
     workers: int | None
     """How many processes may train at once; None for as many as a cluster has."""
     ray: str | None
     """The address of the Ray cluster that runs the job; None for this machine."""
 
-
-@dataclass(frozen=True)
-class Outcome:
-    """The result of a job."""
-
-    state: Literal["finished", "interrupted", "failed"]
-    error: str = ""
-
-
-Message = Outcome | JobProgress | RunEvent | tuple[LogEvent, ...]
-"""What a worker sends to the server."""
+    def values(self) -> dict[str, object]:
+        """Return the configuration or sweep, every value present."""
+        return read_values(self.recordings, self.job.number)
 
 
 class JobChannel(Protocol):
-    """Where a run sends its messages, and learns that it must stop."""
+    """Where a run sends its events, and learns that it must stop."""
 
-    def send(self, message: Message) -> None:
-        """Send a message to the server."""
+    def send(self, event: EventData) -> None:
+        """Send an event to the server."""
 
     def stop(self) -> bool:
         """Return whether the run must stop."""
@@ -73,10 +61,10 @@ class PipeChannel:
         self._lock = threading.Lock()
         threading.Thread(target=self._receive, name="channel", daemon=True).start()
 
-    def send(self, message: Message) -> None:
-        """Send a message to the server; nothing happens if it is gone."""
+    def send(self, event: EventData) -> None:
+        """Send an event to the server; nothing happens if it is gone."""
         with self._lock, contextlib.suppress(OSError):
-            self._pipe.send(message)
+            self._pipe.send(event)
 
     def stop(self) -> bool:
         """Return whether the job must stop."""

@@ -10,7 +10,7 @@ from typing import Final
 
 from pydantic import BaseModel, Field
 
-from runner.client.jobs import LogEvent, SweepProgress
+from runner.client.jobs import LogEvent, StateEvent, SweepProgress
 from runner.config.shipped import shipped
 from runner.debugging.explain import (
     DEFAULT_SEEDS,
@@ -26,7 +26,7 @@ from runner.debugging.explanation import summary
 from runner.debugging.mixtures import Measured, Measurement
 from runner.errors import ConfigError, RunNotFound
 from runner.runs.resolve import find_run
-from runner.service.jobs.channel import REPORT_SECONDS, JobSpec, Outcome, PipeChannel
+from runner.service.jobs.channel import REPORT_SECONDS, JobSpec, PipeChannel
 from runner.service.jobs.checking import MAX_RUNS, CheckedJob, is_path
 from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
@@ -79,9 +79,9 @@ def _refuse_initial_path(source: str, recordings: Path) -> None:
             raise ConfigError(f"initial_q: found the path {run!r}, expected the id of a run here.")
 
 
-def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
+def run_explain_job(spec: JobSpec, channel: PipeChannel) -> StateEvent:
     """Train what is left of an explanation, and store it."""
-    question = _question(ExplainQuestion.model_validate(spec.values), spec.recordings)
+    question = _question(ExplainQuestion.model_validate(spec.values()), spec.recordings)
     stages = set[str]()
 
     def report(done: int, total: int, what: str) -> None:
@@ -89,7 +89,7 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
             channel.send(SweepProgress(done, total, 0, 0, 0, 0, None))
         elif what not in stages:
             stages.add(what)
-            channel.send((LogEvent(LINES[what]),))
+            channel.send(LogEvent(LINES[what]))
 
     workers: Workers[Measurement, Measured]
     try:
@@ -101,12 +101,13 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
                 except ExplanationBusy:  # another job or command asks for another metric, or more seeds
                     report(0, 0, BUSY)
                     if channel.stop():
-                        return Outcome("interrupted")
+                        return StateEvent("interrupted")
                     time.sleep(REPORT_SECONDS)
     except KeyboardInterrupt:
-        return Outcome("interrupted")
-    channel.send(tuple(map(LogEvent, summary(result))))
-    return Outcome("finished")
+        return StateEvent("interrupted")
+    for line in summary(result):
+        channel.send(LogEvent(line))
+    return StateEvent("finished")
 
 
 def _question(given: ExplainQuestion, recordings: Path) -> Question:

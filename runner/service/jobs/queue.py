@@ -50,7 +50,7 @@ class JobQueue:
         """Start working: jobs that the last server left running or interrupted come first."""
         for job in self.store.jobs():
             if job.state in ("running", "interrupted"):
-                self.store.set_state(job.number, "queued")
+                self.store.update(job.number, state="queued")
         self.pool.start()
         return self
 
@@ -79,12 +79,10 @@ class JobQueue:
             if checked.kind == "sweep":
                 self._refuse_running_sweep(checked.name)
             given = min(workers or self.pool.size, self._usable_workers(checked))
-            job = self.store.add(
-                checked.kind, checked.name, checked.runs, text, checked.values, given, keep=self.pool.busy
-            )
+            job = self.store.add(checked.kind, checked.name, checked.runs, text, checked.values, given)
             if workers is not None and workers > given:
                 line = f"{workers} workers were requested; it gets {given}, the most that it can use here"
-                self.store.log(job.number, [LogEvent(line)])
+                self.store.report(job.number, LogEvent(line))
             return job
 
     def cancel(self, number: int) -> Job:
@@ -97,9 +95,7 @@ class JobQueue:
             job = self.store.job(number)
             if job.is_over:
                 raise JobStateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
-            job = self.store.set_state(number, "cancelled", ended=now())
-            self.pool.stop_job(number)
-            return job
+            return self.store.update(number, state="cancelled", ended=now())
 
     def resume(self, number: int, accept_changes: bool = False) -> Job:
         """Queue a failed or cancelled job again; it continues where it stopped.
@@ -117,7 +113,7 @@ class JobQueue:
             if job.kind == "sweep":
                 self._refuse_running_sweep(job.name)
             fresh = {"error": "", "ended": "", "deaths": 0, "retry": True}
-            return self.store.set_state(number, "queued", accept_changes=accept_changes, **fresh)
+            return self.store.update(number, state="queued", accept_changes=accept_changes, **fresh)
 
     def status(self) -> QueueStatus:
         """Return the state of the queue."""
@@ -132,7 +128,7 @@ class JobQueue:
 
     def _usable_workers(self, checked: CheckedJob) -> int:
         """Return the most workers that a job can use; a cluster has its own for the runs of a job."""
-        if checked.kind not in WITHOUT_RUNS or self.pool.is_on_cluster:
+        if checked.kind not in WITHOUT_RUNS or self.pool.ray is not None:
             return 1
         return min(checked.runs, self.pool.size)
 

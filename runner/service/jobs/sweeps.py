@@ -7,12 +7,11 @@ import math
 import time
 from collections.abc import Callable, Iterator
 
-from runner.client.jobs import BestTrial, LogEvent, SweepProgress
+from runner.client.jobs import BestTrial, LogEvent, StateEvent, SweepProgress
 from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
     REPORT_SECONDS,
     JobSpec,
-    Outcome,
     PipeChannel,
     wait_for_owners,
 )
@@ -25,9 +24,9 @@ from runner.sweep.running import INTERRUPTED, SweepStatus, run_sweep
 from runner.sweep.task import Result, Task
 
 
-def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
+def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> StateEvent:
     """Run what is left of a sweep."""
-    sweep = from_values(spec.values)
+    sweep = from_values(spec.values())
     with _locked_sweep(spec, channel.stop):
         exists = spec.job.name in sweeps_in(spec.recordings)
         state.begin(sweep, spec.recordings, resume=exists, accept_changes=spec.job.accept_changes)
@@ -51,12 +50,12 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> Outcome:
             )
         reporter.send(status)
     if status.stopped == INTERRUPTED and channel.stop():
-        return Outcome("interrupted")
+        return StateEvent("interrupted")
     if status.stopped:
-        return Outcome("failed", f"stopped: {status.stopped}")
+        return StateEvent("failed", f"stopped: {status.stopped}")
     if status.failed:
-        return Outcome("failed", f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
-    return Outcome("finished")
+        return StateEvent("failed", f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
+    return StateEvent("finished")
 
 
 @contextlib.contextmanager
@@ -94,7 +93,7 @@ class _SweepReporter:
         if best is not None and best.number != self._best:
             self._best = best.number
             text = f"trial {best.number} is the best so far: {best.value:g}"
-            self._channel.send((LogEvent(text),))
+            self._channel.send(LogEvent(text))
         shown = None
         if best is not None:
             # A level that was never reached is infinite or None; JSON has no infinity.

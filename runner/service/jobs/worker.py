@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.archive.places import at_hand
-from runner.client.jobs import LogEvent, RunEvent, RunProgress
+from runner.client.jobs import LogEvent, RunEvent, RunProgress, StateEvent
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.errors import RunnerError
@@ -25,7 +25,6 @@ from runner.service.jobs.channel import (
     REPORT_SECONDS,
     JobChannel,
     JobSpec,
-    Outcome,
     PipeChannel,
     wait_for_owners,
 )
@@ -35,6 +34,7 @@ from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
 from runner.sweep.cluster import RayActor, connect, start_actor
 from runner.util.compilation import MESSAGE, announced
+from runner.util.values import as_utf8
 
 MAX_TEXT: Final = 4000
 """The length of a log line."""
@@ -47,28 +47,28 @@ def work(pipe: Connection, spec: JobSpec) -> None:
     channel = PipeChannel(pipe)
     signal.signal(signal.SIGTERM, channel.request_stop)
     try:
-        with announced(lambda: channel.send((LogEvent(MESSAGE),))):
+        with announced(lambda: channel.send(LogEvent(MESSAGE))):
             run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.job.kind, run_config_job)
             outcome = run(spec, channel)
-    except RunnerError as error:
+    except (RunnerError, OSError) as error:
         message = "\n".join([str(error), *getattr(error, "__notes__", [])])
-        outcome = Outcome("failed", without_folders(message, spec.recordings))
+        outcome = StateEvent("failed", as_utf8(without_folders(message, spec.recordings)))
     channel.send(outcome)
 
 
-def run_config_job(spec: JobSpec, channel: JobChannel) -> Outcome:
+def run_config_job(spec: JobSpec, channel: JobChannel) -> StateEvent:
     """Run what is left of a configuration's seeds, one after the other."""
-    config = from_mapping(spec.values)
+    config = from_mapping(spec.values())
     run = run_seed if spec.ray is None else run_seed_on_ray
     for seed in config.seeds:
         if channel.stop() or run(spec, channel, config, seed) != "finished":
-            return Outcome("interrupted")
-    return Outcome("finished")
+            return StateEvent("interrupted")
+    return StateEvent("finished")
 
 
 def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
     """Start or resume a job's run of one seed; return its status."""
-    run = _existing_run(spec.recordings / spec.run_ids[seed])
+    run = _existing_run(spec.recordings / spec.job.run_ids[seed])
     if run is not None and run.status == "finished":
         return run.status
     if run is not None:
@@ -78,7 +78,7 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
     else:
         job = Job(config, seed)
         parent = _parent_of(job, spec.recordings) if spec.job.kind == "branch" else None
-        run = create_run(spec.recordings, config, seed, spec.job.name, spec.run_ids[seed], parent)
+        run = create_run(spec.recordings, config, seed, spec.job.name, spec.job.run_ids[seed], parent)
         reporter = Reporter(channel, run.run_id, config, seed)
         if parent is None:
             run = run_job(job, run, reporter.report, channel.stop)
@@ -127,8 +127,8 @@ class Reporter:
         """Send what has not been sent yet."""
         if (progress := self._progress) is None:
             return
-        if lines := progress.log[self._logged :]:
-            self._channel.send(tuple(LogEvent(text[:MAX_TEXT], self._run_id, self._seed) for text in lines))
+        for text in progress.log[self._logged :]:
+            self._channel.send(LogEvent(text[:MAX_TEXT], self._run_id, self._seed))
         self._logged = len(progress.log)
         sent = RunProgress(
             run_id=self._run_id,

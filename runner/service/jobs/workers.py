@@ -5,19 +5,16 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Container, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Final
 
-from runner.client.jobs import JobProgress, LogEvent, RunEvent
-from runner.config import from_mapping
-from runner.errors import StorageError
+from runner.client.jobs import EventData, LogEvent, StateEvent
 from runner.execution.estimate import free_bytes
-from runner.runs.run import new_run_id
-from runner.service.jobs.channel import JobSpec, Message, Outcome
-from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
+from runner.service.jobs.channel import JobSpec
+from runner.service.jobs.store import Job, JobStore, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
 from runner.service.processes import PRELOADED
@@ -37,31 +34,36 @@ RETRY_SECONDS: Final = 5.0
 
 @dataclass
 class _Worker:
-    job: Job
+    number: int
+    """The number of its job."""
+    workers: int
+    """How many workers the job holds."""
     process: BaseProcess
     pipe: Any
-    outcome: Outcome | None = None
     stopped: float | None = None
     """When the request to stop was sent."""
 
     def stop(self) -> None:
-        self.stopped = self.stopped or time.monotonic()
-        with contextlib.suppress(OSError):  # it is dead
-            self.pipe.send(None)
+        """Request that it closes its recording; once it has had time for that, kill it."""
+        if self.stopped is None:
+            self.stopped = time.monotonic()
+            with contextlib.suppress(OSError):  # it is dead
+                self.pipe.send(None)
+        elif time.monotonic() - self.stopped > STOP_SECONDS:
+            self.process.kill()
 
 
 class WorkerPool:
     """Runs the queued jobs of a store, each in a worker process, or on a Ray cluster.
 
-    One thread starts the workers and receives their messages; the other methods read, or send a request.
+    One thread starts the workers, receives their events, and stops those that have a job that is no longer
+    running; the other methods read.
     """
 
     def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
-        self.size, self._store, self._ray, self._lock = size, store, ray, store.lock
+        self.size, self.ray, self._store, self._lock = size, ray, store, store.lock
         self._context = process_context(PRELOADED)
         self._busy: dict[int, _Worker] = {}
-        self._progress: dict[int, JobProgress] = {}
-        """The last progress that each job's worker sent, also when the job is over."""
         self._start_problem, self._retry_at = "", 0.0
         """Why the last attempt to start a worker failed, and when to try again (monotonic seconds)."""
         self._stopping = threading.Event()
@@ -82,26 +84,6 @@ class WorkerPool:
         """Whether queued jobs are started: the thread that does so is alive and can start workers."""
         return self._thread.is_alive() and not self._start_problem
 
-    @property
-    def is_on_cluster(self) -> bool:
-        """Whether a Ray cluster runs the jobs."""
-        return self._ray is not None
-
-    @property
-    def busy(self) -> Container[int]:
-        """The numbers of the jobs that have a worker."""
-        return self._busy
-
-    def stop_job(self, number: int) -> None:
-        """Have the worker of a job, if it has one, close its recording."""
-        with self._lock:
-            if number in self._busy:
-                self._busy[number].stop()
-
-    def progress(self, number: int) -> JobProgress | None:
-        """Return the progress that a job's worker last sent, also when it is over; None if none did."""
-        return self._progress.get(number)
-
     def waiting_for(self) -> str:
         """Return why the next job is not started although a worker is free; empty if it would be."""
         job, free = self._next_job(), self._free()
@@ -111,16 +93,10 @@ class WorkerPool:
         return self._start_problem or self._short_of_disk()
 
     def _run(self) -> None:
-        """Start workers and receive their messages, until the server stops."""
-        while not self._stopping.is_set():
+        """Start workers and receive their events, until the server stops."""
+        while self._busy or not self._stopping.is_set():
             with _logged(), self._lock:
                 self._start_next()
-            with _logged():
-                self._receive()
-        with self._lock:
-            for worker in self._busy.values():
-                worker.stop()
-        while self._busy:
             with _logged():
                 self._receive()
 
@@ -132,35 +108,30 @@ class WorkerPool:
             return
         if self._needed(job) > self._free() or job.number in self._busy or self._short_of_disk():
             return
-        if time.monotonic() < self._retry_at:
+        if self._stopping.is_set() or time.monotonic() < self._retry_at:
             return
         try:
             self._busy[job.number] = self._start_worker(job)
-        except (OSError, StorageError) as error:  # no process, memory, descriptor or disk space is left
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else error
-            self._start_problem = f"no worker process can be started ({reason})"
+        except OSError as error:  # no process, memory or descriptor is left
+            self._start_problem = f"no worker process can be started ({error.strerror or error})"
             self._retry_at = time.monotonic() + RETRY_SECONDS
             LOG.warning("worker", extra={"job": job.number, "problem": self._start_problem})
             return
         except Exception as error:
             problem = f"its worker cannot be started: {error}"
-            self._store.set_state(job.number, "failed", error=problem, ended=now())
+            self._store.update(job.number, state="failed", error=problem, ended=now())
             raise
         self._start_problem = ""
-        remembered = {each.number for each in self._store.jobs()} - {job.number}
-        self._progress = {number: last for number, last in self._progress.items() if number in remembered}
-        self._store.set_state(job.number, "running", started=job.started or now())
+        self._store.update(job.number, state="running", started=job.started or now(), progress=None)
 
     def _start_worker(self, job: Job) -> _Worker:
         """Start the worker process of a job."""
-        values = self._store.values(job.number)
+        workers = self._needed(job)
         spec = JobSpec(
             job=job,
-            values=values,
-            run_ids=self._reserved_runs(job, values),
             recordings=self._store.recordings,
-            workers=self._needed(job) if self._ray is None else None,
-            ray=self._ray,
+            workers=workers if self.ray is None else None,
+            ray=self.ray,
         )
         ours, theirs = self._context.Pipe()
         with contextlib.closing(theirs):
@@ -170,17 +141,7 @@ class WorkerPool:
             except BaseException:
                 ours.close()
                 raise
-        return _Worker(job, process, ours)
-
-    def _reserved_runs(self, job: Job, values: dict[str, object]) -> dict[int, str]:
-        """Return the run id of each seed, stored before the run exists: so no run is started twice."""
-        if job.kind in WITHOUT_RUNS:
-            return {}
-        run_ids = self._store.run_ids(job.number, started=False)
-        seeds = [seed for seed in from_mapping(values).seeds if seed not in run_ids]
-        missing = {seed: new_run_id(self._store.recordings) for seed in seeds}
-        self._store.reserve_runs(job.number, missing)
-        return run_ids | missing
+        return _Worker(job.number, workers, process, ours)
 
     def _next_job(self) -> Job | None:
         """Return the job that is started next: jobs start in the order of their numbers."""
@@ -191,7 +152,7 @@ class WorkerPool:
         return min(job.workers, self.size)
 
     def _free(self) -> int:
-        return self.size - sum(self._needed(worker.job) for worker in list(self._busy.values()))
+        return self.size - sum(worker.workers for worker in list(self._busy.values()))
 
     def _short_of_disk(self) -> str:
         free = free_bytes(self._store.recordings)
@@ -200,68 +161,60 @@ class WorkerPool:
         return f"disk: {size(free)} are free, and a job is started when {size(RESERVE_BYTES)} are"
 
     def _receive(self) -> None:
-        """Receive messages of workers, and handle those that died or do not stop."""
+        """Receive events of workers, and stop those that have nothing more to do."""
         by_pipe = {worker.pipe: worker for worker in self._busy.values()}
         if not by_pipe:
             self._stopping.wait(RECEIVE_SECONDS)
             return
+        for worker in by_pipe.values():
+            if self._stopping.is_set() or not self._store.is_running(worker.number):
+                worker.stop()
         for pipe in connection.wait(list(by_pipe), RECEIVE_SECONDS):
             with _logged():
                 self._receive_from(by_pipe[pipe])
-        for worker in by_pipe.values():
-            if worker.stopped is not None and time.monotonic() - worker.stopped > STOP_SECONDS:
-                worker.process.kill()
 
     def _receive_from(self, worker: _Worker) -> None:
-        """Handle one message of a worker, or its end."""
+        """Handle one event of a worker, or its end."""
+        event: EventData | None = None
         try:
-            message: Message = worker.pipe.recv()
-        except Exception as error:
-            if not isinstance(error, EOFError | OSError):  # after an unpicklable message the pipe is useless
-                LOG.exception("jobs")
-                worker.process.kill()
-            self._remove(worker)
-            return
-        number = worker.job.number
-        with self._lock:
-            if isinstance(message, Outcome):
-                worker.outcome = message
-                self._store_outcome(self._store.job(number), message)
-            elif isinstance(message, RunEvent):
-                self._store.start_run(number, message.seed, message.run_id)
-            elif isinstance(message, tuple):
-                self._store.log(number, message)
-            else:
-                self._progress[number] = message
-
-    def _store_outcome(self, job: Job, outcome: Outcome) -> None:
-        """Store the outcome of a job; one that was cancelled, and perhaps queued again, keeps its state."""
-        if job.state != "running":
-            return
-        if outcome.state == "interrupted":
-            self._store.set_state(job.number, "interrupted" if self._stopping.is_set() else "queued")
-        else:
-            self._store.set_state(job.number, outcome.state, error=outcome.error, ended=now())
-
-    def _remove(self, worker: _Worker) -> None:
-        """Remove a worker whose process has ended, or is about to; queue its job again if it died, once."""
-        worker.pipe.close()
-        worker.process.join(STOP_SECONDS)
-        if worker.process.is_alive():
+            event = worker.pipe.recv()
+        except (EOFError, OSError):
+            pass
+        except Exception:  # an event that cannot be read; after it the pipe is useless
+            LOG.exception("jobs")
             worker.process.kill()
-            worker.process.join()
+        if event is None or isinstance(event, StateEvent):
+            self._end(worker, event)
+        else:
+            self._store.report(worker.number, event)
+
+    def _end(self, worker: _Worker, outcome: StateEvent | None) -> None:
+        """Remove a worker that is about to end, with the outcome of its job; None if it died.
+
+        A job that was cancelled, and perhaps queued again, keeps its state. One with a worker that died, or
+        was told to stop by another, is queued again, unless too many died.
+        """
+        worker.process.join(STOP_SECONDS)
+        worker.process.kill()
+        worker.process.join()
+        worker.pipe.close()
         with self._lock:
-            del self._busy[worker.job.number]
-            job = self._store.job(worker.job.number)
-            if worker.outcome is not None or job.state != "running":
+            del self._busy[worker.number]
+            if not self._store.is_running(worker.number):
                 return
-            code, deaths = worker.process.exitcode, job.deaths + 1
-            self._store.log(job.number, [LogEvent(f"the worker died (exit code {code})")])
-            if deaths < MAX_DEATHS:
-                self._store.set_state(job.number, "queued", deaths=deaths)
-                return
-            error = f"its worker died {deaths} times, at last with exit code {code}; was there enough memory?"
-            self._store.set_state(job.number, "failed", deaths=deaths, error=error, ended=now())
+            job = self._store.job(worker.number)
+            deaths = job.deaths + (outcome is None)
+            if outcome is None:
+                code = worker.process.exitcode
+                self._store.report(job.number, LogEvent(f"the worker died (exit code {code})"))
+                error = (
+                    f"its worker died {deaths} times, at last with exit code {code}; was there enough memory?"
+                )
+                outcome = StateEvent("failed", error) if deaths >= MAX_DEATHS else StateEvent("interrupted")
+            is_over = outcome.state != "interrupted"
+            state = outcome.state if is_over or self._stopping.is_set() else "queued"
+            ended = now() if is_over else ""
+            self._store.update(job.number, state=state, error=outcome.error or "", ended=ended, deaths=deaths)
 
 
 @contextlib.contextmanager

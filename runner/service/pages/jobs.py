@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
 from typing import Annotated, Final
@@ -10,10 +9,9 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
-from runner.client.jobs import SweepProgress
 from runner.debugging.explanation_files import explanations_in
 from runner.service.addresses import Paging
-from runner.service.api.jobs import JobResponse, Number, job_response
+from runner.service.api.jobs import Number, job_response
 from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
@@ -26,17 +24,6 @@ ROWS: Final = 50
 MAX_LINES: Final = 1000
 """Lines of a job's log that its page shows."""
 PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**6)]
-
-
-@dataclass(frozen=True)
-class ShownJob:
-    """A job with its progress."""
-
-    facts: JobResponse
-    share: float | None
-    """Share of the work that is done; None if it is unknown."""
-    progress: str
-    """The same as text, as `job.js` writes it."""
 
 
 @router.get("")
@@ -64,7 +51,7 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     is_answered = own_job.kind == "explain" and own_job.is_over
     answers = explanations_in(jobs.recordings) if is_answered else []
     values = {
-        "job": shown_job(own_job, jobs),
+        "job": job_response(own_job),
         "log": events,
         "place": place,  # the number of the first event after the log
         "submitted": jobs.store.submitted(number),
@@ -89,24 +76,11 @@ def resume(jobs: JobsOf, number: Number) -> Response:
     return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
 
 
-def shown_job(job: Job, jobs: JobQueue) -> ShownJob:
-    """Return a job with its progress."""
-    facts = job_response(job, jobs)
-    now = facts.progress
-    if not now or job.state != "running":
-        return ShownJob(facts, None, "")
-    if isinstance(now, SweepProgress):
-        return ShownJob(facts, now.done / max(1, now.runs), f"{now.done:,} of {now.runs:,} runs")
-    share = (now.run - 1 + now.episode / max(1, now.episodes)) / now.runs
-    run = f", run {now.run} of {now.runs}" if now.runs > 1 else ""
-    return ShownJob(facts, share, f"{now.episode:,} of {now.episodes:,} episodes{run}")
-
-
 def _rows(jobs: JobQueue, number: int) -> dict[str, object]:
     """Return a page of the table of jobs."""
     newest_first = list(reversed(jobs.store.jobs()))
     return {
-        "jobs": [shown_job(job, jobs) for job in newest_first[(number - 1) * ROWS : number * ROWS]],
+        "jobs": [job_response(job) for job in newest_first[(number - 1) * ROWS : number * ROWS]],
         "status": jobs.status(),
         "is_active": any(job.state in ("queued", "running") for job in newest_first),
         "paging": Paging(number, len(newest_first), ROWS, "/queue"),

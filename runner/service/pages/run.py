@@ -233,8 +233,8 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
 def _job_of(run: Run, jobs: JobQueue) -> tuple[int | None, Json]:
     """Return the job that makes a run, or will resume it, and the run's progress in it."""
     for job in jobs.store.jobs():
-        if not job.is_over and run.run_id in jobs.store.run_ids(job.number).values():
-            progress = jobs.pool.progress(job.number) if job.state == "running" else None
+        if not job.is_over and run.run_id in job.started_runs.values():
+            progress = job.progress if job.state == "running" else None
             is_at_run = isinstance(progress, RunProgress) and progress.run_id == run.run_id
             return job.number, vars(progress) if is_at_run else {}
     return None, {}

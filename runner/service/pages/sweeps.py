@@ -19,9 +19,9 @@ from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
 from runner.service import sweep_fragments
 from runner.service.addresses import link
+from runner.service.api.jobs import job_response
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
-from runner.service.pages.jobs import shown_job
 from runner.service.pages.rendering import message_of, page
 from runner.service.response_cache import ALWAYS
 from runner.sweep import folder_of, sweeps_in, tag_of
@@ -94,7 +94,7 @@ async def sweep(
             "name": name,
             "runs": state.runs,
             "runs_address": link("/runs", query),
-            "job": shown_job(own[-1], jobs) if own else None,
+            "job": job_response(own[-1]) if own else None,
             "parts": parts,
         }
         return page(request, "sweep_page.html", values)

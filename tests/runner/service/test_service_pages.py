@@ -309,7 +309,7 @@ def test_the_page_of_a_run_is_live_once_a_job_will_resume_it(client, recordings,
     assert "data-live" not in page_of(client, "/runs/first")
     assert client.get("/runs/first/status?status=interrupted").status_code == 204
     assert client.post("/api/v1/jobs", content="env: {id: FrozenLake-v1}\nepisodes: 60").status_code == 201
-    client.app.state.jobs.store.start_run(1, 0, run.run_id)
+    client.app.state.jobs.store.update(1, run_ids={0: run.run_id}, begun=1)
     page = page_of(client, "/runs/first")
     assert f'data-live="/runs/{run.run_id}/status?status=interrupted"' in page
     assert "live.js" in page

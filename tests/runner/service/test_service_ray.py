@@ -42,13 +42,13 @@ def test_a_job_on_ray_gives_the_same_runs_and_can_be_cancelled(cluster, tmp_path
         far = sorted(list_runs(tmp_path / "far"), key=lambda run: run.seed)
         digests = [[run.summary["content_digest"] for run in runs] for runs in (far, here)]
         assert digests[0] == digests[1]
-        assert jobs.store.run_ids(number) == {run.seed: run.run_id for run in far}
+        assert over.started_runs == {run.seed: run.run_id for run in far}
         kinds = {event.kind for event in jobs.store.events(number)[0]}
         assert kinds == {"state", "run", "log"}
         with open_recording(far[0].recording) as recording:
             assert recording.provenance["package.ray"]
         endless = submit(jobs, ENDLESS).number
-        until(lambda progress: progress and progress.episode > 0, lambda: jobs.pool.progress(endless))
+        until(lambda progress: progress and progress.episode > 0, lambda: jobs.store.job(endless).progress)
         jobs.cancel(endless)
         until(lambda job: job.state == "cancelled", lambda: jobs.store.job(endless))
     (run,) = [run for run in list_runs(tmp_path / "far") if run.name == "endless"]

@@ -1,20 +1,20 @@
-"""The store of jobs in SQLite."""
+"""The store of jobs, in folders."""
 
 from __future__ import annotations
 
-import contextlib
+import errno
 import os
-import sqlite3
 
 import pytest
 
-from runner.client.jobs import LogEvent
+from runner.client.jobs import LogEvent, RunEvent, RunProgress
 from runner.errors import RunnerError, StorageError
 from runner.service.errors import JobNotFound, QueueFull
 from runner.service.jobs import store as stores
-from runner.service.jobs.store import JobStore
+from runner.service.jobs.store import JobStore, read_values
 
-CONFIG = {"episodes": 3, "env": {"kwargs": {"limit": float("inf")}}}
+CONFIG = {"episodes": 3, "seeds": [0]}
+SWEEP = {"parameters": {"limit": [1.5, float("inf")]}}
 
 
 def added(store, name="tiny"):
@@ -34,23 +34,27 @@ def store(tmp_path):
 def test_jobs_their_runs_and_events_outlive_the_process(tmp_path):
     with JobStore(tmp_path) as store:
         first, second = added(store), added(store, "other")
+        third = store.add("sweep", "swept", 2, "", SWEEP, 2)
         store.update(first.number, state="failed", error="no luck")
-        store.log(second.number, [LogEvent("hello")])
-        store.reserve_runs(second.number, {2**64 - 1: "aaaa", 3: "bbbb"})
-        store.start_run(second.number, 3, "bbbb")
+        store.report(second.number, LogEvent("hello"))
+        store.update(second.number, run_ids={2**64 - 1: "aaaa", 3: "bbbb"})
+        store.report(second.number, RunEvent("aaaa", 2**64 - 1))
         before, events = store.jobs(), store.events(second.number)
     with JobStore(tmp_path) as store:
         assert store.jobs() == before
         assert [(job.number, job.state, job.error) for job in before] == [
             (1, "failed", "no luck"),
             (2, "queued", ""),
+            (3, "queued", ""),
         ]
+        assert (read_values(tmp_path, third.number), third.run_ids, third.workers) == (SWEEP, {}, 2)
         assert store.events(2) == events
         assert [event.kind for event in events[0]] == ["state", "log", "run"]
-        assert (store.submitted(1), store.values(1)) == ("episodes: 3\n", CONFIG)
-        assert store.run_ids(2) == {3: "bbbb"}
-        assert store.run_ids(2, started=False) == {3: "bbbb", 2**64 - 1: "aaaa"}
-        assert added(store).number == 3
+        assert (store.submitted(1), read_values(tmp_path, 1)) == ("episodes: 3\n", CONFIG)
+        assert store.job(2).run_ids == {2**64 - 1: "aaaa", 3: "bbbb"}
+        assert store.job(2).started_runs == {2**64 - 1: "aaaa"}
+        assert [len(run_id) for run_id in store.job(1).run_ids.values()] == [8], "reserved at once"
+        assert added(store).number == 4
 
 
 def test_one_process_at_a_time_has_the_store(store):
@@ -80,48 +84,66 @@ def test_the_oldest_jobs_that_are_over_are_forgotten_but_no_number_is_used_twice
         assert added(store).number == 6
 
 
-def test_a_file_that_is_no_database_is_reported_and_kept(tmp_path):
+def test_a_damaged_job_is_reported_and_kept(tmp_path):
     with JobStore(tmp_path) as store:
-        path = store.path
-    path.write_bytes(b"no database" * 1000)
-    with pytest.raises(StorageError, match="move it away to start with an empty queue"):
-        JobStore(tmp_path)
-    assert path.read_bytes().startswith(b"no database")
+        state = store.path(added(store).number, stores.STATE_FILE)
+    for damaged in (b"", b"no job", b'{"number": 1}'):
+        state.write_bytes(damaged)
+        with pytest.raises(StorageError, match="move its folder away to start without the job"):
+            JobStore(tmp_path)
+        assert state.read_bytes() == damaged
 
 
-def test_the_jobs_of_a_server_that_gave_no_workers_are_read(tmp_path):
+def test_a_submission_that_was_not_confirmed_leaves_nothing(tmp_path):
     with JobStore(tmp_path) as store:
-        before, path = added(store), store.path
-    with contextlib.closing(sqlite3.connect(path)) as database:
-        database.execute("ALTER TABLE jobs DROP COLUMN workers")
+        folder = store.path(added(store).number)
+    (folder / stores.STATE_FILE).unlink()  # which is written last
     with JobStore(tmp_path) as store:
-        assert store.jobs() == [before]
+        assert (store.jobs(), folder.exists()) == ([], False)
+        assert added(store).number == 1
+
+
+def test_a_line_that_was_not_written_to_its_end_is_left_out(tmp_path):
+    with JobStore(tmp_path) as store:
+        number = added(store).number
+        store.report(number, LogEvent("one"))
+        before, log = store.events(number), store.path(number, stores.LOG_FILE)
+    with log.open("ab") as stream:
+        stream.write(b'{"kind": "log", "values": {"text": "the power fai')
+    with JobStore(tmp_path) as store:
+        assert store.log_size(number) == before[1]
+        assert store.events(number) == before
+        store.report(number, LogEvent("two"))
+        assert texts(store.events(number)[0]) == ["queued", "one", "two"]
+        assert store.events(number, before[1])[1] == store.log_size(number)
 
 
 def test_a_reader_continues_after_the_last_event_it_saw(store):
     number, other = added(store).number, added(store).number
-    store.log(number, [LogEvent("one")])
+    store.report(number, LogEvent("one"))
     seen, last = store.events(number)
-    store.log(number, [LogEvent("two — ü")])
+    store.report(number, LogEvent("two — ü"))
     assert texts(seen) == ["queued", "one"]
     assert int(seen[-1].id) == last
     assert texts(store.events(number, last)[0]) == ["two — ü"]
+    store.report(other, LogEvent("three"))
     for id_ in (last + 3, 10**9, store.events(other)[1]):
         assert store.events(number, id_)[0] == store.events(number)[0], "it is no event of the job"
 
 
 def test_many_events_are_read_in_parts_and_too_many_are_dropped(store, monkeypatch):
     monkeypatch.setattr(stores, "EVENTS_PER_READ", 30)
-    monkeypatch.setattr(stores, "MAX_EVENTS", 100)
+    monkeypatch.setattr(stores, "MAX_LOG_BYTES", 10_000)
     number = added(store).number
-    for i in range(0, 200, 4):
-        store.log(number, [LogEvent(f"line {i + j}") for j in range(4)])
+    for i in range(200):
+        store.report(number, LogEvent(f"line {i}"))
     store.update(number, state="finished")
     found, last = [], 0
     while (part := store.events(number, last))[0]:
         assert len(part[0]) <= 30
         found, last = [*found, *part[0]], part[1]
-    assert texts(found) == ["queued", *(f"line {i}" for i in range(99)), "finished"]
+    assert 100 < len(found) < 130
+    assert texts(found) == ["queued", *(f"line {i}" for i in range(len(found) - 2)), "finished"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -132,25 +154,46 @@ def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
 
 
 def test_on_a_full_disk_a_job_is_not_queued_and_a_change_counts_until_the_next_start(tmp_path, monkeypatch):
-    def full(*_):
-        raise sqlite3.OperationalError("database or disk is full")
+    def full(path, *_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
 
     with JobStore(tmp_path) as store:
         job = added(store)
-        monkeypatch.setattr(store, "_insert_events", full)
-        with pytest.raises(StorageError, match="disk is full"):
+        monkeypatch.setattr(stores, "_write", full)
+        with pytest.raises(StorageError, match="No space left on device"):
             added(store)
-        with pytest.raises(StorageError, match="disk is full"):
-            store.update(job.number, state="finished")
-        assert [job.state for job in store.jobs()] == ["finished"]
+        assert [folder.name for folder in store.path(job.number).parent.iterdir() if folder.is_dir()] == ["1"]
+        store.update(job.number, state="cancelled")
+        assert [job.state for job in store.jobs()] == ["cancelled"]
     with JobStore(tmp_path) as store:
         assert store.jobs() == [job]
+
+
+def test_a_line_that_the_disk_had_no_room_for_is_dropped_and_later_ones_are_whole(store, monkeypatch):
+    number = added(store).number
+    log = store.path(number, stores.LOG_FILE)
+    whole = log.read_bytes()
+    log.write_bytes(whole + b'{"kind": "log", "values": {"text": "a line of which the disk took only ')
+    assert texts(store.events(number)[0]) == ["queued"]
+    for text in ("one", "two", "three"):
+        store.report(number, LogEvent(text))
+        assert store.events(number)[1] == store.log_size(number)
+    assert texts(store.events(number)[0]) == ["queued", "one", "two", "three"]
+
+
+def test_progress_is_no_event_and_is_that_of_the_last_report(store):
+    number, progress = added(store).number, RunProgress("aaaa", 0, 1, 1, 2, 3, 40, 0, 500, None)
+    before = store.events(number)
+    store.report(number, progress)
+    assert store.job(number).progress == progress
+    assert store.events(number) == before
 
 
 def test_the_last_events_are_read(store):
     number = added(store).number
     assert texts(store.last_events(number, 10)[0]) == ["queued"]
-    store.log(number, [LogEvent(f"line {i}") for i in range(100)])
+    for i in range(100):
+        store.report(number, LogEvent(f"line {i}"))
     found, last = store.last_events(number, 10)
     assert texts(found) == [f"line {i}" for i in range(90, 100)]
     assert store.events(number, last) == ([], last)
