@@ -17,9 +17,9 @@ from pydantic import BaseModel, Field
 from runner.client.jobs import JobEvent, JobProgress
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused
-from runner.service.jobs.checking import DEFAULT_SOURCE, CheckedJob
+from runner.service.jobs.checking import DEFAULT_SOURCE
 from runner.service.jobs.queue import JobQueue, QueueStatus
-from runner.service.jobs.store import Job, Kind, State
+from runner.service.jobs.store import CheckedJob, Job, Kind, State
 from runner.service.problems import error_docs, media_docs
 
 POLL_SECONDS: Final = 0.25
@@ -136,11 +136,7 @@ async def submit(
 ) -> JobResponse:
     """Check the text, and queue it; each mistake is reported with its line and key."""
     checked = await jobs.checker.check(text, source)  # may take long, so no thread waits for it
-
-    def add() -> JobResponse:
-        return created(jobs.add(text, checked, workers), request, response)
-
-    return await run_sync(add)
+    return created(await run_sync(jobs.add, text, checked, workers), request, response)
 
 
 @router.post(

@@ -12,10 +12,10 @@ from runner.runs.run import Run
 from runner.service.api.jobs import JobResponse, created
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.errors import Refused
-from runner.service.jobs.checking import BranchQuestion, CheckedJob, check_branch
+from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
-from runner.service.jobs.store import Job
+from runner.service.jobs.store import CheckedJob, Job
 from runner.service.problems import RUN_ERRORS
 
 router = APIRouter(tags=["jobs"], responses=RUN_ERRORS)

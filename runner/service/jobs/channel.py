@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeVar
 
 from runner.client.jobs import EventData
 from runner.errors import RunnerError
@@ -17,6 +19,7 @@ from runner.runs.listing import run_at
 from runner.runs.run import Run
 from runner.service.jobs.store import Job, read_values
 
+T = TypeVar("T")
 REPORT_SECONDS: Final = 0.25
 OTHER_OWNER_SECONDS: Final = 60.0
 """Time limit for another owner to release a run; on another host it counts as dead after 15 s."""
@@ -80,20 +83,44 @@ class PipeChannel:
         self.request_stop()
 
 
+def until_free(
+    attempt: Callable[[], T],
+    busy: type[RunnerError],
+    stop: Callable[[], bool],
+    seconds: float = math.inf,
+    waiting: Callable[[], None] = lambda: None,
+) -> T:
+    """Return the result of a call that is repeated as long as it raises `busy`; `waiting` is called then.
+
+    The error is raised when the job must stop, or after this time.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return attempt()
+        except busy:
+            if stop() or time.monotonic() > deadline:
+                raise
+            waiting()
+            time.sleep(REPORT_SECONDS)
+
+
 def wait_for_owners(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
     """Wait until no process owns one of these runs: the workers of a server that was killed are stopping.
 
     Raises:
-        RunnerError: one is still owned after a minute.
+        RunnerError: one is still owned after a minute, or when the job must stop.
     """
-    deadline = time.monotonic() + OTHER_OWNER_SECONDS
     for run in runs:
-        while run.status == "running" and not stop():
-            if time.monotonic() > deadline:
-                owner = run.file.owner
-                raise RunnerError(
-                    f"run {run.run_id} is still running (process {owner.get('pid')} on {owner.get('host')}); "
-                    "resume the job when that has ended."
-                )
-            time.sleep(REPORT_SECONDS)
-            run = run_at(run.folder)  # noqa: PLW2901
+        if run.status == "running":
+            until_free(partial(_require_free, run.folder), RunnerError, stop, OTHER_OWNER_SECONDS)
+
+
+def _require_free(folder: Path) -> None:
+    run = run_at(folder)
+    if run.status == "running":
+        owner = run.file.owner
+        raise RunnerError(
+            f"run {run.run_id} is still running (process {owner.get('pid')} on {owner.get('host')}); "
+            "resume the job when that has ended."
+        )

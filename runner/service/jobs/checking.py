@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, ParamSpec
 
@@ -27,7 +26,7 @@ from runner.recording.reader import open_recording
 from runner.replay.trust import require_listed
 from runner.runs.run import Run
 from runner.service.errors import Busy
-from runner.service.jobs.store import Kind
+from runner.service.jobs.store import CheckedJob
 from runner.service.processes import ProcessPool
 from runner.sweep import state, sweeps_in
 from runner.sweep.loading import from_text as sweep_from_text
@@ -50,19 +49,6 @@ DEFAULT_SOURCE: Final = "job.yaml"
 MAX_RUNS: Final = 10_000
 SWEEP_KEYS: Final = ("base", "parameters", "strategy")
 """A file with one of these keys is a sweep."""
-
-
-@dataclass(frozen=True)
-class CheckedJob:
-    """The meaning of a submitted text, or of a question about runs."""
-
-    kind: Kind
-    name: str
-    runs: int
-    bytes: int
-    """The estimated size of its recordings; 0 if unknown."""
-    values: dict[str, object]
-    """The configuration, or the sweep, every value present."""
 
 
 def check(text: str, source: str, recordings: Path) -> CheckedJob:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from pydantic import BaseModel, Field
 
-from runner.client.jobs import LogEvent, StateEvent, SweepProgress
+from runner.client.jobs import LogEvent, SweepProgress
 from runner.config.shipped import shipped
 from runner.debugging.explain import (
     DEFAULT_SEEDS,
@@ -26,8 +26,9 @@ from runner.debugging.explanation import summary
 from runner.debugging.mixtures import Measured, Measurement
 from runner.errors import ConfigError, RunNotFound
 from runner.runs.resolve import find_run
-from runner.service.jobs.channel import REPORT_SECONDS, JobSpec, PipeChannel
-from runner.service.jobs.checking import MAX_RUNS, CheckedJob, is_path
+from runner.service.jobs.channel import JobSpec, PipeChannel, until_free
+from runner.service.jobs.checking import MAX_RUNS, is_path
+from runner.service.jobs.store import CheckedJob
 from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
 
@@ -79,7 +80,7 @@ def _refuse_initial_path(source: str, recordings: Path) -> None:
             raise ConfigError(f"initial_q: found the path {run!r}, expected the id of a run here.")
 
 
-def run_explain_job(spec: JobSpec, channel: PipeChannel) -> StateEvent:
+def run_explain_job(spec: JobSpec, channel: PipeChannel) -> None:
     """Train what is left of an explanation, and store it."""
     question = _question(ExplainQuestion.model_validate(spec.values()), spec.recordings)
     stages = set[str]()
@@ -92,22 +93,15 @@ def run_explain_job(spec: JobSpec, channel: PipeChannel) -> StateEvent:
             channel.send(LogEvent(LINES[what]))
 
     workers: Workers[Measurement, Measured]
-    try:
-        with worker_pool(spec.workers, spec.ray, question.mixtures[1]) as workers:
-            while True:
-                try:
-                    result = answer(question, workers, report, stop=channel.stop)
-                    break
-                except ExplanationBusy:  # another job or command asks for another metric, or more seeds
-                    report(0, 0, BUSY)
-                    if channel.stop():
-                        return StateEvent("interrupted")
-                    time.sleep(REPORT_SECONDS)
-    except KeyboardInterrupt:
-        return StateEvent("interrupted")
+    with worker_pool(spec.workers, spec.ray, question.mixtures[1]) as workers:
+        result = until_free(
+            partial(answer, question, workers, report, stop=channel.stop),
+            ExplanationBusy,  # another job or command asks for another metric, or more seeds
+            channel.stop,
+            waiting=lambda: report(0, 0, BUSY),
+        )
     for line in summary(result):
         channel.send(LogEvent(line))
-    return StateEvent("finished")
 
 
 def _question(given: ExplainQuestion, recordings: Path) -> Question:

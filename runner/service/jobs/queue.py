@@ -10,8 +10,8 @@ from runner.client.jobs import LogEvent
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
-from runner.service.jobs.checking import CheckedJob, JobChecker
-from runner.service.jobs.store import WITHOUT_RUNS, Job, JobStore, now
+from runner.service.jobs.checking import JobChecker
+from runner.service.jobs.store import WITHOUT_RUNS, CheckedJob, Job, JobStore, now
 from runner.service.jobs.workers import WorkerPool
 from runner.sweep.cluster import require_ray
 from runner.util.humanize import size
@@ -79,7 +79,7 @@ class JobQueue:
             if checked.kind == "sweep":
                 self._refuse_running_sweep(checked.name)
             given = min(workers or self.pool.size, self._usable_workers(checked))
-            job = self.store.add(checked.kind, checked.name, checked.runs, text, checked.values, given)
+            job = self.store.add(checked, text, given)
             if workers is not None and workers > given:
                 line = f"{workers} workers were requested; it gets {given}, the most that it can use here"
                 self.store.report(job.number, LogEvent(line))

@@ -32,7 +32,6 @@ from runner.runs.locking import acquired
 from runner.runs.run import new_run_id
 from runner.service.errors import JobNotFound, QueueFull
 from runner.util.files import replacing, storage_errors
-from runner.util.values import JsonView
 
 if TYPE_CHECKING:
     from filelock import FileLock
@@ -51,8 +50,21 @@ LOG_FILE: Final = "log.jsonl"
 LOG_TAIL_BYTES: Final = 1 << 16
 """The end of a log, which is read for its last whole line."""
 MAX_LOG_BYTES: Final = 8 << 20
-"""Size of a job's log; beyond it only its states are stored."""
+"""Size of a job's log; beyond it only its states and the starts of its runs are stored."""
 EVENTS_PER_READ: Final = 2000
+
+
+@dataclass(frozen=True)
+class CheckedJob:
+    """The meaning of a submitted text, or of a question about runs."""
+
+    kind: Kind
+    name: str
+    runs: int
+    bytes: int
+    """The estimated size of its recordings; 0 if unknown."""
+    values: dict[str, object]
+    """The configuration, or the sweep, every value present."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +96,7 @@ class Job:
     begun: int = 0
     """How many of these runs were started."""
     progress: JobProgress | None = None
-    """The last progress that its worker reported, also when it is over."""
+    """The last progress that its worker reported, also when it is over; not stored."""
 
     @property
     def is_over(self) -> bool:
@@ -153,20 +165,11 @@ class JobStore:
 
     def is_running(self, number: int) -> bool:
         """Return whether a job is running; one that was forgotten is not."""
-        return number in self._jobs and self._jobs[number].state == "running"
+        job = self._jobs.get(number)
+        return job is not None and job.state == "running"
 
-    def add(
-        self,
-        kind: Kind,
-        name: str,
-        runs: int,
-        submitted: str,
-        values: JsonView,
-        workers: int = 1,
-    ) -> Job:
-        """Append a job to the queue, on disk, and return it.
-
-        The text is `submitted`, `values` what it means, every value present.
+    def add(self, checked: CheckedJob, submitted: str, workers: int = 1) -> Job:
+        """Append the job that a submitted text means to the queue, on disk, and return it.
 
         Raises:
             QueueFull: there are too many unfinished jobs.
@@ -179,16 +182,16 @@ class JobStore:
                     f"{unfinished:,} jobs are unfinished, the maximum; wait until one of them is over."
                 )
             number = max(self._jobs, default=0) + 1
-            seeds = () if kind in WITHOUT_RUNS else from_mapping(values).seeds
+            seeds = () if checked.kind in WITHOUT_RUNS else from_mapping(checked.values).seeds
             run_ids = {seed: new_run_id(self.recordings) for seed in seeds}
-            job = Job(number, kind, name, runs, now(), workers, run_ids=run_ids)
+            job = Job(number, checked.kind, checked.name, checked.runs, now(), workers, run_ids=run_ids)
             try:
                 with storage_errors(self.path(number), "free some disk"):
                     self.path(number).mkdir()
                     _write(self.path(number, TEXT_FILE), submitted.encode())
-                    _write(self.path(number, VALUES_FILE), write_yaml(values).encode())
+                    _write(self.path(number, VALUES_FILE), write_yaml(checked.values).encode())
                     self._append(number, StateEvent("queued"))
-                    _write(self.path(number, STATE_FILE), _STORED.dump_json(job))  # last: now it is a job
+                    self._write_state(job)  # last: from now on it is a job
             except BaseException:
                 self._forget(number)
                 raise
@@ -209,7 +212,7 @@ class JobStore:
             with contextlib.suppress(OSError):
                 if (job.state, job.error) != (before.state, before.error):
                     self._append(number, StateEvent(job.state, job.error or None))
-                _write(self.path(number, STATE_FILE), _STORED.dump_json(job))
+                self._write_state(job)
             self._jobs[number] = job
             return job
 
@@ -228,7 +231,7 @@ class JobStore:
                 return
             if isinstance(event, RunEvent):
                 self.update(number, begun=max(job.begun, list(job.run_ids).index(event.seed) + 1))
-            if self._log_sizes[number] < MAX_LOG_BYTES:
+            if isinstance(event, RunEvent) or self._log_sizes[number] < MAX_LOG_BYTES:
                 with contextlib.suppress(OSError):
                     self._append(number, event)
 
@@ -252,7 +255,9 @@ class JobStore:
                 if not line.endswith(b"\n"):
                     break  # it is being written
                 after += len(line)
-                with contextlib.suppress(ValueError, RunnerError):  # damaged when the machine stopped
+                with contextlib.suppress(
+                    TypeError, ValueError, RunnerError
+                ):  # damaged when the machine stopped
                     events.append(JobEvent.from_json(**json.loads(line), event_id=str(after)))
         return events, after
 
@@ -297,6 +302,9 @@ class JobStore:
             log.seek(size)  # over a line that was not written to its end because the disk was full
             log.write(line)
         self._log_sizes[number] = size + len(line)
+
+    def _write_state(self, job: Job) -> None:
+        _write(self.path(job.number, STATE_FILE), _STORED.dump_json(job, exclude={"progress"}))
 
     def path(self, number: int, name: str = "") -> Path:
         """Return the folder of a job, or a file in it."""

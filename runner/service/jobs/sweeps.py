@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator
+from functools import partial
 
-from runner.client.jobs import BestTrial, LogEvent, StateEvent, SweepProgress
+from runner.client.jobs import BestTrial, LogEvent, SweepProgress
+from runner.errors import RunnerError
 from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
     REPORT_SECONDS,
     JobSpec,
     PipeChannel,
+    until_free,
     wait_for_owners,
 )
 from runner.sweep import state, sweeps_in
@@ -20,14 +21,19 @@ from runner.sweep.cluster import worker_pool
 from runner.sweep.loading import from_values
 from runner.sweep.local import Workers
 from runner.sweep.plan import limit_of, plan_of, require_disk
-from runner.sweep.running import INTERRUPTED, SweepStatus, run_sweep
+from runner.sweep.running import SweepStatus, run_sweep
 from runner.sweep.task import Result, Task
 
 
-def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> StateEvent:
-    """Run what is left of a sweep."""
+def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> None:
+    """Run what is left of a sweep, once no other process runs it."""
+    rest = partial(_run_rest, spec, channel)
+    until_free(rest, state.SweepBusy, channel.stop, OTHER_OWNER_SECONDS)
+
+
+def _run_rest(spec: JobSpec, channel: PipeChannel) -> None:
     sweep = from_values(spec.values())
-    with _locked_sweep(spec, channel.stop):
+    with state.locked(spec.job.name, spec.recordings):
         exists = spec.job.name in sweeps_in(spec.recordings)
         state.begin(sweep, spec.recordings, resume=exists, accept_changes=spec.job.accept_changes)
         if spec.job.retry:
@@ -49,29 +55,10 @@ def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> StateEvent:
                 accept_changes=spec.job.accept_changes,
             )
         reporter.send(status)
-    if status.stopped == INTERRUPTED and channel.stop():
-        return StateEvent("interrupted")
     if status.stopped:
-        return StateEvent("failed", f"stopped: {status.stopped}")
+        raise RunnerError(f"stopped: {status.stopped}")
     if status.failed:
-        return StateEvent("failed", f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
-    return StateEvent("finished")
-
-
-@contextlib.contextmanager
-def _locked_sweep(spec: JobSpec, stop: Callable[[], bool]) -> Iterator[None]:
-    """Keep every other process from running the sweep; wait for one that is about to stop."""
-    deadline = time.monotonic() + OTHER_OWNER_SECONDS
-    with contextlib.ExitStack() as stack:
-        while True:
-            try:
-                stack.enter_context(state.locked(spec.job.name, spec.recordings))
-                break
-            except state.SweepBusy:
-                if time.monotonic() > deadline or stop():
-                    raise
-                time.sleep(REPORT_SECONDS)
-        yield
+        raise RunnerError(f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
 
 
 class _SweepReporter:

@@ -49,21 +49,23 @@ def work(pipe: Connection, spec: JobSpec) -> None:
     try:
         with announced(lambda: channel.send(LogEvent(MESSAGE))):
             run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.job.kind, run_config_job)
-            outcome = run(spec, channel)
-    except (RunnerError, OSError) as error:
+            run(spec, channel)
+        outcome = StateEvent("finished")
+    except (RunnerError, OSError, KeyboardInterrupt) as error:
         message = "\n".join([str(error), *getattr(error, "__notes__", [])])
         outcome = StateEvent("failed", as_utf8(without_folders(message, spec.recordings)))
+        if channel.stop():  # whatever else was the matter, the next worker meets it again
+            outcome = StateEvent("interrupted")
     channel.send(outcome)
 
 
-def run_config_job(spec: JobSpec, channel: JobChannel) -> StateEvent:
+def run_config_job(spec: JobSpec, channel: JobChannel) -> None:
     """Run what is left of a configuration's seeds, one after the other."""
     config = from_mapping(spec.values())
     run = run_seed if spec.ray is None else run_seed_on_ray
     for seed in config.seeds:
         if channel.stop() or run(spec, channel, config, seed) != "finished":
-            return StateEvent("interrupted")
-    return StateEvent("finished")
+            raise KeyboardInterrupt
 
 
 def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:

@@ -18,7 +18,8 @@ from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
-from runner.service.jobs.checking import SWEEP_KEYS, CheckedJob
+from runner.service.jobs.checking import SWEEP_KEYS
+from runner.service.jobs.store import CheckedJob
 from runner.service.pages.rendering import Form, number_in, page, viewer_of
 from runner.service.problems import error_body
 from runner.sweep.model import SweepFile

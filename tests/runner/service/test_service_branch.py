@@ -102,8 +102,8 @@ def test_a_trial_offers_no_branch_of_training(client):
 def test_a_branch_whose_parent_was_removed_fails_and_leaves_no_run(connect, recordings, tmp_path):
     with JobStore(recordings) as store:
         parent = find_run("first", recordings)
-        checked = check_branch(parent, BranchQuestion(at="20:1", overrides=("epsilon=0.5",)))
-        job = store.add("branch", "orphan", 1, "", checked.values)
+        checked = check_branch(parent, BranchQuestion(at="20:1", overrides=("epsilon=0.5",), name="orphan"))
+        job = store.add(checked, "")
     before = {run.run_id for run in list_runs(recordings)} - {parent.run_id}
     shutil.rmtree(parent.folder)
     client = connect(Settings(recordings=(recordings,), tokens=tmp_path / "tokens.json"))

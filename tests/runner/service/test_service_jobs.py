@@ -18,7 +18,7 @@ from runner.runs.listing import list_runs
 from runner.service.api.jobs import POLL_SECONDS
 from runner.service.jobs import queue, workers
 from runner.service.jobs.queue import JobQueue
-from runner.service.jobs.store import JobStore
+from runner.service.jobs.store import CheckedJob, JobStore
 from tests.waiting import until
 
 CONFIG = ICY | {"episodes": 200, "evaluation": {"every": 100, "trials": 5}}
@@ -308,9 +308,7 @@ def test_a_reserved_run_that_was_never_made_is_made(tmp_path, folder):
         if folder == "there":
             (jobs.recordings / "abcdefgh").mkdir()
         with jobs.store.lock:
-            queued = jobs.store.add(
-                "config", "icy", 1, "", from_mapping(CONFIG | {"seeds": [3]}).to_mapping()
-            )
+            queued = jobs.store.add(one_seed(3), "")
             jobs.store.update(queued.number, run_ids={3: "abcdefgh"})
         over = until(lambda job: job.is_over, lambda: jobs.store.job(queued.number))
         assert over.state == "finished"
@@ -329,7 +327,7 @@ def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(
     monkeypatch.setattr(workers, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
         full.setattr(BaseProcess, "start", refused)
-        number = jobs_of(client).store.add("config", "icy", 1, "", one_seed()).number
+        number = jobs_of(client).store.add(one_seed(), "").number
         waiting = "no worker process can be started (Resource temporarily unavailable)"
         until(
             lambda queue: queue["waiting_for"] == waiting, lambda: client.get("/api/v1/jobs").json()["queue"]
@@ -375,7 +373,7 @@ def test_a_cancelled_job_is_not_forgotten_while_its_worker_closes(client, submit
     job_until(client, number, lambda job: job["progress"] is not None)
     with jobs.store.lock:  # the worker's end is not taken in before the next job is there
         jobs.cancel(number)
-        other = jobs.store.add("config", "icy", 1, "", one_seed()).number
+        other = jobs.store.add(one_seed(), "").number
     job_until(client, other, lambda job: job["state"] == "finished")
 
 
@@ -383,5 +381,5 @@ def jobs_of(client):
     return client.app.state.jobs
 
 
-def one_seed():
-    return from_mapping(CONFIG | {"seeds": [0]}).to_mapping()
+def one_seed(seed=0):
+    return CheckedJob("config", "icy", 1, 0, from_mapping(CONFIG | {"seeds": [seed]}).to_mapping())

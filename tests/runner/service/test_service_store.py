@@ -11,14 +11,14 @@ from runner.client.jobs import LogEvent, RunEvent, RunProgress
 from runner.errors import RunnerError, StorageError
 from runner.service.errors import JobNotFound, QueueFull
 from runner.service.jobs import store as stores
-from runner.service.jobs.store import JobStore, read_values
+from runner.service.jobs.store import CheckedJob, JobStore, read_values
 
 CONFIG = {"episodes": 3, "seeds": [0]}
 SWEEP = {"parameters": {"limit": [1.5, float("inf")]}}
 
 
 def added(store, name="tiny"):
-    return store.add("config", name, 1, "episodes: 3\n", CONFIG)
+    return store.add(CheckedJob("config", name, 1, 0, CONFIG), "episodes: 3\n")
 
 
 def texts(events):
@@ -34,7 +34,7 @@ def store(tmp_path):
 def test_jobs_their_runs_and_events_outlive_the_process(tmp_path):
     with JobStore(tmp_path) as store:
         first, second = added(store), added(store, "other")
-        third = store.add("sweep", "swept", 2, "", SWEEP, 2)
+        third = store.add(CheckedJob("sweep", "swept", 2, 0, SWEEP), "", 2)
         store.update(first.number, state="failed", error="no luck")
         store.report(second.number, LogEvent("hello"))
         store.update(second.number, run_ids={2**64 - 1: "aaaa", 3: "bbbb"})
