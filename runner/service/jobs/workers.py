@@ -44,7 +44,7 @@ class _Worker:
     """When the request to stop was sent."""
 
     def stop(self) -> None:
-        """Request that it closes its recording; once it has had time for that, kill it."""
+        """Ask the worker to close its recording; kill it if it does not."""
         if self.stopped is None:
             self.stopped = time.monotonic()
             with contextlib.suppress(OSError):  # it is dead
@@ -56,7 +56,7 @@ class _Worker:
 class WorkerPool:
     """Runs the queued jobs of a store, each in a worker process, or on a Ray cluster.
 
-    One thread starts the workers, receives their events, and stops those that have a job that is no longer
+    One thread starts the workers, receives their events, and stops a worker when its job is no longer
     running; the other methods read.
     """
 
@@ -161,7 +161,7 @@ class WorkerPool:
         return f"disk: {size(free)} are free, and a job is started when {size(RESERVE_BYTES)} are"
 
     def _receive(self) -> None:
-        """Receive events of workers, and stop those that have nothing more to do."""
+        """Receive events of workers, and stop workers that have nothing more to do."""
         by_pipe = {worker.pipe: worker for worker in self._busy.values()}
         if not by_pipe:
             self._stopping.wait(RECEIVE_SECONDS)
@@ -191,8 +191,8 @@ class WorkerPool:
     def _end(self, worker: _Worker, outcome: StateEvent | None) -> None:
         """Remove a worker that is about to end, with the outcome of its job; None if it died.
 
-        A job that was cancelled, and perhaps queued again, keeps its state. One with a worker that died, or
-        was told to stop by another, is queued again, unless too many died.
+        A job that was cancelled, and perhaps queued again, keeps its state. When a worker died, or was
+        stopped from outside, its job is queued again, unless too many workers died.
         """
         worker.process.join(STOP_SECONDS)
         worker.process.kill()

@@ -53,7 +53,7 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
     values = {
         "job": job_response(own_job),
         "log": events,
-        "place": place,  # the number of the first event after the log
+        "place": place,  # the id of the last event in the log
         "submitted": jobs.store.submitted(number),
         "is_over": own_job.is_over,
         "seconds": _seconds(own_job),
