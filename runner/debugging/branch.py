@@ -32,8 +32,8 @@ from runner.recording.spaces import Value
 from runner.replay.engine import BLOCK_SECONDS, Replay
 from runner.replay.environment import stream_from_child
 from runner.replay.episodes import episode_at
-from runner.replay.makers import why_not_redone
-from runner.replay.stepping import RowStepper
+from runner.replay.makers import why_not_rerun
+from runner.replay.stepping import Stepper
 from runner.replay.steps import transitions_of
 from runner.replay.trust import trusting
 from runner.runs.branches import BranchOrigin
@@ -219,7 +219,7 @@ def _record_branch(path: Path, folder: Path, task: _Task) -> None:
                 f"run {recording.run_id} was trained here; only episodes of loops are branched: runs whose "
                 "environment runner.record wrapped."
             )
-        if reason := why_not_redone(recording, task.trust):
+        if reason := why_not_rerun(recording, task.trust):
             raise CannotRedo(reason)
         player = _Player(recording, folder, task)
         make = partial(Replay, recording, task.trust, 0.0, report_progress, False)
@@ -244,11 +244,11 @@ class _Player:
         self._is_game = False
         self._actions: Iterator[Value] = iter(())
 
-    def begin(self, stepper: RowStepper, actions: Iterator[Value]) -> None:
+    def begin(self, stepper: Stepper, actions: Iterator[Value]) -> None:
         """Record the environment from now on."""
         env, task, recording = stepper.env, self._task, self._recording
         maker = recording.phase(self.phase).maker_of()
-        assert maker is not None  # or `why_not_redone` gave a reason
+        assert maker is not None  # or `why_not_rerun` gave a reason
         self._is_game, self._actions = maker.kind == "pettingzoo", actions
         self._space = copy.deepcopy(stepper.action_space)
         self._space.seed(task.seed)

@@ -18,26 +18,24 @@ from runner.config.loading import recorded_packing
 from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, Diverged, RunnerError
 from runner.execution.initial_tables import address, recorded_tables
-from runner.execution.session import Report, Session, Stop, describe, recorder_for, run_job
+from runner.execution.session import Report, Session, Stop, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS, after_step
-from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
+from runner.recording.actions import ACTION_TOPICS
 from runner.recording.description import recorded_facts
-from runner.recording.metadata import write_result
+from runner.recording.digest import combined_digest
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
-from runner.recording.spaces import least_number
 from runner.recording.writer import RecordingFile
 from runner.replay.engine import Replay
 from runner.replay.environment import stream_from_child
-from runner.replay.makers import why_not_redone
+from runner.replay.makers import why_not_rerun
 from runner.replay.recorded import Piece, pieces
 from runner.replay.steps import last_step
 from runner.replay.tables import tables_at
 from runner.replay.trust import require_may_train
-from runner.replay.whole_steps import blank_steps, fill_in
+from runner.replay.whole_steps import blank_steps, state_of, whole_records
 from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
@@ -54,7 +52,7 @@ def holds_steps(run: Run) -> bool:
         return not recording.leaves_out_steps
 
 
-def is_done_again(run: Run) -> bool:
+def is_rerun(run: Run) -> bool:
     """Return whether the steps of a run come again from its environment, not from training."""
     if not run.recording.is_file():
         return False
@@ -90,7 +88,7 @@ def rerecord(
         KeyboardInterrupt: `stop` returned True; the recording stays as it is.
     """
     with locked(run) as current:
-        is_loop = is_done_again(current)
+        is_loop = is_rerun(current)
         if not is_loop and current.status != "finished":
             from_mapping(current.file.config)  # refuses a loop's run, which nobody can resume
             raise RunnerError(
@@ -188,44 +186,28 @@ def _with(config: ExperimentConfig, **changes: object) -> ExperimentConfig:
 
 
 def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
-    """Train a job again, and write its recording with steps into a new file."""
-    config = from_mapping(run.file.config)
-    job = Job(_with(config, recording=config.to_mapping()["recording"] | {"steps": "all"}), run.seed)
-    mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
+    """Retrain a job, and write its recording with whole steps into a new file."""
     with open_recording(run.recording) as recording:
+        config = from_mapping(recording.config)
+        job = Job(_with(config, recording=config.to_mapping()["recording"] | {"steps": "all"}), run.seed)
+        mdp = load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
-        expected, made_by = recording.result["content_digest"], recording.file.metadata("provenance")
-        metadata = {
-            name: recording.file.metadata(name)
-            for name in recording.file.metadata_names
-            if name == CODE_RECORD or name.startswith("resume/")
-        }
-        circumstances = {topic: list(recording.table(topic).messages()) for topic in schema.MACHINE_TOPICS}
-        code = [entry for entry in recording.file.attachments() if entry[0] == CODE_ATTACHMENT]
-    with RecordingFile(fresh) as file:
-        describe(file, job, run, learner, made_by)
-        for attachment in code:
-            file.add_attachment(*attachment)
-        for name, entries in metadata.items():
-            file.add_metadata(name, entries)
-        file.add_metadata("rerecord", provenance())
+        expected = recording.result["content_digest"]
+
+    def retrain(file: RecordingFile) -> None:
         recorder = recorder_for(job, learner, file, beat=run.beat, clock=False)
-        session = Session(job, learner, recorder, report, stop)
         try:
-            for topic, messages in circumstances.items():
-                for log_time, payload in messages:
-                    recorder.append(topic, payload, log_time // schema.STEP_NANOSECONDS)
-            done = session.run()
-            topics = session.recorder.drain()
+            done, digests = Session(job, learner, recorder, report, stop).run(), recorder.drain()
         except BaseException:
-            session.recorder.abandon()
+            recorder.abandon()
             raise
         if not done:
             raise KeyboardInterrupt(f"the recording of run {run.run_id} is as it was")
-        summary = session.summary(topics)
-        if summary["content_digest"] != expected:
-            raise Diverged("the recording", "content digest", summary["content_digest"], expected)
-        write_result(file, "finished", summary)
+        if (found := combined_digest(digests)) != expected:
+            raise Diverged("the recording", "content digest", found, expected)
+
+    trained = [topic.name for topic in schema.TOPICS]
+    rewrite(run.recording, fresh, _with_all_steps, {"rerecord": provenance()}, trained, retrain)
 
 
 def _require_actions(run: Run, trust: bool) -> None:
@@ -245,7 +227,7 @@ def _require_actions(run: Run, trust: bool) -> None:
                 f"run {run.run_id} was cut off, so it has no content digest to compare with; "
                 f"`dualtaxi verify {run.run_id}` compares the episodes that it has."
             )
-        if reason := why_not_redone(recording, trust):
+        if reason := why_not_rerun(recording, trust):
             raise CannotRedo(reason)
 
 
@@ -276,7 +258,7 @@ def _with_all_steps(name: str, entries: dict[str, str]) -> dict[str, str]:
 
 
 def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
-    """Do the recorded actions again, and write the steps.
+    """Rerun the environment, and write the whole steps.
 
     Raises:
         Diverged: they differ from the recorded ones.
@@ -288,7 +270,7 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
         with closing(Replay(recording, trust)) as replay:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}
             for piece in pieces(recording, schema.PHASES):
-                records = _whole_records(recording, replay, piece, states[piece.phase])
+                records = _whole_steps(recording, replay, piece, states[piece.phase])
                 positions = records["log_time"] // schema.STEP_NANOSECONDS
                 topic = topics[piece.phase]
                 names = (field.name for field in recording.layout.message(topic).fields)
@@ -306,35 +288,23 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
             raise Diverged(name, "digest", digests.get(name), expected)
 
 
-def _whole_records(
+def _whole_steps(
     recording: Recording, replay: Replay, piece: Piece, states: NDArray[np.int64]
 ) -> NDArray[np.void]:
     """Return the whole records of the steps of a piece; `states` are those after the last of each."""
-    rows, records = piece.rows, blank_steps(recording, piece.phase, piece.rows)
+    records, before, n = blank_steps(recording, piece.phase, piece.rows), states.copy(), len(states)
     for environment in replay.environments:
         for steps in replay.steps(piece, environment, draws=False):
-            fill_in(records, steps.step - piece.first, steps)
-    after = after_step(records.dtype)
-    start = least_number(recording.spaces["observation"]) if recording.has_states else 0
+            own = steps.environment % n
+            whole, states[own] = whole_records(recording, steps, states[own])
+            records[steps.recorded["step"] - piece.first] = whole
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment
-        if row < len(rows) and rows["t"][row] == schema.RESET_ONLY:
-            records[after][row] = reset.observation - start if start else reset.observation
-    if recording.has_states:
-        _fill_states(records, piece, states, start)
+        if row >= len(records) or records["t"][row] != schema.RESET_ONLY:
+            continue
+        if recording.has_states:
+            records["state"][row] = records["next_state"][row - n] if row >= n else before[row]
+            records["next_state"][row] = state_of(recording, reset)
+        else:
+            records["next_observation"][row] = reset.observation
     return records
-
-
-def _fill_states(records: NDArray[np.void], piece: Piece, states: NDArray[np.int64], start: int) -> None:
-    """Fill in the state before each step: that after the one before it, or that of a reset between them."""
-    n = len(states)
-    if len(records):
-        before = np.vstack([states, records["next_state"].astype(np.int64).reshape(-1, n)])
-        states[:] = before[-1]
-        records["state"] = before[:-1].reshape(-1)
-    for reset in piece.resets:
-        at = reset.step - piece.first + reset.environment
-        if at >= len(records):
-            states[reset.environment] = reset.observation - start
-        elif records["t"][at] != schema.RESET_ONLY:
-            records["state"][at] = reset.observation - start

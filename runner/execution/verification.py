@@ -10,7 +10,7 @@ from typing import Final, Literal
 from runner.errors import Diverged
 from runner.recording.composition import Composition
 from runner.recording.reader import Recording
-from runner.replay.differences import Difference
+from runner.replay.comparison import Difference
 from runner.runs.provenance import Differences
 from runner.util.values import Json
 

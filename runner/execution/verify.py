@@ -80,7 +80,7 @@ def verify(
     found = check(path, damage_of(path), bool(rerun), report, trust)
     if rerun is False or not found.is_loop:
         return found
-    from runner.execution.redo import rerun_loop  # slow to import
+    from runner.execution.rerun import rerun_loop  # slow to import
 
     return rerun_loop(found, sample, tolerance, trust)
 

@@ -23,7 +23,7 @@ from runner.runs.checkpoints import read_checkpoints
 
 
 def verify_loop(recording: Recording) -> Verification:
-    """Check the file of a user's own loop; `runner.execution.redo` reruns its environment.
+    """Check the file of a user's own loop; `runner.execution.rerun` reruns its environment.
 
     Compared are the numbers of its messages, its steps with the environment's outcomes where it is tabular,
     steps, resets and episodes with one another, and its digest with its messages.

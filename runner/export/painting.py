@@ -110,9 +110,9 @@ def redrawn(
         CannotRedo: the environment cannot be made again, draws no pictures, or differs from the recording, of
             which no picture comes after that step.
     """
-    from runner.replay.environment import redo_in_child  # loads Gymnasium
+    from runner.replay.environment import rerun_in_child  # loads Gymnasium
 
-    blocks: Any = redo_in_child(
+    blocks: Any = rerun_in_child(
         recording.path, phase, episodes, render=True, trust=trust, draw_from=draw_from
     )
     waiting, episode, t = iter(episodes), episodes[0], draw_from

@@ -37,7 +37,7 @@ from runner.export.painting import (
 from runner.export.values import Values, observations_of, observed, step_actions_in_words
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
-from runner.replay.makers import why_not_redone
+from runner.replay.makers import why_not_rerun
 from runner.replay.steps import (
     environment_of,
     environments_with_frames,
@@ -175,7 +175,7 @@ def source_of(
         return recorded, ""
     if recording.can_train_again:
         return recorded, "The environment has no scene."
-    reason = why_not_redone(recording, trust)
+    reason = why_not_rerun(recording, trust)
     return (recorded, reason) if reason else (Source.REDRAWN, "")
 
 

@@ -15,7 +15,8 @@ from runner.environments.naming import spoken
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
-from runner.replay.steps import check_steps, reset_of, transitions_of
+from runner.replay.recorded import reset_of
+from runner.replay.steps import check_steps, transitions_of
 from runner.util.arrays import Records
 
 MAX_NUMBERS: Final = 64
@@ -107,7 +108,7 @@ def observations_of(
             yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None
         elif t == 0:
             reset = reset_of(recording, phase, episode)
-            yield None if reset is None else reset["observation"], None
+            yield None if reset is None else reset.value(recording), None
         yield observed(recording, step), step
 
 

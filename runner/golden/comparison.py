@@ -18,14 +18,14 @@ from runner.analysis.diff.sections import sections
 from runner.analysis.diff.settings import changes_in
 from runner.environments.gym_types import Env
 from runner.errors import CannotRedo, ConfigError
-from runner.execution.redo import OUTSIDE
+from runner.execution.rerun import OUTSIDE
 from runner.export.reports.diff import render_diff
 from runner.loops.env import record
 from runner.loops.makers import maker_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
-from runner.replay.differences import Difference
-from runner.replay.environment import redo
+from runner.replay.comparison import Difference
+from runner.replay.environment import rerun
 from runner.runs.run import Run
 from runner.util.arrays import Array
 from runner.util.extras import require
@@ -110,7 +110,7 @@ def compare_environment(golden: Path, make: Callable[[], Env], tolerance: float)
 
 
 def _first_difference(recording: Recording, make: Callable[[], Env], tolerance: float) -> Difference | None:
-    steps = redo(recording, make=make, tolerance=tolerance)
+    steps = rerun(recording, make=make, tolerance=tolerance)
     return next((block.difference for block in steps if block.difference is not None), None)
 
 

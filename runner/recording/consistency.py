@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +68,7 @@ def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
         for _ in _numbered(table):
             pass
     if recording.leaves_out_steps:
-        return Findings(last_time=_check_actions(own.steps))
+        return Findings(last_time=_last_time_of(own.steps))
     if own.steps.are_actions:
         raise Inconsistent(
             f"{own.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
@@ -76,18 +76,6 @@ def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
     last = own.resets.last()
     stop = None if complete else 0 if last is None else int(last["step"])
     return _PhaseCheck(recording, phase, stop).check()
-
-
-def _check_actions(steps: WholeSteps) -> int:
-    """Check the numbers of steps of which only the actions were recorded; return the time of the last."""
-    expected = last = 0
-    for rows in steps.rows():
-        if rows["step"][0] != expected or (np.diff(rows["log_time"].astype(np.int64)) <= 0).any():
-            raise Inconsistent(
-                f"{steps.actions.topic.name}: found step {rows['step'][0]:,}, expected {expected:,}"
-            )
-        expected, last = expected + len(rows), int(rows["log_time"][-1])
-    return last
 
 
 def check_extras(recording: Recording, phase: str, complete: bool) -> None:
@@ -121,26 +109,6 @@ def check_extras(recording: Recording, phase: str, complete: bool) -> None:
                 raise Inconsistent(f"{where}: found other times than those of the steps")
 
 
-class _Block(NamedTuple):
-    """Steps of all environments, and the resets before them."""
-
-    first: int
-    """The number of the first step."""
-    rows: NDArray[np.void]
-    """[steps of each environment, environments]."""
-    resets: NDArray[np.void]
-    """[like `rows`]: the last reset before each step; zeros where there was none."""
-    was_reset: Flags
-    """[like `rows`]: whether a reset came before a step."""
-    only_reset: Flags
-    """[like `rows`]: whether the environment was reset instead of taking the step."""
-
-    @property
-    def numbers(self) -> range:
-        """The numbers of the steps."""
-        return range(self.first, self.first + self.rows.size)
-
-
 class _Resets:
     """The resets of a phase, taken once in their order: memory is bounded, however many there are."""
 
@@ -168,19 +136,15 @@ class _PhaseCheck:
     """
 
     def __init__(self, recording: Recording, phase: str, stop: int | None) -> None:
-        self._recording, self._phase, self._stop = recording, phase, stop
-        self._own = recording.phase(phase)
-        self._n = recording.environments
-        self._learners = len(recording.agents)
+        self._recording, self._own, self._stop = recording, recording.phase(phase), stop
+        self._n, self._learners = recording.environments, len(recording.agents)
         self._mdp = recording.mdp if recording.tabular else None
         self._episodes = EpisodeLog(self._n, self._learners, self._mdp)
         self._over = np.zeros(self._n, np.bool_)
         """Whether the last step of each environment terminated or truncated its episode."""
-        self._observed = np.full(self._n, -1, np.int64)
+        self._state = np.full(self._n, -1, np.int64)
         """The state after that step, -1 before any."""
         self._findings = Findings()
-        self._has_states = recording.has_states
-        self._start = least_number(recording.spaces["observation"]) if self._has_states else 0
         self._resets, self._numbered_resets = _Resets(self._own.resets), _Resets(self._own.resets)
         """To find where environments were reset, and to compare with the episodes that follow from it."""
         self._endings = self._own.episodes.blocks()
@@ -193,7 +157,7 @@ class _PhaseCheck:
         for rows, waiting in aligned(_numbered(self._own.steps), self._n, self._stop):
             left = waiting
             if len(rows):
-                self._check_block(self._block(steps, rows.reshape(-1, self._n)))
+                self._check_block(steps, rows.reshape(-1, self._n))
                 steps += len(rows)
         if self._stop is None:
             if left:
@@ -204,126 +168,128 @@ class _PhaseCheck:
             self._finish(steps)
         return self._findings
 
-    def _block(self, first: int, rows: NDArray[np.void]) -> _Block:
-        resets, was_reset = np.zeros(rows.shape, self._resets.left.dtype), np.zeros(rows.shape, np.bool_)
-        for own in self._resets.before(first + rows.size):
+    def _check_block(self, first: int, rows: NDArray[np.void]) -> None:
+        """Check steps of all environments, [steps of each, environments], and the resets before them.
+
+        Args:
+            first: the number of the first step.
+        """
+        numbers, names = range(first, first + rows.size), rows.dtype.names or ()
+        self._check_times(numbers, rows)
+        given, was_reset = self._given(numbers, rows.shape)
+        only_reset = rows["t"] == RESET_ONLY
+        if (wrong := np.flatnonzero(only_reset & ~was_reset)).size:
+            raise self._wrong("step", numbers[wrong[0]], "t", "that of a reset alone", "a reset before it")
+        ends = rows["terminated"], rows["truncated"]
+        is_over, counts = self._is_over(numbers, rows), self._counts(first, rows)
+        episodes = self._episodes.take(
+            Steps(first, rows["rewards"], *ends, was_reset, only_reset, is_over, counts)
+        )
+        expected: Columns = {"t": episodes.t, "episode": episodes.number}
+        if self._recording.has_states:
+            expected |= self._states(rows, given, was_reset, only_reset)
+        elif only_reset.any() and "next_observation" in names:
+            same = _equal(rows["next_observation"][only_reset], given[only_reset])
+            if not same.all():
+                number = numbers[np.flatnonzero(only_reset)[np.argmin(same)]]
+                value = "that of the reset before it"
+                raise self._wrong("step", number, "next_observation", "another value", value)
+        if self._learners == 1 and "agents_terminated" in names:
+            expected |= {
+                f"agents_{name}": rows[name].astype(np.uint32) for name in ("terminated", "truncated")
+            }
+        for name, values in expected.items():
+            self._compare("step", numbers, name, rows[name], values)
+        for resets in self._numbered_resets.before(numbers.stop):
+            number = episodes.number[self._places(first, resets)]
+            self._compare("reset", resets["reset"], "episode", resets["episode"], number)
+        over = ends[0] | ends[1]
+        began = ~only_reset & np.vstack([self._over, over[:-1]])
+        self._count_beginnings(first, was_reset | (rows["t"] > 0), began)
+        self._compare_episodes(episodes.ended)
+        self._over = over[-1]
+
+    def _given(self, numbers: range, shape: tuple[int, ...]) -> tuple[Array, Flags]:
+        """Return what the last reset before each step observed, and whether there was one.
+
+        Both are [steps of each environment, environments].
+        """
+        first, resets = numbers.start, self._resets
+        given, was_reset = np.zeros(shape, resets.left.dtype["observation"]), np.zeros(shape, np.bool_)
+        for own in resets.before(numbers.stop):
             step, is_unknown = own["step"], own["environment"] >= environment_count(self._recording)
             if (is_unknown | (step % self._n != 0) | (step < first)).any():
                 raise self._out_of_order()
-            at = self._places(first, own)
-            resets[at], was_reset[at] = own, True  # of several resets at one place the last counts
-        return _Block(first, rows, resets, was_reset, rows["t"] == RESET_ONLY)
+            at = self._places(first, own)  # of several resets at one place the last counts
+            given[at], was_reset[at] = own["observation"], True
+        return given, was_reset
 
     def _places(self, first: int, resets: NDArray[np.void]) -> tuple[Ints, Ints]:
         """Return the places of resets among the rows of a block that begins with step `first`."""
         return (resets["step"] - first) // self._n, resets["environment"].astype(np.int64) % self._n
 
-    def _check_times(self, b: _Block) -> None:
+    def _check_times(self, numbers: range, rows: NDArray[np.void]) -> None:
         """Compare the times of steps: each step of either phase takes one tick, so they increase."""
-        times = b.rows["log_time"].astype(np.int64).ravel()
+        times = rows["log_time"].astype(np.int64).ravel()
         before = np.concatenate([[self._findings.last_time], times[:-1]])
         wrong = np.flatnonzero((times <= before) | (times % schema.STEP_NANOSECONDS != 0))
         if wrong.size:
             k = wrong[0]
-            raise self._wrong("step", b.numbers[k], "log_time", times[k], f"a later tick than {before[k]}")
+            raise self._wrong("step", numbers[k], "log_time", times[k], f"a later tick than {before[k]}")
         self._findings.last_time = int(times[-1])
 
-    def _check_block(self, b: _Block) -> None:
-        """Check some steps of all environments, and the resets before each of them."""
-        self._check_times(b)
-        rows = b.rows
-        if (wrong := np.flatnonzero(b.only_reset & ~b.was_reset)).size:
-            raise self._wrong("step", b.numbers[wrong[0]], "t", "that of a reset alone", "a reset before it")
-        over = rows["terminated"] | rows["truncated"]
-        episodes = self._episodes.take(
-            Steps(
-                b.first,
-                rows["rewards"],
-                rows["terminated"],
-                rows["truncated"],
-                b.was_reset,
-                b.only_reset,
-                self._is_over(b),
-                self._counts(b),
-            )
-        )
-        self._compare("step", b.numbers, "t", rows["t"], episodes.t)
-        self._compare("step", b.numbers, "episode", rows["episode"], episodes.number)
-        for resets in self._numbered_resets.before(b.numbers.stop):
-            expected = episodes.number[self._places(b.first, resets)]
-            self._compare("reset", resets["reset"], "episode", resets["episode"], expected)
-        self._check_observations(b)
-        self._count_beginnings(b, np.vstack([self._over, over[:-1]]))
-        self._compare_episodes(episodes.ended)
-        self._over = over[-1]
-        if self._has_states:
-            self._observed = rows["next_state"][-1].astype(np.int64)
+    def _states(self, rows: NDArray[np.void], given: Array, was_reset: Flags, only_reset: Flags) -> Columns:
+        """Return the states before and after steps, by the steps, or resets, before them."""
+        least = least_number(self._recording.spaces["observation"])
+        after, begun = rows["next_state"].astype(np.int64), given.reshape(rows.shape).astype(np.int64) - least
+        state = np.where(was_reset & ~only_reset, begun, np.vstack([self._state, after[:-1]]))
+        if only_reset.any():
+            state = np.where(state < 0, rows["state"], state)  # unknown
+        self._state = after[-1]
+        return {"state": state, "next_state": np.where(only_reset, begun, after)}
 
-    def _is_over(self, b: _Block) -> Flags:
+    def _is_over(self, numbers: range, rows: NDArray[np.void]) -> Flags:
         """Return where a game of several agents ended without the end of any: its episode record says so."""
-        is_over = np.zeros(b.rows.shape, np.bool_)
+        is_over = np.zeros(rows.shape, np.bool_)
         while self._learners > 1 and self._n == 1:
-            begin, stop = np.searchsorted(self._silent_ends, [b.first, b.numbers.stop])
-            is_over[self._silent_ends[begin:stop] - b.first] = True
-            if self._last_end >= b.numbers.stop or (block := next(self._endings, None)) is None:
+            begin, stop = np.searchsorted(self._silent_ends, [numbers.start, numbers.stop])
+            is_over[self._silent_ends[begin:stop] - numbers.start] = True
+            if self._last_end >= numbers.stop or (block := next(self._endings, None)) is None:
                 break
             is_silent = ~(block["terminated"] | block["truncated"])
             self._silent_ends = np.sort(block["last_step"][is_silent].astype(np.int64))
             self._last_end = int(block["last_step"][-1])
         return is_over
 
-    def _check_observations(self, b: _Block) -> None:
-        """Compare the states before steps with those after the steps, or resets, before them."""
-        rows, names = b.rows, b.rows.dtype.names or ()
-        if self._has_states:
-            after, given = rows["next_state"].astype(np.int64), np.zeros(rows.shape, np.int64)
-            given[b.was_reset] = (
-                b.resets["observation"][b.was_reset].reshape(-1).astype(np.int64) - self._start
-            )
-            before = np.vstack([self._observed, after[:-1]])
-            expected = np.where(b.was_reset & ~b.only_reset, given, before)
-            if b.only_reset.any():
-                expected = np.where(expected < 0, rows["state"], expected)  # unknown
-            self._compare("step", b.numbers, "state", rows["state"], expected)
-            self._compare("step", b.numbers, "next_state", after, np.where(b.only_reset, given, after))
-        elif b.only_reset.any() and "next_observation" in names:
-            same = _equal(rows["next_observation"][b.only_reset], b.resets["observation"][b.only_reset])
-            if not same.all():
-                number = b.numbers[np.flatnonzero(b.only_reset)[np.argmin(same)]]
-                expected_value = "that of the reset before it"
-                raise self._wrong("step", number, "next_observation", "another value", expected_value)
-        if self._learners == 1 and "agents_terminated" in names:
-            for name in ("terminated", "truncated"):
-                self._compare(
-                    "step", b.numbers, f"agents_{name}", rows[f"agents_{name}"], rows[name].astype(np.uint32)
-                )
+    def _count_beginnings(self, first: int, explained: Flags, began: Flags) -> None:
+        """Count the episodes after one that ended by itself, with a reset before them and without.
 
-    def _count_beginnings(self, b: _Block, after_end: Flags) -> None:
-        """Count the episodes after one that ended by itself, with a reset before them and without."""
-        explained = b.was_reset | (b.rows["t"] > 0)
-        if b.first == 0 and (missing := np.flatnonzero(~explained[0])).size:
+        Args:
+            explained: where a reset came before a step, or its episode had begun.
+            began: where a step came after such an end.
+        """
+        if first == 0 and (missing := np.flatnonzero(~explained[0])).size:
             raise self._wrong("step", missing[0], "reset", "none", "one before the first step")
-        began = ~b.only_reset & after_end
         without = np.flatnonzero(began & ~explained)
         if without.size and not self._findings.begun_without:
-            self._findings.first_without = b.first + int(without[0])
+            self._findings.first_without = first + int(without[0])
         self._findings.begun_without += len(without)
         self._findings.begun_by_reset += int(np.count_nonzero(began & explained))
 
-    def _counts(self, b: _Block) -> Ints | None:
+    def _counts(self, first: int, steps: NDArray[np.void]) -> Ints | None:
         """Return events and penalties of each step, if the environment's table determines them."""
         if self._mdp is None:
             return None
-        rows = b.rows.ravel()
-        paid = rows["rewards"][:, 0]
-        counts, excluded = step_counts(self._mdp, paid, rows["state"], rows["action"], rows["next_state"])
-        outcomes = self._mdp.outcomes_to(rows["state"], rows["action"], rows["next_state"])
+        rows = steps.ravel()
+        transitions = rows["state"], rows["action"], rows["next_state"]
+        counts, excluded = step_counts(self._mdp, rows["rewards"][:, 0], *transitions)
+        outcomes = self._mdp.outcomes_to(*transitions)
         self._findings.not_outcomes += int(np.count_nonzero(~outcomes.any(axis=1)))
         if excluded.any():
             if not self._findings.rewards_off_table:
-                self._findings.first_off_table = b.first + int(np.argmax(excluded))
+                self._findings.first_off_table = first + int(np.argmax(excluded))
             self._findings.rewards_off_table += int(np.count_nonzero(excluded))
-        return counts.reshape(*b.rows.shape, -1)
+        return counts.reshape(*steps.shape, -1)
 
     def _compare_episodes(self, expected: Columns) -> None:
         """Compare the next records of episodes with their expected fields."""
@@ -334,7 +300,7 @@ class _PhaseCheck:
         have = len(found)
         if have < count and self._stop is None:
             raise Inconsistent(
-                f"/{self._phase}/episode: found {first + have} episodes, expected one that ended at step "
+                f"/{self._own.name}/episode: found {first + have} episodes, expected one that ended at step "
                 f"{expected['last_step'][have]}"
             )
         for name, values in expected.items() if have else ():
@@ -361,7 +327,7 @@ class _PhaseCheck:
         }
         for name, found in has_more.items():
             if found:
-                raise Inconsistent(f"/{self._phase}/{name}: found more records than the steps account for")
+                raise Inconsistent(f"/{self._own.name}/{name}: found more records than the steps account for")
 
     def _compare(self, what: str, numbers: range | Ints, name: str, found: Array, expected: Array) -> None:
         """Compare a field of steps, resets or episodes, which have these numbers."""
@@ -370,16 +336,30 @@ class _PhaseCheck:
             raise self._wrong(what, numbers[k], name, found.flat[k], expected.flat[k])
 
     def _out_of_order(self) -> Inconsistent:
-        return Inconsistent(f"/{self._phase}/reset: found resets out of order, or of no environment")
+        return Inconsistent(f"/{self._own.name}/reset: found resets out of order, or of no environment")
 
     def _wrong(self, what: str, number: int, name: str, found: object, expected: object) -> Inconsistent:
         return Inconsistent(
-            f"/{self._phase}/{what}, {what} {number}: {name}: found {found}, expected {expected}"
+            f"/{self._own.name}/{what}, {what} {number}: {name}: found {found}, expected {expected}"
         )
 
 
-def _numbered(table: TopicChunks) -> Iterator[NDArray[np.void]]:
+def _last_time_of(steps: WholeSteps) -> int:
+    """Check the numbers and times of steps of which only the actions were recorded; return the last time."""
+    last, name = -1, steps.actions.topic.name
+    for rows in _numbered(steps, name):
+        times = rows["log_time"].astype(np.int64)
+        if (np.diff(times, prepend=last) <= 0).any():
+            raise Inconsistent(f"{name}: found times that do not increase from step to step")
+        last = int(times[-1])
+    return max(last, 0)
+
+
+def _numbered(table: TopicChunks, name: str = "") -> Iterator[NDArray[np.void]]:
     """Yield the records of a topic in blocks, as `TopicChunks.rows` does.
+
+    Args:
+        name: of the topic in errors.
 
     Raises:
         Inconsistent: messages are not numbered consecutively.
@@ -388,7 +368,7 @@ def _numbered(table: TopicChunks) -> Iterator[NDArray[np.void]]:
     for block in table.rows():
         if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
             found, expected = block[number][wrong[0]], first + wrong[0]
-            raise Inconsistent(f"{table.topic.name}: found {number} {found}, expected {expected}")
+            raise Inconsistent(f"{name or table.topic.name}: found {number} {found}, expected {expected}")
         yield block
         first += len(block)
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runner.errors import Diverged
 from runner.recording import schema
+from runner.recording.differences import first_difference
 from runner.recording.messages import Message, decode
 from runner.recording.schema import BLOCK_TOPICS, Topic
 
@@ -118,15 +119,10 @@ class Reference:
 
 
 def _block_difference(topic: Topic, found: NDArray[np.void], expected: NDArray[np.void]) -> Diverged:
-    rows = len(found)
-    differs = {}
-    for name in sorted(found.dtype.names or (), key=lambda name: name.startswith("tag_")):
-        left, right = (
-            np.ascontiguousarray(block[name]).view(np.uint8).reshape(rows, -1) for block in (found, expected)
-        )
-        differs[name] = (left != right).any(axis=1)
-    first = min(int(np.argmax(rows)) for rows in differs.values() if rows.any())
-    name = next(name for name, rows in differs.items() if rows[first])
+    names = sorted(found.dtype.names or (), key=lambda name: name.startswith("tag_"))
+    difference = first_difference(found, expected, names)
+    assert difference is not None  # their bytes differ
+    first, name = difference
     was, should = (np.asarray(block[first][name]).tolist() for block in (found, expected))
     return Diverged(topic.name, name, was, should, **_place(expected[first]))
 

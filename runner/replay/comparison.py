@@ -1,53 +1,121 @@
-"""Steps that were rerun, compared with the recorded ones: what differs first, and in which episode."""
+"""Rerun steps, compared with the recorded ones: what differs first, and in which episode."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import CannotRedo
+from runner.errors import CannotRedo, shortened
 from runner.recording import schema
 from runner.recording.actions import EpisodeDigests, after_step
+from runner.recording.differences import first_difference, first_differing_row
 from runner.recording.reader import Recording
-from runner.recording.spaces import Value
-from runner.replay.differences import Difference, differing_value, first_differing_row
+from runner.recording.spaces import Description, Value, decode
 from runner.replay.recorded import RecordedReset, ended_episode
-from runner.replay.redone import RedoneStart, RedoneSteps, Values
-from runner.replay.stepping import Results
+from runner.util.arrays import Array
+from runner.util.jsonable import as_json
 
-_Place = tuple[int, int, int]
-"""Episode, step of the episode, and step of the phase."""
+Frame = NDArray[np.uint8]
+"""A picture, [height, width, 3]."""
+PlacedReset = tuple[int, RecordedReset]
+"""A reset, and the row that comes after it."""
+_MAX_TEXT: Final = 200
 
 
-class Part(NamedTuple):
-    """Steps of one environment, or of all, and what came of them."""
+@dataclass(frozen=True)
+class Difference:
+    """The first value in which an environment differs from a recording."""
 
     phase: str
+    """`train` or `eval`."""
+    episode: int | None
+    """The number of the episode; None if it never ended, in one of several environments."""
+    t: int
+    """The step of the episode, from 0."""
+    step: int
+    """The step of the phase, from 0."""
     environment: int
-    rows: NDArray[np.void]
-    resets: Sequence[tuple[int, RecordedReset]]
-    """Row and reset, in order; each comes before its row."""
-    results: Results
+    """Which environment of a vector."""
+    field: str
+    """`observation[2]`, `reward`, `terminated`, ...; `first observation[2]` after a reset."""
+    recorded: object
+    """The value, as JSON can hold it."""
+    got: object
 
-
-def parts_of(whole: Part, n: int) -> Iterator[Part]:
-    """Yield the steps of each of the n environments of a vector."""
-    for environment in range(n):
-        rows = whole.rows[environment::n]
-        taken = rows["t"] != schema.RESET_ONLY
-        before = np.concatenate([[0], np.cumsum(taken)])
-        here = [k for k, (_, reset) in enumerate(whole.resets) if reset.environment == environment]
-        resets = [(int(before[whole.resets[k][0]]), whole.resets[k][1]) for k in here]
-        yield Part(
-            whole.phase, environment, rows[taken], resets, whole.results.part(environment, n, taken, here)
+    def __str__(self) -> str:
+        """Describe the difference in a line."""
+        episode = f"episode {self.episode:,}" if self.episode is not None else f"step {self.step:,}"
+        return (
+            f"{self.phase} {episode}, t {self.t:,}: {self.field}: recorded {_short(self.recorded)}, "
+            f"got {_short(self.got)}"
         )
 
 
+class Start(NamedTuple):
+    """A rerun reset."""
+
+    row: int
+    """The row that comes after it."""
+    reset: RecordedReset
+    got: Value
+    """The first observation, as `RecordedReset.observation`."""
+    frame: Frame | None = None
+    """The picture after the reset, if pictures are drawn."""
+
+
+@dataclass(eq=False)
+class Returned:
+    """What an environment returned for recorded actions, until it raised an error."""
+
+    got: NDArray[np.void]
+    """Records with the fields of steps that come from the environment."""
+    starts: list[Start] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
+    """A picture for each step; of a vector, of the environment that is drawn."""
+    done: int = 0
+    """The rows that are filled in."""
+    error: Exception | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RerunSteps:
+    """Consecutive steps of one environment, rerun; of one or more episodes."""
+
+    phase: str
+    environment: int
+    """Which environment of a vector; 0 for a single one."""
+    recorded: NDArray[np.void]
+    """The recorded steps, as `Steps.rows` yields them; each environment of a vector counts its episodes."""
+    got: NDArray[np.void]
+    """What the environment returned: the fields `next_state` or `next_observation`, `rewards`, `terminated`,
+    `truncated`, and of games `agents_terminated` and `agents_truncated`, each as in a recording."""
+    starts: Sequence[Start] = ()
+    """The resets in the block, in order."""
+    frames: Sequence[Frame] = ()
+    """The picture after each step, if pictures are drawn."""
+    difference: Difference | None = None
+    """The first difference, in the last row, or at the reset after it; the last block has it, if any has."""
+
+    def __len__(self) -> int:
+        return len(self.recorded)
+
+    def require_equal(self) -> Self:
+        """Return these steps.
+
+        Raises:
+            CannotRedo: they differ from the recorded ones.
+        """
+        if self.difference is not None:
+            raise CannotRedo(f"The environment is not the recorded one: {self.difference}.")
+        return self
+
+
 class Comparison:
-    """Compares what came of steps with a recording.
+    """Compares rerun steps with a recording.
 
     Args:
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
@@ -57,145 +125,148 @@ class Comparison:
         self._recording, self._tolerance = recording, tolerance
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
 
-    def of(self, part: Part) -> RedoneSteps:
-        """Return steps that were rerun, up to the first difference."""
-        phase, environment, rows, resets, results = part
-        recorded = _recorded_values(rows, results)
-        done, resets_done = results.done, results.resets_done
-        place = self._first_row(part, recorded)
-        failed_reset = self._first_reset(resets, results)
-        if place is not None and (failed_reset is None or resets[failed_reset][0] > place[0]):
-            done = place[0] + 1
-            resets_done = sum(row < done for row, _ in resets[:resets_done])
-            difference = self._row_difference(part, recorded, *place)
-        elif failed_reset is not None:
-            (done, reset), resets_done = resets[failed_reset], failed_reset + 1
-            field, *values = self._observation(reset.observation, results.first_observations[failed_reset])
-            difference = self._difference(part, _of_reset(reset), f"first {field}", *values)
-        elif results.error is not None:
-            difference = self._failure(part, results.error)
-        else:
-            difference = None
-        starts = [
-            RedoneStart(
-                row,
-                reset.episode,
-                reset.seed,
-                reset.observation,
-                results.first_observations[k],
-                results.first_frames[k] if results.first_frames else None,
-            )
-            for k, (row, reset) in enumerate(resets[:resets_done])
-        ]
-        return RedoneSteps(
-            phase=phase,
-            environment=environment,
-            step=rows["step"][:done].astype(np.int64),
-            episode=rows["episode"][:done].astype(np.int64),
-            t=rows["t"][:done].astype(np.int64),
-            actions=rows["action"][:done],
-            recorded=recorded.part(slice(done)),
-            got=results.values.part(slice(done)),
-            starts=tuple(starts),
-            frames=results.frames[:done],
-            difference=difference,
-        )
+    def of(
+        self,
+        phase: str,
+        environment: int,
+        rows: NDArray[np.void],
+        resets: Sequence[PlacedReset],
+        returned: Returned,
+    ) -> RerunSteps:
+        """Return the steps of an environment up to the first difference."""
+        done, starts, where, values = returned.done, returned.starts, None, None
+        rows_done, got = rows[:done], returned.got[:done]
+        names = [name for name in got.dtype.names or () if name in (rows.dtype.names or ())]
+        first = first_difference(rows_done, got, names, self._tolerance)
+        digest = self._first_digest(phase, environment, rows_done, got)
+        if digest is not None and (first is None or digest < first[0]):
+            first = digest, "digest"
+        failed = self._first_start(starts)
+        if first is not None and (failed is None or starts[failed].row > first[0]):
+            k, name = first
+            done, starts = k + 1, [start for start in starts if start.row <= k]
+            where, values = _place_of(rows[k]), self._values(name, rows[k], got[k])
+        elif failed is not None:
+            done, starts = starts[failed].row, starts[: failed + 1]
+            reset = starts[failed].reset
+            field, was, now = self._observation(reset.observation, starts[failed].got)
+            where, values = _place_of_reset(reset), (f"first {field}", was, now)
+        elif returned.error is not None:
+            text = f"{type(returned.error).__name__}: {returned.error}"
+            where, values = _failed_at(rows, done, resets[len(starts) :], text), ("error", None, text)
+        difference = None
+        if where is not None and values is not None:
+            episode, t, step = where
+            number: int | None = episode
+            if self._recording.environments > 1:
+                number = ended_episode(self._recording, phase, environment, step)
+            difference = Difference(phase, number, t, step, environment, *values)
+        frames = returned.frames[:done]
+        return RerunSteps(phase, environment, rows[:done], got[:done], starts, frames, difference)
 
-    def _failure(self, part: Part, error: Exception) -> Difference:
-        """Return the difference that the environment raised an error where the recorded one did not."""
-        _, _, rows, resets, results = part
-        got = f"{type(error).__name__}: {error}"
-        waiting = resets[results.resets_done :]
-        if waiting and (waiting[0][0] <= results.done or results.done >= len(rows)):
-            return self._difference(part, _of_reset(waiting[0][1]), "error", None, got)
-        if not len(rows):  # another environment of the vector raised it
-            raise CannotRedo(f"The vector environment fails: {got}")
-        row = rows[min(results.done, len(rows) - 1)]
-        return self._difference(part, _of_row(row), "error", None, got)
-
-    def _first_row(self, part: Part, recorded: Values) -> tuple[int, str] | None:
-        """Return the first row that differs, and the first field of it that does; None if none does."""
-        rows, results = part.rows, part.results
-        done, places = results.done, []
-        for name in ("observations", "rewards", "terminated", "truncated"):
-            was, got = getattr(recorded, name)[:done], getattr(results, name)[:done]
-            if (row := first_differing_row(was, got, self._tolerance)) is not None:
-                places.append((row, name))
-        for name in ("agents_terminated", "agents_truncated"):
-            got = getattr(results, name)[:done]
-            if len(got) and (rows[name][:done] != got).any():
-                places.append((int(np.argmax(rows[name][:done] != got)), name))
-        if (wrong := self._first_digest(part)) is not None:
-            places.append((wrong, "digest"))
-        return min(places, key=lambda place: place[0]) if places else None
-
-    def _first_digest(self, part: Part) -> int | None:
-        """Return the first row at which the episode so far has another digest than was recorded."""
-        phase, environment, rows, _, results = part
-        done, got = results.done, results.values
-        if not done or "digest" not in (rows.dtype.names or ()):
-            return None
-        outcomes = got.observations[:done], got.rewards[:done], got.terminated[:done], got.truncated[:done]
-        recorded = np.ascontiguousarray(rows["digest"][:done])
-        marked = set(np.flatnonzero(recorded.view(np.uint8).reshape(done, -1).any(axis=1)).tolist())
-        digests = self._digests[phase]
-        for row, digest in digests.add(environment, rows["t"][:done], *outcomes, marked):
-            if row in marked and digest != recorded[row].tobytes():
-                return row
-        return None
-
-    def _first_reset(self, resets: Sequence[tuple[int, RecordedReset]], results: Results) -> int | None:
+    def _first_start(self, starts: Sequence[Start]) -> int | None:
         """Return the number of the first reset whose observation differs; None if none does."""
-        done = results.resets_done
-        recorded = np.empty_like(results.first_observations[:done])
-        for k, (_, reset) in enumerate(resets[:done]):
-            recorded[k] = reset.observation
-        return first_differing_row(recorded, results.first_observations[:done], self._tolerance)
+        if not starts:
+            return None
+        values = np.empty((2, len(starts)), self._recording.train.resets.row_dtype["observation"])
+        for k, start in enumerate(starts):
+            values[0, k], values[1, k] = start.reset.observation, start.got
+        return first_differing_row(values[0], values[1], self._tolerance)
 
-    def _row_difference(self, part: Part, recorded: Values, row: int, name: str) -> Difference:
-        rows, results = part.rows, part.results
-        place = _of_row(rows[row])
+    def _first_digest(
+        self, phase: str, environment: int, rows: NDArray[np.void], got: NDArray[np.void]
+    ) -> int | None:
+        """Return the first row at which the episode so far has another digest than was recorded."""
+        if not len(rows) or "digest" not in (rows.dtype.names or ()):
+            return None
+        after, t = got[after_step(got.dtype)], rows["t"]
+        recorded = np.ascontiguousarray(rows["digest"])
+        marked = set(np.flatnonzero(recorded.view(np.uint8).reshape(len(rows), -1).any(axis=1)).tolist())
+        ends = got["terminated"], got["truncated"]
+        digests = self._digests[phase].add(environment, t, after, got["rewards"], *ends, marked)
+        wrong = (row for row, digest in digests if row in marked and digest != recorded[row].tobytes())
+        return next(wrong, None)
+
+    def _values(self, name: str, recorded: np.void, got: np.void) -> tuple[str, object, object]:
+        """Return a field that differs, such as `observation[2]`, and its values."""
         if name == "digest":
-            was = rows[row]["digest"].tobytes().hex()
-            return self._difference(part, place, "digest of the episode so far", was, "another one")
-        was = rows[name][row] if name.startswith("agents_") else getattr(recorded, name)[row]
-        got = getattr(results, name)[row]
-        if name == "observations":
-            name, was, got = self._observation(was, got)
-        elif name == "rewards":
-            agent = int(np.argmax(was != got)) if len(was) > 1 else 0
-            name = f"reward[{self._recording.agents[agent]!r}]" if len(was) > 1 else "reward"
-            was, got = float(was[agent]), float(got[agent])
-        else:
-            was, got = was.item(), got.item()
-        return self._difference(part, place, name, was, got)
+            return "digest of the episode so far", recorded[name].tobytes().hex(), "another one"
+        if name == after_step(got.dtype):
+            return self._observation(recorded[name], got[name])
+        if name != "rewards":
+            return name, recorded[name].item(), got[name].item()
+        agents = self._recording.agents
+        paid, pays = (dict(zip(agents, row[name], strict=True)) for row in (recorded, got))
+        place, was, now = differing_value(paid, pays, {}, self._tolerance)
+        return f"reward{place if len(agents) > 1 else ''}", was, now
 
     def _observation(self, recorded: Value, got: Value) -> tuple[str, object, object]:
-        """Return the first differing part of two observations, such as `observation[2]`, and its values."""
         space = self._recording.spaces["observation"]
         place, recorded, got = differing_value(recorded, got, space, self._tolerance)
         return f"observation{place}", recorded, got
 
-    def _difference(self, part: Part, place: _Place, field: str, recorded: object, got: object) -> Difference:
-        episode, t, step = place
-        number: int | None = episode
-        if self._recording.environments > 1:
-            number = ended_episode(self._recording, part.phase, part.environment, step)
-        return Difference(part.phase, number, t, step, part.environment, field, recorded, got)
 
-
-def _of_row(row: np.void) -> _Place:
+def _place_of(row: np.void) -> tuple[int, int, int]:
+    """Return episode, step of the episode, and step of the phase."""
     return int(row["episode"]), int(row["t"]), int(row["step"])
 
 
-def _of_reset(reset: RecordedReset) -> _Place:
+def _place_of_reset(reset: RecordedReset) -> tuple[int, int, int]:
     return reset.episode, 0, reset.step
 
 
-def _recorded_values(rows: NDArray[np.void], results: Results) -> Values:
-    """Return what was recorded of steps; of observations and rewards without a record what came of them."""
-    names = rows.dtype.names or ()
-    if "rewards" not in names:
-        got = results.values
-        return Values(got.observations, got.rewards, rows["terminated"], rows["truncated"])
-    return Values(rows[after_step(rows.dtype)], rows["rewards"], rows["terminated"], rows["truncated"])
+def _failed_at(
+    rows: NDArray[np.void], done: int, waiting: Sequence[PlacedReset], text: str
+) -> tuple[int, int, int]:
+    """Return where an environment raised an error: in the first row or reset that it did not return from."""
+    if waiting and (waiting[0][0] <= done or done >= len(rows)):
+        return _place_of_reset(waiting[0][1])
+    if not len(rows):  # another environment of the vector raised it
+        raise CannotRedo(f"The vector environment fails: {text}")
+    return _place_of(rows[min(done, len(rows) - 1)])
+
+
+# --- values -------------------------------------------------------------------------------------------
+
+
+def differing_value(
+    recorded: Value, got: Value, description: Description, tolerance: float = 0.0
+) -> tuple[str, object, object]:
+    """Return where in two observations the first difference is, such as `[2]`, and both values there.
+
+    Args:
+        recorded: a NumPy value of a space, or its bytes.
+    """
+    if isinstance(recorded, bytes):
+        recorded, got = (decode(description, each, "an observation") for each in (recorded, got))
+    for place, left, right in _leaves("", recorded, got):
+        if left.shape != right.shape or left.dtype != right.dtype:
+            return place, _plain(left), _plain(right)
+        first = first_differing_row(left.reshape(-1), right.reshape(-1), tolerance)
+        if first is not None:
+            at = np.unravel_index(first, left.shape)
+            index = f"[{', '.join(map(str, at))}]" if at else ""
+            return place + index, _plain(left[at]), _plain(right[at])
+    return "", _plain(recorded), _plain(got)
+
+
+def _leaves(place: str, recorded: Value, got: Value) -> Iterator[tuple[str, Array, Array]]:
+    """Yield the arrays in two values of a space, with their places."""
+    names: Any = getattr(getattr(recorded, "dtype", None), "names", None)
+    if names or isinstance(recorded, dict):
+        for name in names or recorded:
+            yield from _leaves(f"{place}[{name!r}]", recorded[name], got[name])
+    elif isinstance(recorded, tuple):
+        for i, (left, right) in enumerate(zip(recorded, got, strict=True)):
+            yield from _leaves(f"{place}[{i}]", left, right)
+    else:
+        yield place, np.asarray(recorded), np.asarray(got)
+
+
+def _plain(value: object) -> object:
+    return as_json(value.item() if isinstance(value, np.ndarray | np.generic) and not value.shape else value)
+
+
+def _short(value: object) -> str:
+    text = repr(value) if isinstance(value, str) else str(value)
+    return shortened(text, _MAX_TEXT)

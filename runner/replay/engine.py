@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import dropwhile
 from typing import Final
 
 import numpy as np
@@ -16,14 +18,14 @@ from runner.recording.description import environment_count
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.topic_chunks import FOREVER
-from runner.replay.comparison import Comparison, Part, parts_of
+from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned
 from runner.replay.games import as_parallel
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
-from runner.replay.redone import Frame, RedoneSteps
-from runner.replay.stepping import EnvironmentStepper, GameStepper, Stepper
+from runner.replay.stepping import GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
 from runner.replay.trust import require_plain, trusting
+from runner.util.arrays import Ints
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -39,6 +41,9 @@ ALL: Final = -1
 """The number that stands for all environments of a vector."""
 Report = Callable[[int], None]
 _Key = tuple[str, int]
+_Steps = tuple[NDArray[np.void], list[PlacedReset]]
+_Part = tuple[int, NDArray[np.void], Sequence[PlacedReset], Returned]
+"""An environment, its steps and resets, and what came of them."""
 
 
 class Replay:
@@ -91,7 +96,7 @@ class Replay:
             with contextlib.suppress(Exception):
                 stepper.env.close()
 
-    def all(self) -> Iterator[RedoneSteps]:
+    def all(self) -> Iterator[RerunSteps]:
         """Yield all steps of both phases in the order of time, up to the first difference."""
         for piece in pieces(self._recording, schema.PHASES):
             for environment in self.environments if piece.environment is None else [piece.environment]:
@@ -100,53 +105,94 @@ class Replay:
                     if steps.difference is not None:
                         return
 
-    def steps(self, piece: Piece, environment: int, draws: bool) -> Iterator[RedoneSteps]:
+    def steps(
+        self, piece: Piece, environment: int, draws: bool, start: RecordedReset | None = None
+    ) -> Iterator[RerunSteps]:
         """Yield the steps of one environment in a piece, in blocks, up to the first difference.
 
         Args:
             environment: the number of one in `environments`; `ALL` yields the steps of each in turn.
+            start: where to begin if it was not rerun before; None for the first reset that is known.
         """
-        phase, width = piece.phase, self._recording.environments if environment == ALL else 1
-        rows, resets = own_steps(piece, environment, self._recording.environments)
-        resets = [(row, reset) for row, reset in resets if reset.time <= self._last_step_time]
+        phase, n = piece.phase, self._recording.environments if environment == ALL else 1
+        rows, resets = self.recorded_steps(piece, environment)
         begin = 0
         if not self.is_known(phase, environment):
-            first = next((k for k, (_, reset) in enumerate(resets) if reset.is_known), None)
-            if first is None:
+            resets = list(dropwhile(lambda placed: not placed[1].may_begin(start), resets))
+            if not resets:
                 self.skipped += len(rows)
                 return
             self._known.add(self._key(phase, environment))
-            begin, resets = resets[first][0], resets[first:]
-            self.skipped += begin * width
+            begin = resets[0][0]
+            self.skipped += begin * n
         stepper = self.stepper(phase, environment)
-        stepper.draws, first_drawn = False, 0
-        if draws:
-            first_drawn = int(np.searchsorted(rows["step"].astype(np.int64), self.draw_from)) // width
-        end, stop = begin, len(rows) // width
+        stop = len(rows) // n
+        drawn = (
+            int(np.searchsorted(rows["step"].astype(np.int64), self.draw_from)) // n if draws else stop + 1
+        )
+        stepper.draws, end = False, begin
         while end < stop or resets:
-            if draws and not stepper.draws and end >= first_drawn:
-                stepper.draws = True
-                if first_drawn or self._max_rows > _MAX_PICTURES:
-                    # Blocks without pictures are larger, and the first picture is to come at once.
-                    self._max_rows = 1
-            begin, end = end, min(end + max(self._max_rows // width, 1), stop)
-            if begin < first_drawn < end:
-                end = first_drawn
+            if end >= drawn and not stepper.draws:
+                stepper.draws, self._max_rows = True, 1  # the first picture is to come at once
+            begin, end = end, min(end + max(self._max_rows // n, 1), stop)
+            if begin < drawn < end:
+                end = drawn
+            block = rows[begin * n : end * n]
             here = [(row - begin, reset) for row, reset in resets if row < end or end == stop]
-            resets, block = resets[len(here) :], rows[begin * width : end * width]
+            resets = resets[len(here) :]
             for _, reset in () if stepper.is_trusted else here:
                 require_plain("option of a reset,", reset.options or {}, {})
             started = time.monotonic()
-            results = stepper.run(block, here)
-            self._adapt(time.monotonic() - started, results.frames if stepper.draws else None)
-            self.taken += results.done
+            returned = stepper.run(block, here)
+            self._adapt(time.monotonic() - started, returned.frames if stepper.draws else None)
+            self.taken += returned.done
             self._report(self.taken)
-            whole = Part(phase, environment, block, here, results)
-            for part in parts_of(whole, width) if environment == ALL else [whole]:
-                steps = self._comparison.of(part)
+            for part in self._parts(environment, block, here, returned):
+                steps = self._comparison.of(phase, *part)
                 yield steps
                 if steps.difference is not None:
                     return
+
+    def recorded_steps(self, piece: Piece, environment: int) -> _Steps:
+        """Return the steps of one environment, or of `ALL`, and its resets with the step that each precedes.
+
+        Steps at which a vector only reset the environment are left out: the reset stands for them.
+        """
+        n, rows = self._recording.environments, piece.rows
+        resets = [(r.step - piece.first, r) for r in piece.resets if r.time <= self._last_step_time]
+        if environment == ALL:
+            return rows, [(row // n, reset) for row, reset in resets]
+        if piece.environment not in (None, environment):
+            return rows[:0], []
+        index, resets = _of_environment(rows, resets, environment, n)
+        return rows if len(index) == len(rows) else rows[index], resets
+
+    def _parts(
+        self, environment: int, rows: NDArray[np.void], resets: Sequence[PlacedReset], returned: Returned
+    ) -> Iterator[_Part]:
+        """Yield what came of some steps, of `ALL` environments one after the other."""
+        if environment != ALL:
+            yield environment, rows, resets, returned
+            return
+        n = self._recording.environments
+        resets = [(n * row, reset) for row, reset in resets]
+        for own in range(n):
+            index, placed = _of_environment(rows, resets, own, n)
+            places = {reset.number: row for row, reset in placed}
+            done = int(np.searchsorted(index, returned.done))
+            pictures = index[:done].tolist() if own == self.drawn and returned.frames else ()
+            part = replace(
+                returned,
+                got=returned.got[index],
+                done=done,
+                starts=[
+                    start._replace(row=places[start.reset.number])
+                    for start in returned.starts
+                    if start.reset.environment == own
+                ],
+                frames=[returned.frames[row // n] for row in pictures],
+            )
+            yield own, rows[index], placed, part
 
     def is_known(self, phase: str, environment: int) -> bool:
         """Return whether an environment's random generators are in the recorded state."""
@@ -183,7 +229,7 @@ class Replay:
                 elif maker is not None and maker.kind == "pettingzoo":
                     stepper = GameStepper(as_parallel(env), self._recording)
                 else:
-                    stepper = EnvironmentStepper(env, self._recording)
+                    stepper = Stepper(env, self._recording)
                     vector = None if maker is None else maker.vector
                     stepper.ends_once = vector is not None and vector.is_vec_env
                 stepper.is_trusted = is_trusted
@@ -235,24 +281,16 @@ def _are_separate(recording: Recording) -> bool:
     return False
 
 
-def own_steps(
-    piece: Piece, environment: int, environments: int
-) -> tuple[NDArray[np.void], list[tuple[int, RecordedReset]]]:
-    """Return the steps of one environment, and its resets with the row that each comes before.
+def _of_environment(
+    rows: NDArray[np.void], resets: Sequence[PlacedReset], environment: int, n: int
+) -> tuple[Ints, list[PlacedReset]]:
+    """Return which of some rows are steps that an environment took, and its resets, placed among these.
 
-    Steps at which a vector only reset the environment are left out: the reset stands for them.
+    Args:
+        resets: those of all environments, placed among `rows`.
+        n: how many environments take turns.
     """
-    if piece.environment not in (None, environment):
-        return piece.rows[:0], []
-    is_all = environment == ALL
-    rows = piece.rows if is_all else piece.rows[environment % environments :: environments]
-    own = [reset for reset in piece.resets if is_all or reset.environment == environment]
-    if not len(rows):
-        return rows, [(0, reset) for reset in own]
-    at = [(reset.step - piece.first) // environments for reset in own]
-    if not is_all:
-        taken = rows["t"] != schema.RESET_ONLY
-        if not taken.all():
-            before = np.concatenate([[0], np.cumsum(taken)])
-            at, rows = before[at].tolist(), rows[taken]
-    return rows, list(zip(at, own, strict=True))
+    index = np.arange(environment % n, len(rows), n)
+    index = index[rows["t"][index] != schema.RESET_ONLY]
+    own = [(row, reset) for row, reset in resets if reset.environment == environment]
+    return index, [(int(np.searchsorted(index, row)), reset) for row, reset in own]

@@ -1,12 +1,12 @@
 """A loop's episodes, rerun: its environment is made again and takes the recorded resets and actions.
 
-    for steps in redo_in_child(path, "train", episodes=[5], render=True):
+    for steps in rerun_in_child(path, "train", episodes=[5], render=True):
         for row in range(len(steps)):
-            show(steps.frames[row], steps.recorded.rewards[row])
+            show(steps.frames[row], steps.recorded["rewards"][row])
         if steps.difference:
             ...                           # the environment is not the recorded one; nothing follows
 
-`redo` runs the environment, which is foreign code, in this process; `redo_in_child` in a child process with
+`rerun` runs the environment, which is foreign code, in this process; `rerun_in_child` in a child process with
 limits on memory and time. `runner.replay.makers` says whether a recording can be rerun, and
 `runner.export.pictures` what its pictures are made from.
 """
@@ -24,10 +24,10 @@ from typing import Any, Final
 
 from runner.errors import CannotRedo
 from runner.recording.reader import Recording, open_recording
+from runner.replay.comparison import RerunSteps
 from runner.replay.engine import Replay, Report
-from runner.replay.episodes import redo_episode
-from runner.replay.makers import why_not_redone
-from runner.replay.redone import RedoneSteps
+from runner.replay.episodes import rerun_episode
+from runner.replay.makers import why_not_rerun
 from runner.util.processes import CallFailed, ChildProcess, TimedOut, report_progress
 
 MEMORY_BYTES: Final = 4 * 10**9
@@ -36,7 +36,7 @@ SECONDS: Final = 60.0
 """How long a child process may take for a block of steps, which is meant to take 0.2 s, or to begin."""
 
 
-def redo(
+def rerun(
     recording: Recording,
     phase: str | None = None,
     episodes: Sequence[int] | None = None,
@@ -47,7 +47,7 @@ def redo(
     report: Report = lambda _: None,
     make: Callable[[], object] | None = None,
     draw_from: int = 0,
-) -> Iterator[RedoneSteps]:
+) -> Iterator[RerunSteps]:
     """Rerun recorded episodes; yield their steps in blocks of about 0.2 s, compared with the recording.
 
     An episode alone is begun at its reset, if that has a seed or the state of the random generators was
@@ -71,7 +71,7 @@ def redo(
         CannotRedo: the environment cannot be made again, or draws no pictures; the message is why.
         RecordingError: the recording is damaged, or has no such episode.
     """
-    if make is None and (reason := why_not_redone(recording, trust)):
+    if make is None and (reason := why_not_rerun(recording, trust)):
         raise CannotRedo(reason)
     begin = partial(Replay, recording, trust, tolerance, report, render, make)
     if episodes is None:
@@ -86,13 +86,13 @@ def redo(
             span = recording.phase(own).episode_span(episode)
             first = span[draw_from - 1] if draw_from <= len(span) else span.stop
             begin = partial(begin, draw_from=first)
-        for steps in redo_episode(recording, own, episode, begin):
+        for steps in rerun_episode(recording, own, episode, begin):
             yield steps
             if steps.difference is not None:
                 return
 
 
-def redo_in_child(
+def rerun_in_child(
     path: Path,
     phase: str | None = None,
     episodes: Sequence[int] | None = None,
@@ -100,23 +100,23 @@ def redo_in_child(
     render: bool = False,
     trust: bool = False,
     draw_from: int = 0,
-) -> Iterator[RedoneSteps]:
-    """Rerun recorded episodes in a child process, which ends with the iterator; see `redo`.
+) -> Iterator[RerunSteps]:
+    """Rerun recorded episodes in a child process, which ends with the iterator; see `rerun`.
 
     The child works ahead of the caller by a block at most. A process that is such a child reruns them
     itself, as it may have none.
 
     Raises:
-        CannotRedo: see `redo`; or the environment hangs, crashes, or needs more memory.
+        CannotRedo: see `rerun`; or the environment hangs, crashes, or needs more memory.
     """
     options: Any = {"render": render, "trust": trust, "draw_from": draw_from}
     if multiprocessing.current_process().daemon:
         _silence()
         with open_recording(path) as recording:
-            yield from redo(recording, phase, episodes, **options)
+            yield from rerun(recording, phase, episodes, **options)
         return
-    for message in stream_from_child(_redo_path, path, phase, episodes, **options):
-        if isinstance(message, RedoneSteps):  # else steps taken, which show that it does not hang
+    for message in stream_from_child(_rerun_path, path, phase, episodes, **options):
+        if isinstance(message, RerunSteps):  # else steps taken, which show that it does not hang
             yield message
 
 
@@ -160,8 +160,8 @@ def _silence() -> None:
             os.dup2(nothing.fileno(), stream)
 
 
-def _redo_path(path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: Any) -> None:
+def _rerun_path(path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: Any) -> None:
     """Pass the rerun steps of a recording to the process that called this one."""
     with open_recording(path) as recording:
-        for steps in redo(recording, phase, episodes, report=report_progress, **arguments):
+        for steps in rerun(recording, phase, episodes, report=report_progress, **arguments):
             report_progress(steps)

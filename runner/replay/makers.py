@@ -336,7 +336,7 @@ def _short(error: BaseException) -> str:
     return " ".join(str(error).split())[:500]
 
 
-def why_not_redone(recording: Recording, trust: bool = False) -> str:
+def why_not_rerun(recording: Recording, trust: bool = False) -> str:
     """Return why the recorded actions cannot be repeated in the environment; empty if it can be tried."""
     if recording.can_train_again:
         return "The run was trained here: `dualtaxi verify` retrains it instead."

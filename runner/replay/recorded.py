@@ -17,7 +17,7 @@ from runner.recording.description import environment_count
 from runner.recording.reader import Recording
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.recording.spaces import Value
+from runner.recording.spaces import Value, decode
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
 
@@ -32,6 +32,7 @@ _Extra = tuple[dict[str, object] | None, int | None]
 class RecordedReset(NamedTuple):
     """A reset of one environment."""
 
+    phase: str
     number: int
     """Its number in the phase."""
     environment: int
@@ -48,11 +49,22 @@ class RecordedReset(NamedTuple):
     state: ResetState | None
     """What it depends on, if it has no seed and this was recorded."""
 
+    def value(self, recording: Recording) -> Value:
+        """Return the observation as a value of its space."""
+        if not isinstance(self.observation, bytes):
+            return self.observation
+        return decode(recording.spaces["observation"], self.observation, f"{recording.path}: a reset")
+
     @property
     def is_known(self) -> bool:
         """Whether its episode can be repeated without those before it, but for what outlives a reset."""
         state = self.state
         return self.seed is not None or (state is not None and not is_empty(state))
+
+    def may_begin(self, start: RecordedReset | None) -> bool:
+        """Return whether a rerun can begin here; with `start`, whether this is that reset."""
+        is_start = start is None or (self.phase, self.number) == (start.phase, start.number)
+        return self.is_known and is_start
 
 
 def is_empty(state: ResetState) -> bool:
@@ -127,7 +139,32 @@ def resets_of(
         while state is not None and state.reset <= number:
             own, state = state if state.reset == number else None, next(states, None)
         known_seed = seed if seeded else large_seed
-        yield RecordedReset(number, environment, episode, step, time, observation, known_seed, options, own)
+        yield RecordedReset(
+            phase, number, environment, episode, step, time, observation, known_seed, options, own
+        )
+
+
+def resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
+    """Yield the resets up to a time, from the last to the first, reading no more than needed."""
+    width, stop = 1_000 * STEP_NANOSECONDS, time
+    while stop >= 0:
+        start = max(stop - width, 0)
+        yield from reversed(list(resets_of(recording, phase, start, stop)))
+        stop, width = start - 1, 4 * width
+
+
+def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
+    """Return the last reset of an episode's environment at or before its first step; None if it was lost.
+
+    Raises:
+        RecordingError: there is no such episode, or its first step was lost.
+    """
+    span, n = recording.phase(phase).episode_span(episode), recording.environments
+    time = int(recording.phase(phase).steps.one(span.start)["log_time"])
+    for reset in resets_back(recording, phase, time):
+        if reset.environment % n == span.start % n and reset.step <= span.start:
+            return reset
+    return None
 
 
 def _with_extras(
@@ -231,14 +268,16 @@ def _by_environment(pieces: Iterator[Piece]) -> Iterator[Piece]:
             if reset.environment != environment:
                 end = reset.step - piece.first if len(piece.rows) else 0
                 if end > begin or own:
-                    yield _part(piece, begin, end, own, environment)
+                    yield part(piece, begin, end, own, environment)
                 begin, own, environment = end, [], reset.environment
             own.append(reset)
         if begin < len(piece.rows) or own:
-            yield _part(piece, begin, len(piece.rows), own, environment)
+            yield part(piece, begin, len(piece.rows), own, environment)
 
 
-def _part(piece: Piece, begin: int, end: int, resets: list[RecordedReset], environment: int | None) -> Piece:
+def part(
+    piece: Piece, begin: int, end: int, resets: Sequence[RecordedReset], environment: int | None
+) -> Piece:
     """Return the rows from `begin` to `end` of a piece, with their resets."""
     first, time = piece.first + begin, piece.time + begin * STEP_NANOSECONDS
     return Piece(piece.phase, first, piece.rows[begin:end], resets, time, environment)

@@ -1,12 +1,11 @@
-"""One environment, stepped through recorded actions, with what it returns in the layout of the recording."""
+"""An environment that takes recorded actions, and what it returns in the layout of the recording."""
 
 from __future__ import annotations
 
 import json
 import struct
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import Any, Final
 
 import numpy as np
@@ -18,106 +17,165 @@ from runner.errors import CannotRedo, shortened
 from runner.recording.gym_spaces import describe_space, parts_of, value_of
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of
 from runner.recording.reader import Recording
-from runner.recording.reset_states import ResetState
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
+from runner.replay.comparison import Frame, PlacedReset, Returned, Start
 from runner.replay.recorded import RecordedReset
-from runner.replay.redone import Frame, Values
 from runner.util.arrays import Array
 from runner.util.extras import missing
 from runner.util.processes import raise_if_out_of_memory
 
 _MAX_TEXT: Final = 300
 _ENDING: Final = struct.Struct("<d??")
-_ENDING_DTYPE: Final = np.dtype([("reward", "<f8"), ("terminated", "?"), ("truncated", "?")])
+_ENDS: Final = ("rewards", "terminated", "truncated")
+Fill = Callable[[int, Any], None]
+"""Puts down what the environment returned for a step."""
 
 
-@dataclass(frozen=True)
-class Dtypes:
-    """The dtypes of recorded observations; `object` where values vary in size."""
+class Stepper:
+    """A Gymnasium environment that takes recorded actions."""
 
-    step: np.dtype[np.generic]
-    """That of the observation after a step."""
-    reset: np.dtype[np.generic]
-    """That of the first observation of an episode."""
+    n = 1
+    """How many environments step at once."""
 
-
-class Results:
-    """What an environment returned for some steps and resets, as it is recorded: arrays [rows], [resets]."""
-
-    def __init__(self, rows: int, resets: int, dtypes: Dtypes, learners: int, drawn: int = 0) -> None:
-        self._drawn = drawn
-        self.observations: Array = np.empty(rows, dtypes.step)
-        self.rewards: NDArray[np.float64] = np.zeros((rows, learners))
-        self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
-        self.truncated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
-        masks = rows if learners > 1 else 0
-        self.agents_terminated = np.zeros(masks, np.uint32)
-        """Bit i: agent i of a game; empty for one agent."""
-        self.agents_truncated = np.zeros(masks, np.uint32)
-        self.first_observations: Array = np.empty(resets, dtypes.reset)
-        self.frames: list[Frame] = []
-        """After each row; of a vector, after each step of all environments, of the one that is drawn."""
-        self.first_frames: list[Frame] = []
-        self.done = 0
-        self.resets_done = 0
-        """Rows and resets that are filled in; fewer than all if the environment raised `error`."""
-        self.error: Exception | None = None
-
-    @property
-    def values(self) -> Values:
-        """The values of all rows."""
-        return Values(self.observations, self.rewards, self.terminated, self.truncated)
-
-    def part(self, first: int, stride: int, rows: NDArray[np.bool_], resets: Sequence[int]) -> Results:
-        """Return the results of one environment of a vector.
-
-        Args:
-            first: its number.
-            stride: the number of environments.
-        """
-        part = Results.__new__(Results)
-        for name in ("observations", "rewards", "terminated", "truncated"):
-            setattr(part, name, getattr(self, name)[first::stride][rows])
-        part.agents_terminated, part.agents_truncated = self.agents_terminated, self.agents_truncated
-        part.first_observations = self.first_observations[list(resets)]
-        is_drawn, part.error = first == self._drawn, self.error
-        part.frames = [frame for frame, own in zip(self.frames, rows, strict=False) if own and is_drawn]
-        part.first_frames = self.first_frames if is_drawn else []
-        part.done = int(np.count_nonzero(rows[: self.done // stride]))
-        part.resets_done = sum(number < self.resets_done for number in resets)
-        return part
-
-
-class Stepper(ABC):
-    """An environment that is stepped through a recording of one like it."""
-
-    env: Any
-
-    def __init__(self, env: object, recording: Recording) -> None:
+    def __init__(self, env: Any, recording: Recording) -> None:
         self.env = env
         self.draws = False
         """Whether to draw a picture after each step and reset."""
         self.is_trusted = False
         """Whether `reset` may get options that name something."""
-        self._recording = recording
+        self.ends_once = False
+        """Whether an episode that terminated is not truncated too."""
+        self._recording, self._has_states = recording, recording.has_states
         self.observation_space, self.action_space = self._spaces()
-        self._learners = len(recording.agents)
-        topics, after = recording.train.topics, "next_state" if recording.has_states else "next_observation"
+        self._after = "next_state" if self._has_states else "next_observation"
+        topics, agents = recording.train.topics, recording.agents
         steps, resets = map(recording.layout.rows, (topics.steps, topics.resets))
-        self.dtypes = Dtypes(steps[after], resets["observation"])
+        ends = [("rewards", "<f8", (len(agents),)), ("terminated", "?"), ("truncated", "?")]
+        masks = [(f"agents_{name}", "<u4") for name in _ENDS[1:] if len(agents) > 1]
+        self._ends_dtype = np.dtype(ends)
+        self._dtype = np.dtype([(self._after, steps[self._after]), *ends, *masks])
+        self._first_dtype = resets["observation"]
 
-    @abstractmethod
-    def _spaces(self) -> tuple[Space, Space]:
-        """Return the spaces of observation and action."""
-
-    @abstractmethod
-    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
-        """Do recorded steps again, until the environment raises an error.
+    def run(self, rows: NDArray[np.void], resets: Sequence[PlacedReset]) -> Returned:
+        """Take recorded actions, until the environment raises an error.
 
         Args:
-            resets: row and reset, in order; each comes before its row.
+            rows: the recorded steps, [steps of each environment * n].
+            resets: step of each environment, and reset, in order; each comes before its step.
         """
+        got, ends = np.zeros(len(rows), self._dtype), np.zeros(len(rows), self._ends_dtype)
+        self._rows, self._actions, self._fill = rows, self.actions(rows), self._filler(got, ends)
+        self._firsts = np.zeros(len(resets), self._first_dtype)
+        self._put_first = self._putter(self._firsts, is_first=True)
+        returned = Returned(got)
+        try:
+            for step, group in groupby(resets, key=lambda placed: placed[0]):
+                self._take(step, returned)
+                self._reset(step, [reset for _, reset in group], returned)
+            self._take(len(self._actions), returned)
+        except (MemoryError, CannotRedo):
+            raise
+        except Exception as error:  # foreign code raises anything
+            raise_if_out_of_memory()
+            returned.error = error
+        for name in _ENDS:
+            got[name] = ends[name]
+        if self.ends_once:
+            got["truncated"] &= ~got["terminated"]
+        return returned
+
+    def _take(self, stop: int, returned: Returned) -> None:
+        """Take the steps up to `stop`; `returned.done` is right also if one fails."""
+        step, actions, fill, draws = self.env.step, self._actions, self._fill, self.draws
+        first = k = returned.done // self.n
+        try:
+            for k in range(first, stop):
+                fill(k, step(actions[k]))
+                if draws:
+                    returned.frames.append(self.draw())
+            k = stop
+        finally:
+            returned.done = k * self.n
+
+    def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
+        """Do the resets before a step."""
+        for reset in resets:
+            arguments = {"seed": self._seed(reset), "options": reset.options}
+            given = {name: value for name, value in arguments.items() if value is not None}
+            k = len(returned.starts)
+            self._put_first(k, self.env.reset(**given)[0])
+            frame = self.draw() if self.draws else None
+            returned.starts.append(Start(step, reset, self._firsts[k], frame))
+
+    def _seed(self, reset: RecordedReset) -> int | None:
+        """Return the seed of a reset; if it has none, bring random generators to the recorded state."""
+        state = reset.state
+        if reset.seed is not None or state is None:
+            return reset.seed
+        if state.bit_generator is None and not state.ale_state:
+            return state.np_random_seed
+        base = self._base(reset.environment)
+        if state.bit_generator is not None:
+            base.np_random.bit_generator.state = state.bit_generator
+        if state.ale_state:
+            import ale_py
+
+            base.ale.restoreState(ale_py.ALEState(state.ale_state))
+        return None
+
+    def _base(self, environment: int) -> Any:  # noqa: ARG002
+        """Return an environment without wrappers."""
+        return self.env.unwrapped
+
+    def _spaces(self) -> tuple[Space, Space]:
+        """Return the spaces of observation and action."""
+        return self.env.observation_space, self.env.action_space
+
+    def _putter(self, column: Array, is_first: bool = False) -> Put:
+        """Return a function that puts an observation, of a step or of a reset, into a row of a column."""
+        if self._has_states:
+            # States are counted from 0, the first observations are as they came.
+            start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
+
+            def put_state(row: int, observation: object) -> None:
+                if observation.__class__ is not int:
+                    observation = int(np.asarray(observation).reshape(()))
+                column[row] = observation - start
+
+            return put_state
+        return filler(leaves_of(self.observation_space, "observation"), column)
+
+    def _filler(self, got: NDArray[np.void], ends: NDArray[np.void]) -> Fill:
+        """Return a function that puts down steps: observations in `got`, and rewards and ends in `ends`."""
+        put, pack = self._putter(got[self._after]), _ENDING.pack_into
+        data, size = ends.view(np.uint8).data, _ENDING.size
+
+        def fill(row: int, result: Any) -> None:
+            observation, reward, terminated, truncated, _ = result
+            put(row, observation)
+            try:
+                pack(data, row * size, reward, terminated, truncated)
+            except (struct.error, TypeError):  # an array of one
+                number = float(np.asarray(reward).reshape(()))
+                pack(data, row * size, number, bool(terminated), bool(truncated))
+
+        return fill
+
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
+        """Return the actions of recorded steps as the environment takes them."""
+        column = rows["action"]
+        if column.dtype.hasobject:
+            return [keyed(self.action_space, action) for action in self._decoded(column)]
+        if self._has_states:
+            column = column.astype(np.int64) + int(self.action_space.start)  # type: ignore[attr-defined]
+            return column.tolist()  # type: ignore[no-any-return]
+        return values_in(self.action_space, np.array(column))
+
+    def _decoded(self, actions: Array) -> Iterator[Value]:
+        """Yield actions of varying size."""
+        description, where = self._recording.spaces["action"], f"{self._recording.path}: an action"
+        return (decode(description, data, where) for data in actions)
 
     def check_spaces(self) -> None:
         """Check that the environment's spaces hold the recorded values.
@@ -138,23 +196,6 @@ class Stepper(ABC):
                     f"The environment has another {name} space than recorded: found {texts[1]}, expected "
                     f"{texts[0]}. It is another environment, or another version."
                 )
-
-    def _decoded_actions(self, rows: NDArray[np.void]) -> Iterator[Value]:
-        """Yield the actions of recorded steps whose size varies."""
-        description, where = self._recording.spaces["action"], f"{self._recording.path}: an action"
-        return (decode(description, data, where) for data in rows["action"])
-
-    def _restore(self, state: ResetState, base: Any) -> int | None:
-        """Bring random generators to a recorded state; return the seed that `reset` needs instead, if any."""
-        if state.bit_generator is None and not state.ale_state:
-            return state.np_random_seed
-        if state.bit_generator is not None:
-            base.np_random.bit_generator.state = state.bit_generator
-        if state.ale_state:
-            import ale_py
-
-            base.ale.restoreState(ale_py.ALEState(state.ale_state))
-        return None
 
     def _render(self) -> object:
         return self.env.render()
@@ -185,118 +226,7 @@ class Stepper(ABC):
         return picture.copy()
 
 
-class RowStepper(Stepper):
-    """An environment that takes one step after the other."""
-
-    @abstractmethod
-    def _filler(self, column: Array, is_first: bool = False) -> Put:
-        """Return a function that puts an observation into a row of a column; `is_first`: that of a reset."""
-
-    @abstractmethod
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
-        """Return the actions of recorded steps as the environment takes them."""
-
-    @abstractmethod
-    def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
-        """Take the steps of these rows, and fill them in; `results.done` counts them also if one fails."""
-
-    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
-        """Do recorded steps again, until the environment raises an error."""
-        n = len(rows)
-        results = Results(n, len(resets), self.dtypes, self._learners)
-        put, actions, first = self._filler(results.observations), self.actions(rows), 0
-        put_first = self._filler(results.first_observations, is_first=True)
-        try:
-            for number, (row, reset) in enumerate(resets):
-                self.take(actions, first, row, results, put)
-                first = row
-                put_first(number, self._reset(reset))
-                if self.draws:
-                    results.first_frames.append(self.draw())
-                results.resets_done += 1
-            self.take(actions, first, n, results, put)
-        except (MemoryError, CannotRedo):
-            raise
-        except Exception as error:  # foreign code raises anything
-            raise_if_out_of_memory()
-            results.error = error
-        return results
-
-    def _reset(self, reset: RecordedReset) -> Value:
-        """Reset the environment as it was; return its observation."""
-        seed = reset.seed
-        if seed is None and reset.state is not None:
-            seed = self._restore(reset.state, self.env.unwrapped)
-        arguments = {"seed": seed, "options": reset.options}
-        return self.env.reset(**{name: value for name, value in arguments.items() if value is not None})[0]
-
-
-class EnvironmentStepper(RowStepper):
-    """A Gymnasium environment."""
-
-    ends_once = False
-    """Whether an episode that terminated is not truncated too."""
-    _endings: NDArray[np.void]
-    """Rewards and ends of the rows, put down quickly, and copied to their columns at the end."""
-
-    def run(self, rows: NDArray[np.void], resets: Sequence[tuple[int, RecordedReset]]) -> Results:
-        """Do recorded steps again, until the environment raises an error."""
-        self._endings = np.zeros(len(rows), _ENDING_DTYPE)
-        results = super().run(rows, resets)
-        results.rewards[:, 0] = self._endings["reward"]
-        results.terminated[:] = self._endings["terminated"]
-        results.truncated[:] = self._endings["truncated"]
-        if self.ends_once:
-            results.truncated &= ~results.terminated
-        return results
-
-    def _spaces(self) -> tuple[Space, Space]:
-        return self.env.observation_space, self.env.action_space
-
-    def _filler(self, column: Array, is_first: bool = False) -> Put:
-        if self._recording.has_states:
-            # States are counted from 0, the first observations are as they came.
-            start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
-
-            def put_state(row: int, observation: object) -> None:
-                if observation.__class__ is not int:
-                    observation = int(np.asarray(observation).reshape(()))
-                column[row] = observation - start
-
-            return put_state
-        return filler(leaves_of(self.observation_space, "observation"), column)
-
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
-        """Return the actions of recorded steps as the environment takes them."""
-        if self._recording.has_states:
-            start = int(self.action_space.start)  # type: ignore[attr-defined]
-            return (rows["action"].astype(np.int64) + start).tolist()  # type: ignore[no-any-return]
-        if self._recording.train.steps.dtype is not None:
-            return values_in(self.action_space, np.array(rows["action"]))
-        return [keyed(self.action_space, action) for action in self._decoded_actions(rows)]
-
-    def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
-        """Take the steps of these rows, and fill them in."""
-        step, pack, frames = self.env.step, _ENDING.pack_into, results.frames
-        data, size, draws = self._endings.view(np.uint8).data, _ENDING.size, self.draws
-        row = first
-        try:
-            for row in range(first, stop):
-                observation, reward, terminated, truncated, _ = step(actions[row])
-                put(row, observation)
-                try:
-                    pack(data, row * size, reward, terminated, truncated)
-                except (struct.error, TypeError):  # an array of one
-                    number = float(np.asarray(reward).reshape(()))
-                    pack(data, row * size, number, bool(terminated), bool(truncated))
-                if draws:
-                    frames.append(self.draw())
-            row = stop
-        finally:
-            results.done = row
-
-
-class GameStepper(RowStepper):
+class GameStepper(Stepper):
     """A PettingZoo parallel environment."""
 
     def _spaces(self) -> tuple[Space, Space]:
@@ -308,52 +238,38 @@ class GameStepper(RowStepper):
             )
         return game_spaces(self.env)
 
-    def _filler(self, column: Array, is_first: bool = False) -> Put:  # noqa: ARG002
+    def _putter(self, column: Array, is_first: bool = False) -> Put:  # noqa: ARG002
         return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
+
+    def _filler(self, got: NDArray[np.void], ends: NDArray[np.void]) -> Fill:
+        put, agents = self._putter(got[self._after]), self.env.possible_agents
+        masks = [got[name] for name in got.dtype.names or () if name.startswith("agents_")]
+
+        def fill(row: int, result: Any) -> None:
+            observations, rewards, *flags, _ = result
+            put(row, observations)
+            over = not self.env.agents
+            paid = [float(rewards.get(agent, 0.0)) for agent in agents]
+            ends[row] = (paid, *(over and any(flag.values()) for flag in flags))
+            for mask, flag in zip(masks, flags, strict=False):  # none if there is one agent
+                mask[row] = sum(bool(flag.get(agent)) << i for i, agent in enumerate(agents))
+
+        return fill
 
     def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
-        agents = self.env.possible_agents
+        agents, column = self.env.possible_agents, rows["action"]
         own: Any = self.action_space
-        if self._recording.train.steps.dtype is None:
-            return [
-                {
-                    agent: keyed(own[agent], action[str(agent)])
-                    for i, agent in enumerate(agents)
-                    if acted >> i & 1
-                }
-                for action, acted in zip(self._decoded_actions(rows), rows["acted"].tolist(), strict=True)
-            ]
-        columns = {agent: values_in(own[agent], np.array(rows["action"][str(agent)])) for agent in agents}
-        return [
-            {agent: columns[agent][row] for i, agent in enumerate(agents) if acted >> i & 1}
-            for row, acted in enumerate(rows["acted"].tolist())
+        acting = [
+            [agent for i, agent in enumerate(agents) if acted >> i & 1] for acted in rows["acted"].tolist()
         ]
-
-    def take(self, actions: Sequence[Value], first: int, stop: int, results: Results, put: Put) -> None:
-        """Take the steps of these rows, and fill them in."""
-        agents = self.env.possible_agents
-
-        def mask(flags: Mapping[object, bool]) -> int:
-            return sum(bool(flags.get(agent)) << i for i, agent in enumerate(agents))
-
-        row = first
-        try:
-            for row in range(first, stop):
-                observations, rewards, terminated, truncated, _ = self.env.step(actions[row])
-                put(row, observations)
-                over = not self.env.agents
-                results.rewards[row] = [float(rewards.get(agent, 0.0)) for agent in agents]
-                results.terminated[row] = over and any(terminated.values())
-                results.truncated[row] = over and any(truncated.values())
-                if len(results.agents_terminated):
-                    results.agents_terminated[row] = mask(terminated)
-                    results.agents_truncated[row] = mask(truncated)
-                if self.draws:
-                    results.frames.append(self.draw())
-            row = stop
-        finally:
-            results.done = row
+        if column.dtype.hasobject:
+            return [
+                {agent: keyed(own[agent], action[str(agent)]) for agent in some}
+                for action, some in zip(self._decoded(column), acting, strict=True)
+            ]
+        values = values_in(own, np.array(column))
+        return [{agent: action[agent] for agent in some} for action, some in zip(values, acting, strict=True)]
 
 
 def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:

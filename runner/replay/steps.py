@@ -14,6 +14,7 @@ from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message, frame_place
 from runner.recording.reader import Recording
+from runner.replay.recorded import reset_of
 from runner.replay.whole_steps import whole_steps
 
 _END_OF_TIME: Final = 2**62
@@ -81,29 +82,6 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
     return whole_steps(recording, phase, episode) if own.steps.are_actions else own.episode_steps(episode)
 
 
-def reset_of(recording: Recording, phase: str, episode: int) -> Any | None:
-    """Return the reset that an episode of a loop began with, as `Phase.reset_values` yields it.
-
-    It is the last one of the episode's environment at or before its first step. None if it was lost.
-    """
-    own = recording.phase(phase)
-    resets, numbers = own.resets, own.episode_span(episode)
-    if resets.dtype is None:
-        last = None
-        for reset in own.reset_values():
-            if reset["step"] > numbers.start:
-                break
-            if reset["environment"] % numbers.step == numbers.start % numbers.step:
-                last = reset
-        return last
-    first, stop = (
-        resets.first_from("step", number) for number in (numbers.start - 2 * numbers.step, numbers.start + 1)
-    )
-    before = resets.array(first, stop)
-    before = before[before["environment"] % numbers.step == numbers.start % numbers.step]
-    return before[-1] if len(before) else None
-
-
 def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
     """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
 
@@ -119,9 +97,7 @@ def recorded_frames(recording: Recording, phase: str, episode: int, start: int =
     # The frames of a vector come after the step of its last environment.
     later = (n - 1 - span.start % n) * schema.STEP_NANOSECONDS
     reset = reset_of(recording, phase, episode) if first == 0 else None
-    begin = (
-        times[max(0, first - 1)] - n * schema.STEP_NANOSECONDS if reset is None else int(reset["log_time"])
-    )
+    begin = times[max(0, first - 1)] - n * schema.STEP_NANOSECONDS if reset is None else reset.time
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
         for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))

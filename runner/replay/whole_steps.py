@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.actions import after_step
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.schema import PHASE_NAMES
 from runner.recording.spaces import least_number
-from runner.replay.redone import RedoneSteps
+from runner.replay.comparison import RerunSteps
+from runner.replay.recorded import RecordedReset
 
 
 def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
@@ -37,23 +37,42 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
 
 @lru_cache(4)
 def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
-    from runner.replay.environment import redo_in_child  # loads Gymnasium
+    from runner.replay.environment import rerun_in_child  # loads Gymnasium
 
     with open_recording(path) as recording:
         span = recording.phase(phase).episode_span(episode)
         own = list(recording.phase(phase).steps.numbered(span))
         if not own or not np.array_equal(np.concatenate([part["step"] for part in own]), span):
             raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
-        records = blank_steps(recording, phase, np.concatenate(own))
-        is_state, start = recording.has_states, least_number(recording.spaces["observation"])
-    for steps in redo_in_child(path, phase, [episode]):
-        fill_in(records, (steps.step - span.start) // span.step, steps)
-        for first in steps.starts if is_state else ():
-            records["state"][0] = int(np.asarray(first.got).reshape(())) - start
-    if is_state:
-        records["state"][1:] = records["next_state"][:-1]
-    records.setflags(write=False)
-    return records
+        parts, state = [np.empty(0, recording.layout.rows(recording.phase(phase).steps.topic))], 0
+        for steps in rerun_in_child(path, phase, [episode]):
+            records, state = whole_records(recording, steps, state)
+            parts.append(records)
+    whole = np.concatenate(parts)
+    whole.setflags(write=False)
+    return whole
+
+
+def whole_records(recording: Recording, steps: RerunSteps, state: int) -> tuple[NDArray[np.void], int]:
+    """Return rerun steps as whole records, and the state after them; `state` is the one before.
+
+    Raises:
+        CannotRedo: the environment is not the recorded one.
+    """
+    records = blank_steps(recording, steps.phase, steps.recorded)
+    for name in steps.require_equal().got.dtype.names or ():
+        records[name] = steps.got[name]
+    if recording.has_states:
+        states = np.append(state, records["next_state"])
+        for start in steps.starts:
+            states[start.row] = state_of(recording, start.reset)
+        records["state"], state = states[:-1], int(states[-1])
+    return records, state
+
+
+def state_of(recording: Recording, reset: RecordedReset) -> int:
+    """Return the state, from 0, that a reset led to."""
+    return int(reset.observation) - least_number(recording.spaces["observation"])
 
 
 def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDArray[np.void]:
@@ -64,13 +83,3 @@ def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDA
         if name != "digest":
             records[name] = rows[name]
     return records
-
-
-def fill_in(records: NDArray[np.void], at: NDArray[np.int64], steps: RedoneSteps) -> None:
-    """Fill in what the environment returned for the records at these places.
-
-    Raises:
-        CannotRedo: it is not the recorded environment.
-    """
-    got = steps.require_equal().got
-    records[after_step(records.dtype)][at], records["rewards"][at] = got.observations, got.rewards

@@ -29,7 +29,7 @@ from runner.execution.verify import verify
 from runner.recording.maker import EnvironmentMaker, VectorMaker
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
-from runner.replay.environment import redo
+from runner.replay.environment import rerun
 from runner.replay.makers import make_environment, make_vector
 from runner.replay.trust import require_listed
 from runner.runs.marks import MARK_FILE
@@ -319,15 +319,15 @@ def test_options_of_a_reset_are_numbers_unless_the_run_is_trusted(tmp_path, monk
             env.step(0)
         got.clear()
         with open_recording(env.run.recording) as recording:
-            assert all(s.difference is None for s in redo(recording))
+            assert all(s.difference is None for s in rerun(recording))
             assert got == [options]
             (env.run.folder / MARK_FILE).unlink()
             got.clear()
             if "config" in options:
                 with pytest.raises(CannotRedo, match=r"option of a reset, config=.*--trust"):
-                    list(redo(recording))
+                    list(rerun(recording))
             else:
-                assert all(s.difference is None for s in redo(recording))
+                assert all(s.difference is None for s in rerun(recording))
             assert got == [options] * ("low" in options)
 
 
@@ -349,7 +349,7 @@ def test_a_known_environment_of_a_stranger_is_made(strangers):
 
 def test_of_golden_runs_the_environment_is_the_tests_own(strangers, trap):
     with open_recording(strangers / "function" / "recording.mcap") as recording:
-        assert all(s.difference is None for s in redo(recording, make=lambda: gymnasium.make("CartPole-v1")))
+        assert all(s.difference is None for s in rerun(recording, make=lambda: gymnasium.make("CartPole-v1")))
     assert untouched(trap)
 
 

@@ -92,11 +92,11 @@ def rerecord_command(
       dualtaxi run quick --set recording.steps=none
       dualtaxi rerecord @latest
     """
-    from runner.execution.rerecord import holds_steps, is_done_again, rerecord
+    from runner.execution.rerecord import holds_steps, is_rerun, rerecord
 
     run = find(run_name, recordings)
     require_over(run)
-    is_loop = is_done_again(run)
+    is_loop = is_rerun(run)
     had_steps = (is_loop or run.status == "finished") and holds_steps(run)
     if is_loop:
         steps = (run.summary.train_steps or 0) + (run.summary.eval_steps or 0)

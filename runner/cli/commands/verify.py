@@ -83,7 +83,7 @@ def verify_command(
     with job_progress("verifying", episodes) as (report, _):
         found = check(path, damage, bool(rerun), report, trust)
     if found.is_loop and rerun is not False:
-        from runner.execution.redo import rerun_loop  # slow to import
+        from runner.execution.rerun import rerun_loop  # slow to import
 
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)

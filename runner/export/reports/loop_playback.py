@@ -33,7 +33,7 @@ from runner.export.values import is_image, names_in, number_names, observed, ste
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
-from runner.replay.steps import reset_of
+from runner.replay.recorded import reset_of
 from runner.replay.whole_steps import whole_steps
 from runner.util.arrays import Array, Records
 
@@ -151,7 +151,7 @@ def _observations_before(
     reset = reset_of(recording, phase, episode)
     if reset is None:
         return []
-    value = reset["observation"]
+    value = reset.value(recording)
     return [
         part.column([value] if recording.train.steps.dtype is None else np.array([value])) for part in parts
     ]

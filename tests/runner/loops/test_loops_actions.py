@@ -119,9 +119,9 @@ def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
                     found = np.concatenate([block[name] for block in kept])
                     assert found.tobytes() == np.concatenate([block[name] for block in steps]).tobytes()
     assert verify(actions.recording).sound
-    redone = verify(actions.recording)
-    assert (redone.verdict, redone.left_out) == ("reproduced", 0)
-    assert redone.steps == verify(whole.recording).steps
+    rerun = verify(actions.recording)
+    assert (rerun.verdict, rerun.left_out) == ("reproduced", 0)
+    assert rerun.steps == verify(whole.recording).steps
     after = rerecord(actions)
     assert after.summary["content_digest"] == digest
     assert verify(after.recording).content_digest == digest
@@ -155,9 +155,9 @@ def test_steps_of_actions_alone_are_found_by_number_and_not_taken_for_none(tmp_p
 def test_one_episode_comes_again_alone(tmp_path):
     run = single("CartPole-v1")(tmp_path, steps="actions")
     with open_recording(run.recording) as recording:
-        (steps,) = runner.replay.environment.redo(recording, "train", [9])
+        (steps,) = runner.replay.environment.rerun(recording, "train", [9])
         assert steps.difference is None
-        assert len(steps.recorded.rewards) == recording.train.episodes.array(9, 10)["length"][0]
+        assert len(steps.recorded) == recording.train.episodes.array(9, 10)["length"][0]
 
 
 def test_replays_make_its_steps_again(tmp_path):
@@ -203,7 +203,7 @@ def test_another_reward_is_found_in_its_episode(tmp_path, monkeypatch):
                 rec.reset()
     with open_recording(rec.run.recording) as recording:
         make = lambda: gymnasium.make("CartPole-v1")  # noqa: E731
-        difference = [steps.difference for steps in runner.replay.environment.redo(recording, make=make)][-1]
+        difference = [steps.difference for steps in runner.replay.environment.rerun(recording, make=make)][-1]
         ends = recording.train.episodes.array()["last_step"]
     assert difference.field == "digest of the episode so far"
     assert difference.step == ends[np.searchsorted(ends, 69)]
@@ -216,8 +216,8 @@ def test_without_actions_nothing_comes_again(tmp_path):
     assert verify(run.recording).sound
     with pytest.raises(RunnerError, match="without its actions"):
         rerecord(run)
-    redone = verify(run.recording)
-    assert (redone.verdict, redone.reason) == ("consistent", "No steps were recorded.")
+    rerun = verify(run.recording)
+    assert (rerun.verdict, rerun.reason) == ("consistent", "No steps were recorded.")
     shown = CliRunner().invoke(cli, ["play", run.run_id, "--recordings", str(tmp_path)])
     assert shown.exit_code
     assert "without its actions a loop's environment cannot be rerun" in " ".join(shown.output.split())
@@ -333,9 +333,9 @@ def test_a_killed_loop_keeps_its_actions_up_to_the_last_second(tmp_path):
         process.send_signal(signal.SIGKILL)
         process.wait()
     (run,) = runner.list_runs(tmp_path)
-    redone = verify(run.recording)
-    assert (redone.verdict, redone.act) == ("interrupted", "rerun")
-    assert redone.steps > 100
+    rerun = verify(run.recording)
+    assert (rerun.verdict, rerun.act) == ("interrupted", "rerun")
+    assert rerun.steps > 100
     with pytest.raises(RunnerError, match="cut off"):
         rerecord(run)
 

@@ -29,7 +29,7 @@ from runner.recording.maker import EnvironmentMaker, VectorMaker, parse_maker
 from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
 from runner.recording.reset_states import ResetState, decode_reset_state
-from runner.replay.environment import redo
+from runner.replay.environment import rerun
 from runner.replay.trust import name_of
 from tests.runner.loops.making import Leaving
 
@@ -212,7 +212,7 @@ def test_wrappers_that_a_registered_function_adds_are_not_added_again(entry_poin
     assert (maker.reason, maker.assumed, maker.inner_wrappers) == ("", (), 2)
     assert [one["name"] for one in json.loads(maker.spec)["additional_wrappers"]] == ["Scaled"]
     with open_recording(rec.run.recording) as recording:
-        assert not any(steps.difference for steps in redo(recording, trust=True))
+        assert not any(steps.difference for steps in rerun(recording, trust=True))
     bare = maker_of(record_steps(runner.record(gymnasium.make("Clipped-v0", high=1).unwrapped, tmp_path)))
     assert bare.assumed == (name_of(entry_point),)  # whether the wrappers were left out is not known
 

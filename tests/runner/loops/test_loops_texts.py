@@ -17,8 +17,8 @@ from runner.execution.verify import check_integrity, verify
 from runner.recording.description import environment_count
 from runner.recording.reader import open_recording
 from runner.recording.spaces import decode
-from runner.replay.environment import redo
-from runner.replay.steps import reset_of
+from runner.replay.environment import rerun
+from runner.replay.recorded import reset_of
 from tests.runner.loops import talking
 from tests.runner.loops.talking import ENVIRONMENTS, MAKERS, said
 from tests.runner.replay.varied import SPACES, Varied
@@ -86,7 +86,7 @@ def test_a_change_of_the_environment_is_found_at_its_first_step(is_whole, tmp_pa
     step = next(t for t, own in enumerate(taken) if "so far" in own[1][0])
     make = talking.make_mistaken if is_whole else talking.Mistaken
     with open_recording(envs.run.recording) as recording:
-        found = [steps.difference for steps in redo(recording, make=make)][-1]
+        found = [steps.difference for steps in rerun(recording, make=make)][-1]
     assert (found.environment, found.t, found.field) == (0, step, "observation")
     was = taken[step][1][0]
     assert (found.recorded, found.got) == (was, was.replace("so far", "now"))
@@ -102,7 +102,7 @@ def test_an_episode_of_a_vector_is_played_alone(tmp_path):
             seen = [repr(step[1][environment]) for step in taken[:length]]
             assert played(envs.run, tmp_path, number) == [*seen[:-1], f"{seen[-1]}, ended"]
             reset = reset_of(recording, "train", number)
-            assert reset["observation"] == first[environment]
+            assert reset.value(recording) == first[environment]
 
 
 def test_vectors_of_texts_share_a_run(tmp_path):
@@ -128,7 +128,7 @@ def test_any_space_is_recorded_of_a_vector(name, tmp_path):
             envs.step(batch(envs.single_action_space, sample))
     check_integrity(envs.run.recording)
     with open_recording(envs.run.recording) as recording:
-        for steps in redo(recording, make=partial(Varied, name)):
+        for steps in rerun(recording, make=partial(Varied, name)):
             steps.require_equal()
 
 
@@ -239,7 +239,7 @@ def test_texts_of_a_game_are_read_back_and_reproduced(tmp_path):
     check_integrity(env.run.recording)
     assert verify(env.run.recording).verdict == "reproduced"
     with open_recording(env.run.recording) as recording:
-        found = [steps.difference for steps in redo(recording, make=talking.Changed)][-1]
+        found = [steps.difference for steps in rerun(recording, make=talking.Changed)][-1]
     assert (found.episode, found.t, found.field) == (0, 0, "observation['buyer']['heard']")
 
 

@@ -105,8 +105,8 @@ def test_vectors_and_single_environments_share_a_run(tmp_path, mode):
         steps = recording.done()["train_steps"]
         taken = 120 * 3 + 90 * 2 + 80
         assert steps < taken if mode == AutoresetMode.NEXT_STEP else steps == taken
-    redone = verify(rec.run.recording)
-    assert (redone.verdict, redone.steps, redone.left_out) == ("reproduced", steps + 100, 0)
+    rerun = verify(rec.run.recording)
+    assert (rerun.verdict, rerun.steps, rerun.left_out) == ("reproduced", steps + 100, 0)
 
 
 class Wide(gymnasium.Env):
@@ -339,8 +339,8 @@ def test_games_of_several_agents_share_a_run(tmp_path):
         step(rec, 1)
         with runner.record_parallel(simple_tag_v3.parallel_env(max_cycles=30), join=rec.run) as two:
             step(two, 5)
-    redone = verify(rec.run.recording)
-    assert (redone.verdict, redone.steps, redone.episodes) == ("reproduced", 120, 4)
+    rerun = verify(rec.run.recording)
+    assert (rerun.verdict, rerun.steps, rerun.episodes) == ("reproduced", 120, 4)
     assert verify(rec.run.recording).sound
 
 

@@ -133,5 +133,5 @@ def test_evaluations_right_after_each_other_are_recorded_in_full(tmp_path):
             evaluator.at_step(100 * evaluation)
             play(evaluator, 20, seed=evaluation)
         evaluator.close()
-    redone = verify(rec.run.recording)
-    assert (redone.verdict, redone.steps) == ("reproduced", 60)
+    rerun = verify(rec.run.recording)
+    assert (rerun.verdict, rerun.steps) == ("reproduced", 60)

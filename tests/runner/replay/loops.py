@@ -1,4 +1,4 @@
-"""Loops over real environments, and environments of bad habits, for the tests of doing loops again."""
+"""Loops over real environments, and environments of bad habits, for the tests of reruns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gymnasium import spaces
 
 import runner
 from runner.recording.reader import open_recording
-from runner.replay.environment import redo
+from runner.replay.environment import rerun
 from tests.runner.loops.making import Rooms
 
 SEEDING = ("once", "each", "never")
@@ -37,12 +37,12 @@ def record(env: Any, folder: Path, steps: int, seeding: str = "once", **options:
     return recorded.run.recording
 
 
-def redone(path: Path, *arguments: Any, **options: Any) -> tuple[int, Any]:
-    """Return how many steps were done again, and the first difference."""
+def rerun_steps(path: Path, *arguments: Any, **options: Any) -> tuple[int, Any]:
+    """Return how many steps were rerun, and the first difference."""
     steps, difference = 0, None
     with open_recording(path) as recording:
-        for block in redo(recording, *arguments, **options):
-            assert len(block.t) == len(block.got.rewards) == len(block.recorded.observations)
+        for block in rerun(recording, *arguments, **options):
+            assert len(block) == len(block.got["rewards"]) == len(block.recorded["t"])
             steps, difference = steps + len(block), block.difference
     return steps, difference
 

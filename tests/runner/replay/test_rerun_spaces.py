@@ -13,7 +13,7 @@ from runner.execution.verify import check_integrity
 from runner.recording.gym_spaces import text_of, value_of
 from runner.recording.reader import open_recording
 from tests.runner.replay import varied
-from tests.runner.replay.loops import redone
+from tests.runner.replay.loops import rerun_steps
 
 
 @pytest.mark.parametrize("name", varied.SPACES)
@@ -27,8 +27,8 @@ def test_actions_and_observations_of_any_space_come_out_again(name, is_seeded, t
                 env.step(env.action_space.sample())
     check_integrity(env.run.recording)
     make = partial(varied.Varied, name)
-    assert redone(env.run.recording, make=make) == (21, None)
-    assert redone(env.run.recording, "train", [1], make=make) == (7, None)
+    assert rerun_steps(env.run.recording, make=make) == (21, None)
+    assert rerun_steps(env.run.recording, "train", [1], make=make) == (7, None)
 
 
 @pytest.mark.parametrize("name", varied.SPACES)
@@ -65,7 +65,7 @@ def test_another_space_is_found_out(tmp_path):
         env.reset()
         env.step(env.action_space.sample())
     with pytest.raises(CannotRedo, match="another observation space"):
-        redone(env.run.recording, make=partial(varied.Varied, "graph"))
+        rerun_steps(env.run.recording, make=partial(varied.Varied, "graph"))
 
 
 @pytest.mark.parametrize("cls", [spaces.Box, int, varied.Hands()])

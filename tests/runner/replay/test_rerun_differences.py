@@ -17,11 +17,11 @@ from runner.execution.verify import verify
 from runner.export.pictures import Source, source_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
-from runner.replay.environment import redo, redo_in_child
+from runner.replay.environment import rerun, rerun_in_child
 from runner.replay.makers import make_environment, why_not_made
 from tests.runner.loops.making import drive
 from tests.runner.replay import loops
-from tests.runner.replay.loops import record, redone
+from tests.runner.replay.loops import record, rerun_steps
 
 
 def cart_pole(**attributes):
@@ -42,7 +42,7 @@ def pole(tmp_path_factory):
 
 
 def test_another_constant_is_found_in_the_first_step(pole):
-    steps, difference = redone(pole, make=lambda: cart_pole(gravity=9.81))
+    steps, difference = rerun_steps(pole, make=lambda: cart_pole(gravity=9.81))
     assert steps == 1
     assert (difference.phase, difference.episode, difference.t, difference.step) == ("train", 0, 0, 0)
     assert difference.field == "observation[1]"  # gravity acts on both velocities, and not yet on places
@@ -53,7 +53,7 @@ def test_another_constant_is_found_in_the_first_step(pole):
 
 
 def test_another_rule_of_the_end_is_found_where_it_first_matters(pole):
-    steps, difference = redone(pole, make=lambda: cart_pole(theta_threshold_radians=math.radians(11)))
+    steps, difference = rerun_steps(pole, make=lambda: cart_pole(theta_threshold_radians=math.radians(11)))
     with open_recording(pole) as recording:
         rows = recording.train.steps.array()
     beyond = np.abs(rows["next_observation"][:, 2]) > math.radians(11)
@@ -65,21 +65,21 @@ def test_another_rule_of_the_end_is_found_where_it_first_matters(pole):
 
 def test_another_limit_is_found_in_the_first_episode_that_reaches_it(tmp_path):
     path = record(gymnasium.make("Taxi-v4"), tmp_path, 700)
-    steps, difference = redone(path, make=lambda: gymnasium.make("Taxi-v4", max_episode_steps=150))
+    steps, difference = rerun_steps(path, make=lambda: gymnasium.make("Taxi-v4", max_episode_steps=150))
     assert (steps, difference.episode, difference.t, difference.field) == (150, 0, 149, "truncated")
 
 
 def test_steps_are_yielded_once_where_nothing_can_be_compared_in_advance(pole, monkeypatch):
     monkeypatch.setattr("runner.replay.episodes._HELD_SECONDS", 0.0)  # as on a slow machine
     limited = {"render_mode": "rgb_array", "max_episode_steps": 4}
-    steps, difference = redone(
+    steps, difference = rerun_steps(
         pole, "train", [0], render=True, make=lambda: gymnasium.make("CartPole-v1", **limited)
     )
     assert (steps, difference.t, difference.field) == (4, 3, "truncated")
 
 
 def test_another_beginning_is_found_at_the_reset(pole):
-    _, difference = redone(
+    _, difference = rerun_steps(
         pole, make=lambda: gymnasium.wrappers.TransformObservation(cart_pole(), lambda o: o * 2, None)
     )
     assert (difference.t, difference.field) == (0, "first observation[0]")
@@ -95,7 +95,7 @@ def test_a_difference_in_one_part_of_a_dictionary_is_named(tmp_path):
                 observation["doors"] ^= np.array([0, 1, 0], np.int8)
             return observation
 
-    _, difference = redone(path, make=OtherDoors)
+    _, difference = rerun_steps(path, make=OtherDoors)
     assert (difference.episode, difference.t, difference.field) == (0, 2, "observation['doors'][1]")
 
 
@@ -113,7 +113,7 @@ def test_an_action_that_the_environment_refuses_is_named(tmp_path):
     with runner.record(Lenient(), tmp_path) as env:
         env.reset(seed=3)
         env.step(7)
-    _, difference = redone(env.run.recording, make=cart_pole)
+    _, difference = rerun_steps(env.run.recording, make=cart_pole)
     assert difference.field == "error"
     assert "7" in difference.got
     assert "AssertionError" in difference.got
@@ -132,7 +132,9 @@ def test_an_error_of_a_vector_is_named(step, tmp_path):
 
     with runner.record_vector(gymnasium.make_vec("CartPole-v1", 3), tmp_path) as envs:
         drive(envs, 80)
-    done, difference = redone(envs.run.recording, make=lambda: Failing(gymnasium.make_vec("CartPole-v1", 3)))
+    done, difference = rerun_steps(
+        envs.run.recording, make=lambda: Failing(gymnasium.make_vec("CartPole-v1", 3))
+    )
     assert (difference.field, difference.got) == ("error", "RuntimeError: out of order")
     assert difference.step // 3 in (step - 1, step)
     assert done <= step
@@ -144,9 +146,9 @@ def test_small_differences_are_accepted_within_a_tolerance(pole):
             cart_pole(), lambda o: (o * np.float32(factor)).astype(np.float32), None
         )
 
-    assert redone(pole, make=scaled(1 + 1e-5), tolerance=1e-4) == (600, None)
-    assert redone(pole, make=scaled(1 + 1e-5))[1] is not None
-    assert redone(pole, make=scaled(1 + 1e-2), tolerance=1e-4)[1] is not None
+    assert rerun_steps(pole, make=scaled(1 + 1e-5), tolerance=1e-4) == (600, None)
+    assert rerun_steps(pole, make=scaled(1 + 1e-5))[1] is not None
+    assert rerun_steps(pole, make=scaled(1 + 1e-2), tolerance=1e-4)[1] is not None
 
 
 def test_a_recording_that_was_cut_by_a_kill_is_done_again_as_far_as_it_goes(pole, tmp_path):
@@ -159,7 +161,7 @@ def test_a_recording_that_was_cut_by_a_kill_is_done_again_as_far_as_it_goes(pole
         cut.write_bytes(data[: int(share * len(data))])
         with open_recording(cut) as recording:
             if any(phase.steps for phase in recording.phases):
-                done.append(redone(cut))
+                done.append(rerun_steps(cut))
     assert done
     assert all(difference is None for _, difference in done)
     assert max(steps for steps, _ in done) > spans[1].stop
@@ -241,13 +243,13 @@ def test_an_environment_of_the_script_itself_cannot_be_made_again(tmp_path):
         assert source is Source.VALUES
         assert "JSON cannot hold" in reason
         with pytest.raises(CannotRedo, match="JSON cannot hold"):
-            next(redo(recording))
+            next(rerun(recording))
 
 
 def test_another_space_is_named(tmp_path):
     path = record(gymnasium.make("CartPole-v1"), tmp_path, 20)
     with pytest.raises(CannotRedo, match="another observation space than recorded"):
-        redone(path, make=lambda: gymnasium.make("Pendulum-v1"))
+        rerun_steps(path, make=lambda: gymnasium.make("Pendulum-v1"))
 
 
 @pytest.mark.parametrize(
@@ -264,7 +266,7 @@ def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason
     monkeypatch.setattr("runner.replay.environment.MEMORY_BYTES", 1 << 29)
     path = record(make(), tmp_path, 60, make=make)
     with pytest.raises(CannotRedo, match=reason):
-        list(redo_in_child(path, trust=True))
+        list(rerun_in_child(path, trust=True))
     found = verify(path, trust=True)
     assert found.verdict == "consistent"
     assert reason in found.reason
@@ -277,8 +279,8 @@ def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason
 def test_an_environment_that_cannot_draw_says_so(make, reason, tmp_path):
     path = record(make(), tmp_path, 30, make=make)
     with pytest.raises(CannotRedo, match=reason):
-        list(redo_in_child(path, "train", [0], render=True, trust=True))
-    assert redone(path, trust=True) == (30, None)
+        list(rerun_in_child(path, "train", [0], render=True, trust=True))
+    assert rerun_steps(path, trust=True) == (30, None)
 
 
 # --- verdicts -----------------------------------------------------------------------------------------

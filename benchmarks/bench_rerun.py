@@ -1,4 +1,4 @@
-"""Doing a loop again, against stepping the bare environment with the same actions."""
+"""Rerunning a loop, against stepping the bare environment with the same actions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import gymnasium
 import runner
 from benchmarks.figures import Figure, figure
 from runner.recording.reader import open_recording
-from runner.replay.environment import redo
+from runner.replay.environment import rerun
 
 _ENVIRONMENTS: Final = {
     "CartPole-v1": 100_000,
@@ -24,7 +24,7 @@ _ENVIRONMENTS: Final = {
 
 
 def measure(quick: bool) -> list[Figure]:
-    """Return the speed of doing loops again, as a share of that of the bare environment."""
+    """Return the speed of rerunning loops, as a share of that of the bare environment."""
     repetitions = 3 if quick else 7
     return [_figure(name, steps // (4 if quick else 1), repetitions) for name, steps in _ENVIRONMENTS.items()]
 
@@ -35,15 +35,15 @@ def _figure(name: str, steps: int, repetitions: int) -> Figure:
 
     with tempfile.TemporaryDirectory() as folder:
         path, actions = _recorded(name, steps, folder)
-        pairs = [(_bare(name, actions), _redone(path, steps)) for _ in range(repetitions)]
-    ratios = [bare / redone for bare, redone in pairs]
-    bare, redone = (1e6 * min(seconds) / steps for seconds in zip(*pairs, strict=True))
+        pairs = [(_bare(name, actions), _rerun(path, steps)) for _ in range(repetitions)]
+    ratios = [bare / again for bare, again in pairs]
+    bare, again = (1e6 * min(seconds) / steps for seconds in zip(*pairs, strict=True))
     return figure(
-        f"{name}: steps done again and compared, of the bare environment's speed",
+        f"{name}: steps rerun and compared, of the bare environment's speed",
         ratios,
         "x",
         (0.5, 0.85),
-        detail=f"{redone:.1f} us a step, bare {bare:.1f}; both in one process, in turns",
+        detail=f"{again:.1f} us a step, bare {bare:.1f}; both in one process, in turns",
     )
 
 
@@ -73,10 +73,10 @@ def _bare(name: str, actions: list[Any]) -> float:
     return time.process_time() - started
 
 
-def _redone(path: Path, steps: int) -> float:
-    """Return the seconds that reading, doing again and comparing takes, without making the environment."""
+def _rerun(path: Path, steps: int) -> float:
+    """Return the seconds that reading, rerunning and comparing takes, without making the environment."""
     with open_recording(path) as recording:
-        found = redo(recording)
+        found = rerun(recording)
         done = len(next(found))
         started = time.process_time()
         for block in found:

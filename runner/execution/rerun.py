@@ -22,10 +22,10 @@ from runner.execution.verification import Verification
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
-from runner.replay.differences import Difference
+from runner.replay.comparison import Difference
 from runner.replay.engine import Replay
-from runner.replay.environment import redo, stream_from_child
-from runner.replay.makers import why_not_redone, why_uncertain
+from runner.replay.environment import rerun, stream_from_child
+from runner.replay.makers import why_not_rerun, why_uncertain
 from runner.runs.provenance import Differences
 from runner.util.processes import report_progress
 
@@ -61,7 +61,7 @@ def rerun_loop(
     if is_empty or not checked.sound:
         return checked
     with open_recording(checked.path) as recording:
-        if reason := why_not_redone(recording, trust):
+        if reason := why_not_rerun(recording, trust):
             return replace(checked, reason=reason)
         if recording.maker is not None:
             checked = replace(checked, changes=_other_versions(recording.maker))
@@ -108,11 +108,11 @@ def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verifi
     with closing(Replay(recording, trust, found.tolerance, report_progress)) as replay:
         for steps in replay.all():
             if len(steps):
-                after = total[steps.phase] - 1 - int(steps.step[-1])
+                after = total[steps.phase] - 1 - int(steps.recorded["step"][-1])
                 left[steps.phase] = min(left[steps.phase], after)
             found = replace(
                 found,
-                episodes=found.episodes + int(np.count_nonzero(steps.t == 0)),
+                episodes=found.episodes + int(np.count_nonzero(steps.recorded["t"] == 0)),
                 steps=found.steps + len(steps),
                 difference=steps.difference,
             )
@@ -142,7 +142,7 @@ def _rerun_sample(recording: Recording, found: Verification, sample: int, trust:
             report_progress(taken + steps)
 
         try:
-            episode = redo(recording, phase, [number], trust=trust, tolerance=found.tolerance, report=report)
+            episode = rerun(recording, phase, [number], trust=trust, tolerance=found.tolerance, report=report)
             for steps in episode:
                 found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
         except CannotRedo as error:
@@ -168,7 +168,7 @@ def _first_again(path: Path, found: Verification, trust: bool) -> None:
     assert isinstance(first, Difference)
     episodes = None if first.episode is None else [first.episode]
     with open_recording(path) as recording, contextlib.suppress(NotInRecording):  # an episode without steps
-        for steps in redo(
+        for steps in rerun(
             recording,
             first.phase,
             episodes,

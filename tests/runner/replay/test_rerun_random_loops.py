@@ -13,7 +13,7 @@ from gymnasium.wrappers.vector import NormalizeObservation
 
 import runner
 from runner.recording.reader import open_recording
-from tests.runner.replay.loops import redone
+from tests.runner.replay.loops import rerun_steps
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")  # Box2D's module gives them
 
@@ -39,9 +39,9 @@ def check(path, generator):
             for phase in ("train", "eval")
             for number in range(recording.phase(phase).episodes.count())
         }
-    assert redone(path) == (int((np.concatenate(rows) != 2**32 - 1).sum()), None)
+    assert rerun_steps(path) == (int((np.concatenate(rows) != 2**32 - 1).sum()), None)
     for (phase, number), length in generator.sample(sorted(spans.items()), min(4, len(spans))):
-        assert redone(path, phase, [number]) == (length, None)
+        assert rerun_steps(path, phase, [number]) == (length, None)
 
 
 @pytest.mark.parametrize("number", range(4))

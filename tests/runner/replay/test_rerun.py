@@ -21,10 +21,10 @@ from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.export.pictures import Source, source_of
 from runner.recording.reader import open_recording
-from runner.replay.environment import redo, redo_in_child
+from runner.replay.environment import rerun, rerun_in_child
 from tests.runner.loops.making import drive, parallel
 from tests.runner.replay import loops
-from tests.runner.replay.loops import SEEDING, record, redone
+from tests.runner.replay.loops import SEEDING, record, rerun_steps
 
 gymnasium.register_envs(ale_py)
 
@@ -65,12 +65,12 @@ def test_an_environment_comes_out_again(name, seeding, tmp_path):
     make, steps = ENVIRONMENTS[name]
     own = make if name in ("Dict", "texts") else None
     path = record(make(), tmp_path, steps, seeding, make=own)
-    assert redone(path, trust=own is not None) == (steps, None)
+    assert rerun_steps(path, trust=own is not None) == (steps, None)
     with open_recording(path) as recording:
         last = recording.train.episodes.count() - 1
         length = len(recording.train.episode_span(max(last, 0)))
     for episode in {max(last, 0), 0}:
-        found = redone(path, "train", [episode], trust=own is not None)
+        found = rerun_steps(path, "train", [episode], trust=own is not None)
         assert found[1] is None
         assert found[0] == length or episode != last
 
@@ -106,7 +106,7 @@ def test_the_unfinished_episode_of_a_vector_of_one_begins_with_its_first_step(tm
             recorded.step(np.zeros(1, int))
     with open_recording(recorded.run.recording) as recording:
         assert recording.train.episode_steps(1)["t"].tolist() == [0, 1, 2]
-    assert redone(recorded.run.recording, "train", [1]) == (3, None)
+    assert rerun_steps(recorded.run.recording, "train", [1]) == (3, None)
 
 
 def check_vector(envs, seeding, folder):
@@ -129,9 +129,9 @@ def check_vector(envs, seeding, folder):
         ended = recording.train.episodes.count()
         numbers = sorted({0, 5 % ended, min(12, ended - 1)})
         spans = [recording.train.episode_span(k) for k in numbers]
-    assert redone(path) == (250 * recorded.num_envs - resets_alone, None)
+    assert rerun_steps(path) == (250 * recorded.num_envs - resets_alone, None)
     for number, span in zip(numbers, spans, strict=True):
-        assert redone(path, "train", [number]) == (len(span), None)
+        assert rerun_steps(path, "train", [number]) == (len(span), None)
 
 
 @pytest.mark.parametrize("seeding", ["each", "never"])
@@ -148,8 +148,8 @@ def test_a_game_of_several_agents_comes_out_again(seeding, tmp_path):
                 recorded.reset()
                 while recorded.agents:
                     recorded.step({agent: int(generator.integers(5)) for agent in recorded.agents})
-    assert redone(recorded.run.recording) == (40, None)
-    assert redone(recorded.run.recording, "train", [2]) == (10, None)
+    assert rerun_steps(recorded.run.recording) == (40, None)
+    assert rerun_steps(recorded.run.recording, "train", [2]) == (10, None)
 
 
 def test_options_of_resets_are_given_again(tmp_path):
@@ -158,7 +158,7 @@ def test_options_of_resets_are_given_again(tmp_path):
             env.reset(seed=seed, options=options)
             for _ in range(10):
                 env.step(0)
-    assert redone(env.run.recording, trust=True) == (30, None)
+    assert rerun_steps(env.run.recording, trust=True) == (30, None)
 
 
 def test_options_that_the_environment_changes_are_recorded_as_they_were(tmp_path):
@@ -201,9 +201,9 @@ def test_evaluations_between_training_episodes_come_out_again(is_shared, tmp_pat
     with open_recording(path) as recording:
         evaluated = recording.eval.steps.count()
     assert evaluated > 20
-    assert redone(path) == (400 + evaluated, None)
-    assert redone(path, "eval", [1])[1] is None
-    assert redone(path, "train", [7])[1] is None
+    assert rerun_steps(path) == (400 + evaluated, None)
+    assert rerun_steps(path, "eval", [1])[1] is None
+    assert rerun_steps(path, "train", [7])[1] is None
 
 
 def test_few_pictures_are_in_memory_after_episodes_that_are_not_drawn(tmp_path):
@@ -213,7 +213,7 @@ def test_few_pictures_are_in_memory_after_episodes_that_are_not_drawn(tmp_path):
             if any(env.step(np.zeros(1, np.float32))[2:4]):
                 env.reset()
     with open_recording(env.run.recording) as recording:
-        blocks = [len(b.frames) for b in redo(recording, "train", [4], render=True)]
+        blocks = [len(b.frames) for b in rerun(recording, "train", [4], render=True)]
     assert sum(blocks) == 200
     assert max(blocks) <= 32
 
@@ -241,7 +241,7 @@ def test_a_vector_that_cannot_be_taken_apart_draws_its_episodes(kind, tmp_path):
         first, second = next(own), next(own)
         spans = [recording.train.episode_span(k) for k in (first, second)]
     for number, span in ((first, spans[0]), (second, spans[1])):
-        blocks = list(redo_in_child(recorded.run.recording, "train", [number], render=True))
+        blocks = list(rerun_in_child(recorded.run.recording, "train", [number], render=True))
         assert all(block.difference is None for block in blocks)
         frames = [start.frame for block in blocks for start in block.starts]
         frames += [frame for block in blocks for frame in block.frames]
@@ -253,18 +253,18 @@ def test_a_vector_that_cannot_be_taken_apart_draws_its_episodes(kind, tmp_path):
 def test_large_pictures_come_one_by_one(tmp_path):
     path = record(loops.Wide(), tmp_path, 100, make="tests.runner.replay.loops:Wide")
     with open_recording(path) as recording:
-        blocks = [len(block.frames) for block in redo(recording, "train", [0], render=True, trust=True)]
+        blocks = [len(block.frames) for block in rerun(recording, "train", [0], render=True, trust=True)]
     assert sum(blocks) == 10
     assert max(blocks) == 1, "as many of them as of small pictures would take gigabytes"
 
 
 def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     path = record(gymnasium.make("CartPole-v1"), tmp_path, 200)
-    blocks = list(redo_in_child(path, "train", [3], render=True))
+    blocks = list(rerun_in_child(path, "train", [3], render=True))
     with open_recording(path) as recording:
         steps = recording.train.episode_steps(3)
         assert source_of(recording, "train") == (Source.REDRAWN, "")
-        (in_process,) = (b for b in redo(recording, "train", [3], render=True) if b.starts)
+        (in_process,) = (b for b in rerun(recording, "train", [3], render=True) if b.starts)
     frames = [frame for block in blocks for frame in block.frames]
     assert len(frames) == sum(map(len, blocks)) == len(steps)
     assert frames[0].shape == (400, 600, 3)
@@ -272,9 +272,9 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     assert (frames[0] != frames[-1]).any()
     assert (blocks[0].starts[0].frame == in_process.starts[0].frame).all()
     assert (blocks[0].frames[0] == in_process.frames[0]).all()
-    assert [t for block in blocks for t in block.t] == list(range(len(steps)))
-    assert {int(episode) for block in blocks for episode in block.episode} == {3}
-    assert (np.concatenate([b.got.rewards for b in blocks]) == steps["rewards"]).all()
+    assert [t for block in blocks for t in block.recorded["t"]] == list(range(len(steps)))
+    assert {int(episode) for block in blocks for episode in block.recorded["episode"]} == {3}
+    assert (np.concatenate([b.got["rewards"] for b in blocks]) == steps["rewards"]).all()
 
 
 def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp_path):
@@ -301,7 +301,7 @@ def test_a_run_that_was_killed_comes_out_again_with_both_of_its_environments(tmp
             shutil.copy(env.run.recording, killed)
             with contextlib.suppress(RecordingError), open_recording(killed) as recording:
                 recorded, has_maker = counted(killed), recording.eval.own_maker is not None
-    steps, difference = redone(killed)
+    steps, difference = rerun_steps(killed)
     assert difference is None
     assert sum(recorded) - 60 < steps <= sum(recorded)
     verdict = verify(killed)
