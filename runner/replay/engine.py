@@ -20,7 +20,7 @@ from runner.recording.reader import Recording
 from runner.recording.topic_chunks import FOREVER
 from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned
 from runner.replay.games import as_parallel
-from runner.replay.makers import is_whole_vector, make_environment, make_vector, why_not_made
+from runner.replay.makers import is_whole_vector, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.stepping import GameStepper, Stepper
 from runner.replay.stepping_vector import VectorStepper
@@ -220,27 +220,22 @@ class Replay:
             CannotRedo: it cannot be made, or has other spaces.
         """
         key, maker = self._key(phase, environment), self._recording.phase(phase).maker_of(environment)
-        if key not in self._steppers:
-            env, is_trusted = self._environment(maker, environment)
-            try:
-                if environment == ALL and maker is not None and maker.vector is not None:
-                    autoreset = maker.vector.autoreset
-                    stepper: Stepper = VectorStepper(env, self._recording, autoreset, self.drawn)
-                elif maker is not None and maker.kind == "pettingzoo":
-                    stepper = GameStepper(as_parallel(env), self._recording)
-                else:
-                    stepper = Stepper(env, self._recording)
-                    vector = None if maker is None else maker.vector
-                    stepper.ends_once = vector is not None and vector.is_vec_env
-                stepper.is_trusted = is_trusted
-                stepper.check_spaces()
-            except (CannotRedo, MemoryError):
-                raise
-            except Exception as error:  # foreign code raises anything
-                reason = f"{type(error).__name__}: {error}"
-                raise CannotRedo(f"The environment cannot be used: {reason}") from error
-            self._steppers[key] = stepper
-        return self._steppers[key]
+        if key in self._steppers:
+            return self._steppers[key]
+        env, is_trusted = self._environment(maker, environment)
+        with using("The environment cannot be used"):
+            vector = None if maker is None else maker.vector
+            if environment == ALL and vector is not None:
+                stepper: Stepper = VectorStepper(env, self._recording, vector.autoreset, self.drawn)
+            elif maker is not None and maker.kind == "pettingzoo":
+                stepper = GameStepper(as_parallel(env), self._recording)
+            else:
+                stepper = Stepper(env, self._recording)
+                stepper.ends_once = vector is not None and vector.is_vec_env
+            stepper.is_trusted = is_trusted
+            stepper.check_spaces()
+        self._steppers[key] = stepper
+        return stepper
 
     def _environment(self, maker: EnvironmentMaker | None, environment: int) -> tuple[object, bool]:
         """Return an environment, and whether it may get all that is recorded."""

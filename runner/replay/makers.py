@@ -97,15 +97,20 @@ def _making(what: str, maker: EnvironmentMaker, trust: bool, render: bool) -> It
         raise CannotRedo(reason)
     if render:
         _without_display()
+    with using(f"The {what} cannot be made here"):
+        yield
+
+
+@contextlib.contextmanager
+def using(failure: str) -> Iterator[None]:
+    """Raise what foreign code raises in the block as `CannotRedo`, which begins with `failure`."""
     try:
         yield
     except (CannotRedo, MemoryError):
         raise
     except Exception as error:  # foreign code raises anything
         raise_if_out_of_memory()
-        raise CannotRedo(
-            f"The {what} cannot be made here: {type(error).__name__}: {_short(error)}"
-        ) from error
+        raise CannotRedo(f"{failure}: {type(error).__name__}: {_short(error)}") from error
 
 
 def is_whole_vector(maker: EnvironmentMaker) -> bool:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import heapq
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,6 @@ from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
 
 _BLOCK_BYTES: Final = 16 << 20
-T = TypeVar("T")
-_Row = tuple[Any, ...]
-"""Number, environment, episode, step, time, seed, whether it has one, and observation of a reset."""
-_Extra = tuple[dict[str, object] | None, int | None]
-"""Options and large seed of a call of `reset`."""
 
 
 class RecordedReset(NamedTuple):
@@ -45,8 +40,8 @@ class RecordedReset(NamedTuple):
     observation: Value
     """As recorded: a NumPy value, or bytes where values vary in size."""
     seed: int | None
-    options: dict[str, object] | None
-    state: ResetState | None
+    options: dict[str, object] | None = None
+    state: ResetState | None = None
     """What it depends on, if it has no seed and this was recorded."""
 
     def value(self, recording: Recording) -> Value:
@@ -123,25 +118,39 @@ def _in_turn(resets: list[Piece], last_phase: str) -> list[Piece]:
 def resets_of(
     recording: Recording, phase: str, start_time: int = 0, stop_time: int | None = None
 ) -> Iterator[RecordedReset]:
-    """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`."""
+    """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`.
+
+    Options and large seeds stand among the infos, once for a call of `reset`. If several calls came without
+    a step between them, and fewer infos, these belong to the last calls.
+    """
     times = range(start_time, FOREVER if stop_time is None else stop_time + 1)
-    states = recording.phase(phase).reset_states(times)
-    state = next(states, None)
+    states, extras = recording.phase(phase).reset_states(times), _extras(recording, phase, times)
+    state, extra = next(states, None), next(extras, None)
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
-    rows = (
-        row
+    resets = (
+        RecordedReset(phase, number, environment, episode, step, time, observation, seed if seeded else None)
         for block in recording.phase(phase).resets.rows(times)
-        for row in zip(*(block[name].tolist() for name in names), block["observation"], strict=True)
-    )
-    for row, options, large_seed in _with_extras(recording, phase, rows, times):
-        number, environment, episode, step, time, seed, seeded, observation = row
-        own = None
-        while state is not None and state.reset <= number:
-            own, state = state if state.reset == number else None, next(states, None)
-        known_seed = seed if seeded else large_seed
-        yield RecordedReset(
-            phase, number, environment, episode, step, time, observation, known_seed, options, own
+        for number, environment, episode, step, time, seed, seeded, observation in zip(
+            *(block[name].tolist() for name in names), block["observation"], strict=True
         )
+    )
+    for place, group in groupby(resets, key=lambda reset: (reset.time, reset.step)):
+        given = []
+        while extra is not None and extra[:2] <= place:
+            given += [extra[2:]] if extra[:2] == place else []
+            extra = next(extras, None)
+        of_group = list(calls(group))
+        without = len(of_group) - len(given)
+        for k, call in enumerate(of_group):
+            options, seed = given[k - without] if k >= without else (None, None)
+            for reset in call:
+                while state is not None and state.reset < reset.number:
+                    state = next(states, None)
+                yield reset._replace(
+                    seed=seed if reset.seed is None else reset.seed,
+                    options=options,
+                    state=state if state is not None and state.reset == reset.number else None,
+                )
 
 
 def resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
@@ -167,31 +176,6 @@ def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | 
     return None
 
 
-def _with_extras(
-    recording: Recording, phase: str, rows: Iterator[_Row], times: range
-) -> Iterator[tuple[_Row, dict[str, object] | None, int | None]]:
-    """Yield resets with their options, and with seeds too large for the record of a reset.
-
-    Both stand among the infos, once for a call of `reset`. If several calls came without a step between them,
-    and fewer infos, these belong to the last calls.
-    """
-    extras = _extras(recording, phase, times)
-    extra = next(extras, None)
-    for (step, time), group in groupby(rows, key=lambda row: row[3:5]):
-        here: list[_Extra] = []
-        while extra is not None and extra[:2] <= (time, step):
-            if extra[:2] == (time, step):
-                here.append(extra[2:])
-            extra = next(extras, None)
-        if not here:
-            yield from ((row, None, None) for row in group)
-            continue
-        of_group = list(calls(group, lambda row: row[1]))
-        none: list[_Extra] = [(None, None)] * (len(of_group) - len(here))
-        for call, (options, seed) in zip(of_group, [*none, *here[-len(of_group) :]], strict=True):
-            yield from ((row, options, seed) for row in call)
-
-
 def _extras(
     recording: Recording, phase: str, times: range
 ) -> Iterator[tuple[int, int, dict[str, object] | None, int | None]]:
@@ -213,11 +197,11 @@ def _extras(
         )
 
 
-def calls(resets: Iterable[T], environment_of: Callable[[T], int]) -> Iterator[list[T]]:
+def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
     """Yield the resets of each call; within a call, the environments are in order."""
-    call: list[T] = []
+    call: list[RecordedReset] = []
     for reset in resets:
-        if call and environment_of(reset) <= environment_of(call[-1]):
+        if call and reset.environment <= call[-1].environment:
             yield call
             call = []
         call.append(reset)

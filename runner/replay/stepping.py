@@ -10,11 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import Space
 from runner.errors import CannotRedo, shortened
-from runner.recording.gym_spaces import describe_space, parts_of, value_of
+from runner.recording.gym_spaces import describe_space, value_of
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
@@ -292,12 +293,8 @@ def values_in(space: Space, column: NDArray[Any]) -> Sequence[Value]:
 
 def batched(space: Space, values: Sequence[Value]) -> Value:
     """Return the values of many environments as a vector with this single action space takes them."""
-    if isinstance(space, spaces.Dict):
-        return {key: batched(part, [own[key] for own in values]) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(batched(part, [own[i] for own in values]) for i, part in enumerate(space.spaces))
-    (part,) = parts_of(space, "the action space")
-    return tuple(values) if part.dtype is None else np.array(values)
+    room: Any = create_empty_array(space, len(values))
+    return concatenate(space, values, room)
 
 
 def keyed(space: Space, value: Value) -> Value:

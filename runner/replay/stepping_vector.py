@@ -66,7 +66,7 @@ class VectorStepper(Stepper):
                 add(reset)
             else:
                 explicit.append(reset)
-        for call in calls(explicit, lambda reset: reset.environment):
+        for call in calls(explicit):
             self._see(self.env.reset(**self._arguments(call))[0])
             for reset in call:
                 add(reset)
