@@ -203,8 +203,8 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
             raise
         if not done:
             raise KeyboardInterrupt(f"the recording of run {run.run_id} is as it was")
-        if (found := combined_digest(digests)) != expected:
-            raise Diverged("the recording", "content digest", found, expected)
+        if (digest := combined_digest(digests)) != expected:
+            raise Diverged("the recording", "content digest", digest, expected)
 
     trained = [topic.name for topic in schema.TOPICS]
     rewrite(run.recording, fresh, _with_all_steps, {"rerecord": provenance()}, trained, retrain)
@@ -295,8 +295,8 @@ def _whole_steps(
     records, before, n = blank_steps(recording, piece.phase, piece.rows), states.copy(), len(states)
     for environment in replay.environments:
         for steps in replay.steps(piece, environment, draws=False):
-            own = steps.environment % n
-            whole, states[own] = whole_records(recording, steps, states[own])
+            column = steps.environment % n
+            whole, states[column] = whole_records(recording, steps, states[column])
             records[steps.recorded["step"] - piece.first] = whole
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment

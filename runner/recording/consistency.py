@@ -216,12 +216,12 @@ class _PhaseCheck:
         """
         first, resets = numbers.start, self._resets
         given, was_reset = np.zeros(shape, resets.left.dtype["observation"]), np.zeros(shape, np.bool_)
-        for own in resets.before(numbers.stop):
-            step, is_unknown = own["step"], own["environment"] >= environment_count(self._recording)
+        for block in resets.before(numbers.stop):
+            step, is_unknown = block["step"], block["environment"] >= environment_count(self._recording)
             if (is_unknown | (step % self._n != 0) | (step < first)).any():
                 raise self._out_of_order()
-            at = self._places(first, own)  # of several resets at one place the last counts
-            given[at], was_reset[at] = own["observation"], True
+            at = self._places(first, block)  # of several resets before a step the last counts
+            given[at], was_reset[at] = block["observation"], True
         return given, was_reset
 
     def _places(self, first: int, resets: NDArray[np.void]) -> tuple[Ints, Ints]:

@@ -69,8 +69,12 @@ class Start(NamedTuple):
 
 @dataclass(eq=False)
 class Returned:
-    """What an environment returned for recorded actions, until it raised an error."""
+    """What an environment returned for recorded actions and resets, until it raised an error."""
 
+    rows: NDArray[np.void]
+    """The recorded steps."""
+    resets: Sequence[PlacedReset]
+    """In order; each comes before its row."""
     got: NDArray[np.void]
     """Records with the fields of steps that come from the environment."""
     starts: list[Start] = field(default_factory=list)
@@ -125,44 +129,41 @@ class Comparison:
         self._recording, self._tolerance = recording, tolerance
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
 
-    def of(
-        self,
-        phase: str,
-        environment: int,
-        rows: NDArray[np.void],
-        resets: Sequence[PlacedReset],
-        returned: Returned,
-    ) -> RerunSteps:
+    def of(self, phase: str, environment: int, returned: Returned) -> RerunSteps:
         """Return the steps of an environment up to the first difference."""
-        done, starts, where, values = returned.done, returned.starts, None, None
-        rows_done, got = rows[:done], returned.got[:done]
-        names = [name for name in got.dtype.names or () if name in (rows.dtype.names or ())]
-        first = first_difference(rows_done, got, names, self._tolerance)
-        digest = self._first_digest(phase, environment, rows_done, got)
-        if digest is not None and (first is None or digest < first[0]):
-            first = digest, "digest"
-        failed = self._first_start(starts)
+        rows, got, starts, done = returned.rows, returned.got, returned.starts, returned.done
+        first = self._first_row(phase, environment, rows[:done], got[:done])
+        failed, differing = self._first_start(starts), None
         if first is not None and (failed is None or starts[failed].row > first[0]):
-            k, name = first
-            done, starts = k + 1, [start for start in starts if start.row <= k]
-            where, values = _place_of(rows[k]), self._values(name, rows[k], got[k])
+            row, name = first
+            done, starts = row + 1, [start for start in starts if start.row <= row]
+            differing = _place_of(rows[row]), self._values(name, rows[row], got[row])
         elif failed is not None:
             done, starts = starts[failed].row, starts[: failed + 1]
-            reset = starts[failed].reset
-            field, was, now = self._observation(reset.observation, starts[failed].got)
-            where, values = _place_of_reset(reset), (f"first {field}", was, now)
+            _, reset, value, _ = starts[failed]
+            field, was, now = self._observation(reset.observation, value)
+            differing = _place_of_reset(reset), (f"first {field}", was, now)
         elif returned.error is not None:
             text = f"{type(returned.error).__name__}: {returned.error}"
-            where, values = _failed_at(rows, done, resets[len(starts) :], text), ("error", None, text)
+            differing = _failed_at(returned, text), ("error", None, text)
         difference = None
-        if where is not None and values is not None:
-            episode, t, step = where
+        if differing is not None:
+            (episode, t, step), values = differing
             number: int | None = episode
             if self._recording.environments > 1:
                 number = ended_episode(self._recording, phase, environment, step)
             difference = Difference(phase, number, t, step, environment, *values)
         frames = returned.frames[:done]
         return RerunSteps(phase, environment, rows[:done], got[:done], starts, frames, difference)
+
+    def _first_row(
+        self, phase: str, environment: int, rows: NDArray[np.void], got: NDArray[np.void]
+    ) -> tuple[int, str] | None:
+        """Return the first row that differs, and its first field that does; None if none does."""
+        names = [name for name in got.dtype.names or () if name in (rows.dtype.names or ())]
+        first = first_difference(rows, got, names, self._tolerance)
+        digest = self._first_digest(phase, environment, rows, got)
+        return (digest, "digest") if digest is not None and (first is None or digest < first[0]) else first
 
     def _first_start(self, starts: Sequence[Start]) -> int | None:
         """Return the number of the first reset whose observation differs; None if none does."""
@@ -197,8 +198,8 @@ class Comparison:
             return name, recorded[name].item(), got[name].item()
         agents = self._recording.agents
         paid, pays = (dict(zip(agents, row[name], strict=True)) for row in (recorded, got))
-        place, was, now = differing_value(paid, pays, {}, self._tolerance)
-        return f"reward{place if len(agents) > 1 else ''}", was, now
+        agent, was, now = differing_value(paid, pays, {}, self._tolerance)
+        return f"reward{agent if len(agents) > 1 else ''}", was, now
 
     def _observation(self, recorded: Value, got: Value) -> tuple[str, object, object]:
         space = self._recording.spaces["observation"]
@@ -215,10 +216,9 @@ def _place_of_reset(reset: RecordedReset) -> tuple[int, int, int]:
     return reset.episode, 0, reset.step
 
 
-def _failed_at(
-    rows: NDArray[np.void], done: int, waiting: Sequence[PlacedReset], text: str
-) -> tuple[int, int, int]:
+def _failed_at(returned: Returned, text: str) -> tuple[int, int, int]:
     """Return where an environment raised an error: in the first row or reset that it did not return from."""
+    rows, done, waiting = returned.rows, returned.done, returned.resets[len(returned.starts) :]
     if waiting and (waiting[0][0] <= done or done >= len(rows)):
         return _place_of_reset(waiting[0][1])
     if not len(rows):  # another environment of the vector raised it

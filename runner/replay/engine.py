@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import dropwhile
 from typing import Final
 
@@ -18,7 +17,7 @@ from runner.recording.description import environment_count
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.topic_chunks import FOREVER
-from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned
+from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned, Start
 from runner.replay.games import as_parallel
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
@@ -42,8 +41,6 @@ ALL: Final = -1
 Report = Callable[[int], None]
 _Key = tuple[str, int]
 _Steps = tuple[NDArray[np.void], list[PlacedReset]]
-_Part = tuple[int, NDArray[np.void], Sequence[PlacedReset], Returned]
-"""An environment, its steps and resets, and what came of them."""
 
 
 class Replay:
@@ -147,8 +144,9 @@ class Replay:
             self._adapt(time.monotonic() - started, returned.frames if stepper.draws else None)
             self.taken += returned.done
             self._report(self.taken)
-            for part in self._parts(environment, block, here, returned):
-                steps = self._comparison.of(phase, *part)
+            for number in range(n) if environment == ALL else [environment]:
+                part = self._part(returned, number) if environment == ALL else returned
+                steps = self._comparison.of(phase, number, part)
                 yield steps
                 if steps.difference is not None:
                     return
@@ -158,41 +156,33 @@ class Replay:
 
         Steps at which a vector only reset the environment are left out: the reset stands for them.
         """
-        n, rows = self._recording.environments, piece.rows
-        resets = [(r.step - piece.first, r) for r in piece.resets if r.time <= self._last_step_time]
+        n, rows, first = self._recording.environments, piece.rows, piece.first
+        resets = [reset for reset in piece.resets if environment in (ALL, reset.environment)]
+        resets = [reset for reset in resets if reset.time <= self._last_step_time]
         if environment == ALL:
-            return rows, [(row // n, reset) for row, reset in resets]
+            return rows, [((reset.step - first) // n, reset) for reset in resets]
         if piece.environment not in (None, environment):
             return rows[:0], []
-        index, resets = _of_environment(rows, resets, environment, n)
-        return rows if len(index) == len(rows) else rows[index], resets
+        index, places = _of_environment(rows, [reset.step - first for reset in resets], environment, n)
+        return rows if len(index) == len(rows) else rows[index], list(zip(places, resets, strict=True))
 
-    def _parts(
-        self, environment: int, rows: NDArray[np.void], resets: Sequence[PlacedReset], returned: Returned
-    ) -> Iterator[_Part]:
-        """Yield what came of some steps, of `ALL` environments one after the other."""
-        if environment != ALL:
-            yield environment, rows, resets, returned
-            return
+    def _part(self, whole: Returned, environment: int) -> Returned:
+        """Return what came of the steps of one environment, of those of `ALL`."""
         n = self._recording.environments
-        resets = [(n * row, reset) for row, reset in resets]
-        for own in range(n):
-            index, placed = _of_environment(rows, resets, own, n)
-            places = {reset.number: row for row, reset in placed}
-            done = int(np.searchsorted(index, returned.done))
-            pictures = index[:done].tolist() if own == self.drawn and returned.frames else ()
-            part = replace(
-                returned,
-                got=returned.got[index],
-                done=done,
-                starts=[
-                    start._replace(row=places[start.reset.number])
-                    for start in returned.starts
-                    if start.reset.environment == own
-                ],
-                frames=[returned.frames[row // n] for row in pictures],
-            )
-            yield own, rows[index], placed, part
+        resets = [placed for placed in whole.resets if placed[1].environment == environment]
+        starts = [start for start in whole.starts if start.reset.environment == environment]
+        index, places = _of_environment(whole.rows, [n * step for step, _ in resets], environment, n)
+        done = int(np.searchsorted(index, whole.done))
+        pictures = index[:done].tolist() if environment == self.drawn and whole.frames else ()
+        return Returned(
+            whole.rows[index],
+            [(row, reset) for row, (_, reset) in zip(places, resets, strict=True)],
+            whole.got[index],
+            [Start(row, *start[1:]) for row, start in zip(places, starts, strict=False)],
+            [whole.frames[row // n] for row in pictures],
+            done,
+            whole.error,
+        )
 
     def is_known(self, phase: str, environment: int) -> bool:
         """Return whether an environment's random generators are in the recorded state."""
@@ -277,15 +267,14 @@ def _are_separate(recording: Recording) -> bool:
 
 
 def _of_environment(
-    rows: NDArray[np.void], resets: Sequence[PlacedReset], environment: int, n: int
-) -> tuple[Ints, list[PlacedReset]]:
-    """Return which of some rows are steps that an environment took, and its resets, placed among these.
+    rows: NDArray[np.void], places: Sequence[int], environment: int, n: int
+) -> tuple[Ints, list[int]]:
+    """Return which of the rows of all environments are steps that one took, and places among these.
 
     Args:
-        resets: those of all environments, placed among `rows`.
+        places: numbers of rows.
         n: how many environments take turns.
     """
     index = np.arange(environment % n, len(rows), n)
     index = index[rows["t"][index] != schema.RESET_ONLY]
-    own = [(row, reset) for row, reset in resets if reset.environment == environment]
-    return index, [(int(np.searchsorted(index, row)), reset) for row, reset in own]
+    return index, np.searchsorted(index, places).tolist()

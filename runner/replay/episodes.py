@@ -177,7 +177,7 @@ def _episode(
         for steps in replay.steps(piece, environment, is_target and replay.render, start):
             if is_target and steps.environment == reset.environment:
                 yield replace(
-                    steps, starts=[each for each in steps.starts if each.reset.number >= reset.number]
+                    steps, starts=[begun for begun in steps.starts if begun.reset.number >= reset.number]
                 )
             elif steps.difference is not None and start is not None:
                 raise _Astray
@@ -197,16 +197,16 @@ def _approach(
     """Yield pieces from a reset up to the end of an episode, each with whether it belongs to the episode."""
     reset, is_reached = target.reset, False
     for piece in pieces(recording, schema.PHASES, 0 if start is None else start.time, target.stop_time):
-        is_own = piece.phase == reset.phase
-        numbers = [each.number for each in piece.resets if is_own]
+        is_of_phase = piece.phase == reset.phase
+        numbers = [other.number for other in piece.resets if is_of_phase]
         if reset.number in numbers:
             # The environments of a vector that are reset with the same step stay together.
-            at = [each.step for each in piece.resets].index(reset.step)
+            at = [other.step for other in piece.resets].index(reset.step)
             at, rows = at if is_whole else numbers.index(reset.number), reset.step - piece.first
             yield part(piece, 0, rows, piece.resets[:at], piece.environment), False
             yield part(piece, rows, len(piece.rows), piece.resets[at:], piece.environment), True
             is_reached = True
-        elif is_own or not is_reached:  # what the other phase does meanwhile is not part of the episode
+        elif is_of_phase or not is_reached:  # what the other phase does meanwhile is not part of the episode
             yield piece, is_reached
 
 

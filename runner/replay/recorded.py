@@ -134,10 +134,10 @@ def resets_of(
             *(block[name].tolist() for name in names), block["observation"], strict=True
         )
     )
-    for place, group in groupby(resets, key=lambda reset: (reset.time, reset.step)):
+    for moment, group in groupby(resets, key=lambda reset: (reset.time, reset.step)):
         given = []
-        while extra is not None and extra[:2] <= place:
-            given += [extra[2:]] if extra[:2] == place else []
+        while extra is not None and extra[:2] <= moment:
+            given += [extra[2:]] if extra[:2] == moment else []
             extra = next(extras, None)
         of_group = list(calls(group))
         without = len(of_group) - len(given)
@@ -146,11 +146,8 @@ def resets_of(
             for reset in call:
                 while state is not None and state.reset < reset.number:
                     state = next(states, None)
-                yield reset._replace(
-                    seed=seed if reset.seed is None else reset.seed,
-                    options=options,
-                    state=state if state is not None and state.reset == reset.number else None,
-                )
+                known = state if state is not None and state.reset == reset.number else None
+                yield RecordedReset(*reset[:7], seed if reset.seed is None else reset.seed, options, known)
 
 
 def resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
@@ -214,7 +211,7 @@ def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
 
 def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Piece]:
     """Yield the pieces of one phase; one ends where steps of the other phase come between its own."""
-    n = recording.environments
+    n, known = recording.environments, environment_count(recording)
     resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
     blocks = aligned(_blocks(recording, phase, start_time, stop_time), n)
@@ -232,8 +229,7 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
         yield from _without_steps(phase, early, nothing)
         here = []
         while waiting is not None and waiting.step < first + len(block):
-            is_known = waiting.environment < environment_count(recording)
-            if waiting.step < first or (waiting.step - first) % n or not is_known:
+            if waiting.step < first or (waiting.step - first) % n or waiting.environment >= known:
                 raise RecordingError(
                     f"{recording.path}: /{phase}/reset {waiting.number}: out of order, or of no environment."
                 )

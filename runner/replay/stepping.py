@@ -66,10 +66,10 @@ class Stepper:
             resets: step of each environment, and reset, in order; each comes before its step.
         """
         got, ends = np.zeros(len(rows), self._dtype), np.zeros(len(rows), self._ends_dtype)
-        self._rows, self._actions, self._fill = rows, self.actions(rows), self._filler(got, ends)
+        self._actions, self._fill = self.actions(rows), self._filler(got, ends)
         self._firsts = np.zeros(len(resets), self._first_dtype)
         self._put_first = self._putter(self._firsts, is_first=True)
-        returned = Returned(got)
+        returned = Returned(rows, resets, got)
         try:
             for step, group in groupby(resets, key=lambda placed: placed[0]):
                 self._take(step, returned)
@@ -260,16 +260,16 @@ class GameStepper(Stepper):
     def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
         agents, column = self.env.possible_agents, rows["action"]
-        own: Any = self.action_space
+        by_agent: Any = self.action_space
         acting = [
             [agent for i, agent in enumerate(agents) if acted >> i & 1] for acted in rows["acted"].tolist()
         ]
         if column.dtype.hasobject:
             return [
-                {agent: keyed(own[agent], action[str(agent)]) for agent in some}
+                {agent: keyed(by_agent[agent], action[str(agent)]) for agent in some}
                 for action, some in zip(self._decoded(column), acting, strict=True)
             ]
-        values = values_in(own, np.array(column))
+        values = values_in(by_agent, np.array(column))
         return [{agent: action[agent] for agent in some} for action, some in zip(values, acting, strict=True)]
 
 

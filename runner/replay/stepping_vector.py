@@ -51,18 +51,18 @@ class VectorStepper(Stepper):
         self._last = self._buffer[0].copy()
 
     def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
-        rows, explicit, automatic = self._rows[step * self.n :], [], []
+        t, explicit, automatic = returned.rows["t"][step * self.n :], [], []
 
-        def add(reset: RecordedReset, draws: bool = self.draws) -> None:
-            frame = self.draw() if draws and reset.environment == self._drawn else None
+        def add(reset: RecordedReset) -> None:
+            frame = self.draw() if self.draws and reset.environment == self._drawn else None
             returned.starts.append(Start(step, reset, self._last[reset.environment], frame))
 
         for reset in resets:
-            own = reset.environment
-            if len(rows) and rows["t"][own] == schema.RESET_ONLY:
+            environment = reset.environment
+            if len(t) and t[environment] == schema.RESET_ONLY:
                 automatic.append(reset)  # the step does it
-            elif self._autoreset == "SameStep" and self._over[own]:
-                self._over[own] = False  # the step before did it
+            elif self._autoreset == "SameStep" and self._over[environment]:
+                self._over[environment] = False  # the step before did it
                 add(reset)
             else:
                 explicit.append(reset)
@@ -95,7 +95,8 @@ class VectorStepper(Stepper):
         return arguments | {"seed": first if is_one else [seeds.get(i) for i in range(self.n)]}
 
     def _filler(self, got: NDArray[np.void], ends: NDArray[np.void]) -> Fill:
-        n = self.n
+        n, column, paid = self.n, got[self._after], ends["rewards"][:, 0]
+        over = ends["terminated"], ends["truncated"]
         start = int(self.observation_space.start) if self._has_states else 0  # type: ignore[attr-defined]
 
         def fill(step: int, result: Any) -> None:
@@ -109,9 +110,8 @@ class VectorStepper(Stepper):
                 put = filler(self._leaves, after)
                 for i in np.flatnonzero(self._over).tolist():
                     put(i, element_of(final, i))
-            got[self._after][rows] = after - start if start else after
-            ends["rewards"][rows, 0] = rewards
-            ends["terminated"][rows], ends["truncated"][rows] = terminated, truncated
+            column[rows] = after - start if start else after
+            paid[rows], over[0][rows], over[1][rows] = rewards, terminated, truncated
 
         return fill
 

@@ -19,7 +19,7 @@ from runner.service.pictures import MAX_STREAMS, PictureStreams
 
 
 def test_recorded_frames_are_passed_on_as_they_are(loops_client, loops, monkeypatch):
-    monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
+    monkeypatch.setattr("runner.export.pictures.why_not_rerun", lambda *_: "It is not installed.")
     length = len(steps_of(loops, "framed", "train", 1))
     with open_recording(find_run("framed", loops).recording) as recording:
         recorded = [frame["data"] for frame in recording.train.frames.decoded()]
@@ -75,7 +75,7 @@ def test_where_an_environment_cannot_draw_the_recorded_frames_are_shown_with_the
 
 
 def test_a_damaged_recording_ends_the_pictures_with_a_reason(loops, tmp_path, monkeypatch):
-    monkeypatch.setattr("runner.export.pictures.why_not_redone", lambda *_: "It is not installed.")
+    monkeypatch.setattr("runner.export.pictures.why_not_rerun", lambda *_: "It is not installed.")
     data = bytearray(find_run("framed", loops).recording.read_bytes())
     place = data.rindex(b"\x89PNG")  # frames are stored as they are, in chunks with a checksum
     data[place + 100] ^= 255
