@@ -116,15 +116,23 @@ def _in_turn(resets: list[Piece], last_phase: str) -> list[Piece]:
 
 
 def resets_of(
-    recording: Recording, phase: str, start_time: int = 0, stop_time: int | None = None
+    recording: Recording,
+    phase: str,
+    start_time: int = 0,
+    stop_time: int | None = None,
+    without_infos: bool = False,
 ) -> Iterator[RecordedReset]:
     """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`.
 
     Options and large seeds stand among the infos, once for a call of `reset`. If several calls came without
     a step between them, and fewer infos, these belong to the last calls.
+
+    Args:
+        without_infos: leave out options, large seeds and states, so that no infos are read.
     """
     times = range(start_time, FOREVER if stop_time is None else stop_time + 1)
-    states, extras = recording.phase(phase).reset_states(times), _extras(recording, phase, times)
+    states = iter(()) if without_infos else recording.phase(phase).reset_states(times)
+    extras = iter(()) if without_infos else _extras(recording, phase, times)
     state, extra = next(states, None), next(extras, None)
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
     resets = (
@@ -150,24 +158,31 @@ def resets_of(
                 yield RecordedReset(*reset[:7], seed if reset.seed is None else reset.seed, options, known)
 
 
-def resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
-    """Yield the resets up to a time, from the last to the first, reading no more than needed."""
+def resets_back(
+    recording: Recording, phase: str, time: int, without_infos: bool = False
+) -> Iterator[RecordedReset]:
+    """Yield the resets up to a time, from the last to the first, reading no more than needed.
+
+    `without_infos` is as for `resets_of`.
+    """
     width, stop = 1_000 * STEP_NANOSECONDS, time
     while stop >= 0:
         start = max(stop - width, 0)
-        yield from reversed(list(resets_of(recording, phase, start, stop)))
+        yield from reversed(list(resets_of(recording, phase, start, stop, without_infos)))
         stop, width = start - 1, 4 * width
 
 
 def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
     """Return the last reset of an episode's environment at or before its first step; None if it was lost.
 
+    It has no options, and a seed only up to 64 bits.
+
     Raises:
         RecordingError: there is no such episode, or its first step was lost.
     """
     span, n = recording.phase(phase).episode_span(episode), recording.environments
     time = int(recording.phase(phase).steps.one(span.start)["log_time"])
-    for reset in resets_back(recording, phase, time):
+    for reset in resets_back(recording, phase, time, without_infos=True):
         if reset.environment % n == span.start % n and reset.step <= span.start:
             return reset
     return None
