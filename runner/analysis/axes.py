@@ -160,7 +160,7 @@ def _times(recording: Recording) -> tuple[Values, Values]:
     """
     clock = read_clock(recording)
     if clock is None or recording.shards:
-        reason = "no clock was recorded, as by earlier versions"
+        reason = "no clock was recorded"
         if recording.shards:
             reason = "several processes took its steps at the same time, and the clock is that of one"
         raise RecordingError(f"{recording.path}: has no axis of wall time: {reason}.")

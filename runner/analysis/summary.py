@@ -85,7 +85,7 @@ class RunDetails:
     shards: tuple[Shard, ...] = ()
     """The processes that recorded a loop together; empty if it was one."""
     clock: Clock | None = None
-    """The time that was recorded; None in recordings of earlier versions."""
+    """The time that was recorded; None without samples."""
 
     def facts(self) -> dict[str, object]:
         """Return everything but the series, as JSON can hold it."""

@@ -33,8 +33,6 @@ EXTRAS: Final = "extras.parquet"
 CONTENTS: Final = "checkpoints/"
 """The folder of the contents of checkpoints, named by their digests."""
 LOG: Final = "log.parquet"
-FRAME_ID: Final = "frame_id"
-"""A column that archives of earlier versions do not have."""
 RUN: Final = "run.parquet"
 TRANSITIONS: Final = "transitions.parquet"
 STATES: Final = "states.parquet"
@@ -100,7 +98,7 @@ FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
     schema.EXTRA: ("step", "values"),
     schema.LOG: ("name", "level", "message"),
     schema.SCALAR: ("phase", "name", "step", "episode", "value"),
-    schema.IMAGE: ("format", "data", FRAME_ID),
+    schema.IMAGE: ("format", "data", "frame_id"),
 }
 """The fields that messages may have, in the order of their columns; other messages keep their own order."""
 Q_TABLE_COLUMNS: Final = pa.schema(

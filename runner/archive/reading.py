@@ -178,18 +178,14 @@ class Archive(RunDescription):
                             raise RecordingError(
                                 f"{path}: found {values.null_count} rows without {column}, expected none."
                             )
-                    if batch.schema.names == columns.names:
-                        yield batch
-                    else:
-                        yield batch.append_column(layout.FRAME_ID, batch["phase"].cast(pa.string()))
+                    yield batch
         except (pa.ArrowException, OSError, OverflowError, MemoryError) as error:
             raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
 
     def _check(self, file: pq.ParquetFile, path: Path, columns: pa.Schema, rows: int) -> None:
         about, size = file.metadata, path.stat().st_size
         found = file.schema_arrow.remove_metadata()
-        earlier = pa.schema([column for column in columns if column.name != layout.FRAME_ID])
-        if not found.equals(columns) and not found.equals(earlier):
+        if not found.equals(columns):
             raise RecordingError(f"{path}: found columns\n{found}\nexpected\n{columns}")
         if about.num_rows != rows:
             raise RecordingError(f"{path}: found {about.num_rows:,} rows, expected {rows:,}.")

@@ -117,8 +117,6 @@ def recorded_packing(config: JsonView) -> Packing:
     """
     chosen, names = config.get("recording"), [option.name for option in fields(Packing)]
     parts = {key: chosen[key] for key in names if key in chosen} if isinstance(chosen, Mapping) else {}
-    if parts.get("compression", Packing.compression) != "zstd":
-        parts.pop("level", None)  # loops recorded by earlier versions have one with any compression
     return packing_from(parts).packing
 
 

@@ -36,11 +36,6 @@ class Copied:
     mdp: Mdp | None
     environments: int = 1
 
-    @property
-    def kind(self) -> str:
-        """The kind of recording."""
-        return self.layout.kind
-
 
 class CopiedRows(SingleRows):
     """Rows that are copied as they are, but for their numbers."""

@@ -301,7 +301,7 @@ class _Fold:
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
             own = rows[phase]
-            topics = schema.topics_of(self._layout.kind, phase)
+            topics = schema.topics_of(phase)
             if own is not active:
                 active.commit()
                 active = own

@@ -6,7 +6,6 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
@@ -100,7 +99,6 @@ class Loop(Generic[R]):
             self._recorder,
             self._loop_run.outcomes,
             options,
-            partial(schema.topics_of, described.kind),
             options.join.folder if options.join else self.run.folder,
         )
         FLUSHER.add(self)

@@ -23,7 +23,7 @@ from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
 from runner.recording.reset_states import ResetState
-from runner.recording.schema import STEP_NANOSECONDS, PhaseTopics, Topic
+from runner.recording.schema import STEP_NANOSECONDS, Topic, topics_of
 from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
 from runner.util.jsonable import as_json, is_packed, packed
@@ -95,12 +95,11 @@ class Messages:
         recorder: Recorder,
         outcomes: Outcomes,
         options: Options,
-        topics: Callable[[str], PhaseTopics],
         run_folder: Path,
     ) -> None:
         self._run_folder = run_folder
         self._loop, self._recorder, self._outcomes = loop, recorder, outcomes
-        self._options, self._topics = options, topics
+        self._options = options
         self.has_logged = False
         """Whether anything was logged."""
         self._series: dict[tuple[str, str], _Series] = {}
@@ -221,7 +220,7 @@ class Messages:
             step, _ = self._loop.rows(phase).place
             is_reset = reset is not None
             fields = {"step": step if is_reset else step - 1, "reset": is_reset, "json": text}
-            self._recorder.append(self._topics(phase).infos, encode(schema.INFO, fields), self._loop.position)
+            self._recorder.append(topics_of(phase).infos, encode(schema.INFO, fields), self._loop.position)
 
     def reset_info(
         self, phase: str, info: Mapping[str, object], options: Mapping[str, object] | None, seed: object
@@ -251,7 +250,7 @@ class Messages:
     def reset_state(self, phase: str, state: ResetState) -> None:
         """Record what a reset depended on, of the reset that was just put down. The caller holds the lock."""
         if self._loop.records():
-            self._states.append((self._topics(phase).reset_states, state, self._loop.position))
+            self._states.append((topics_of(phase).reset_states, state, self._loop.position))
             if len(self._states) == _MAX_WAITING:
                 self.commit()
 
@@ -279,7 +278,7 @@ class Messages:
             def make() -> bytes:
                 return encode_image(image_bytes(pixels, kind), kind, position, place)
 
-            self._recorder.submit(self._topics(phase).frames, make, position)
+            self._recorder.submit(topics_of(phase).frames, make, position)
 
     def picture(self, name: str, picture: Picture) -> None:
         """Record a picture or a film under a name, at this moment; another thread encodes it."""

@@ -44,7 +44,7 @@ class Rows:
     ) -> None:
         # Python reads attributes slower if there are more than 30, and some are read at each step.
         self._recorder, self._first_action = recorder, first_action
-        self._topics = schema.topics_of(described.kind, phase)
+        self._topics = schema.topics_of(phase)
         self._mdp, self._n = described.mdp, described.environments
         learners = recorder.dtype(self._topics.episodes)["returns"].shape[0]
         self._log = EpisodeLog(self._n, learners, self._mdp, zero=-0.0)

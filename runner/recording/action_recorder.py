@@ -57,5 +57,5 @@ class ActionRecorder:
         if self._rows:
             rows, self._rows = np.concatenate(self._rows), []
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
-            topic = schema.topics_of("loop", self._phase).actions
+            topic = schema.topics_of(self._phase).actions
             self._recorder.append(topic, encode(schema.ACTIONS, packed(rows, self._n)), position)

@@ -121,7 +121,7 @@ class Clock:
 
 
 def read_clock(recording: Recording) -> Clock | None:
-    """Return the clock of a recording; None if it has no samples, as those of earlier versions.
+    """Return the clock of a recording; None if it has no samples.
 
     Raises:
         RecordingError: samples are damaged, or more than 1,048,576.

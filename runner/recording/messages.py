@@ -424,10 +424,7 @@ def frame_id(phase: str, environment: int | None, is_reset: bool) -> str:
 
 
 def frame_place(frame: Message) -> tuple[int, bool]:
-    """Return the environment of a decoded frame, and whether it shows the state after a reset.
-
-    Recordings of earlier versions do not mark resets.
-    """
+    """Return the environment of a decoded frame, and whether it shows the state after a reset."""
     _, *place = frame["frame_id"].split("/", 2)
     environment = int(place[0]) if place and place[0].isdecimal() and len(place[0]) < 10 else 0
     return environment, place[-1:] == ["reset"]

@@ -286,7 +286,7 @@ def _packed_packages(packages: tuple[tuple[str, str], ...]) -> str:
 
 
 def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]:
-    """Return the provenance in the entries of its record, of earlier recordings too.
+    """Return the provenance in the entries of its record.
 
     Raises:
         RecordingError: the versions of packages are damaged.

@@ -39,7 +39,7 @@ from runner.recording.messages import (
     decode_scalars,
     unknown_measures,
 )
-from runner.recording.metadata import check_file, kind_of
+from runner.recording.metadata import check_file
 from runner.recording.metrics import RECENT_EPISODES, finite_mean
 from runner.recording.record_store import RecordStore
 from runner.recording.reset_states import ResetState, decode_reset_state
@@ -95,33 +95,34 @@ class Recording(RunDescription):
         self.file.close()
 
     def table(self, topic: Topic | str) -> TopicChunks:
-        """Return the messages of a topic, or of this recording's own topic of that name: the kinds differ.
+        """Return the messages of a topic, given by itself or by its name.
 
         Raises:
             RecordingError: the recording has no topic of that name.
         """
-        name = topic if isinstance(topic, str) else topic.name
-        own = self._topics_by_name.get(name, topic)
-        if isinstance(own, str):
-            raise RecordingError(
-                f"{self.path}: has no topic {name!r}: it is of the kind {kind_of(self.run)!r}."
-            )
-        if own not in self._tables:
-            message, lost = self.layout.message(own), self.lost.get(own.name, [])
-            chunks = self._file, own, self._places[own], message, lost
-            if own.message is schema.STEP:
-                actions = self.table(topics_of(kind_of(self.run), own.phase).actions)
-                self._tables[own] = Steps(*chunks, actions=actions)
-            elif own.message in (schema.TRAIN_METRICS, schema.EVAL_METRICS, schema.OPTIMALITY):
-                channel = self.file.index.channels.get(own.channel)
+        if isinstance(topic, str):
+            named = [own for own in self.topics if own.name == topic]
+            if not named:
+                raise RecordingError(
+                    f"{self.path}: has no topic {topic!r}: it is of the kind {self.layout.kind!r}."
+                )
+            topic = named[0]
+        if topic not in self._tables:
+            message, lost = self.layout.message(topic), self.lost.get(topic.name, [])
+            chunks = self._file, topic, self._places[topic], message, lost
+            if topic.message is schema.STEP:
+                actions = self.table(topics_of(topic.phase).actions)
+                self._tables[topic] = Steps(*chunks, actions=actions)
+            elif topic.message in (schema.TRAIN_METRICS, schema.EVAL_METRICS, schema.OPTIMALITY):
+                channel = self.file.index.channels.get(topic.channel)
                 recorded = self.file.index.schemas.get(channel.schema_id) if channel else None
                 unknown = dict.fromkeys(
-                    unknown_measures(own.message, recorded.data if recorded else b""), math.nan
+                    unknown_measures(topic.message, recorded.data if recorded else b""), math.nan
                 )
-                self._tables[own] = TopicChunks(*chunks, _METRICS_BYTES, unknown)
+                self._tables[topic] = TopicChunks(*chunks, _METRICS_BYTES, unknown)
             else:
-                self._tables[own] = TopicChunks(*chunks)
-        return self._tables[own]
+                self._tables[topic] = TopicChunks(*chunks)
+        return self._tables[topic]
 
     @cached_property
     def _file(self) -> ChunkFile:
@@ -131,11 +132,6 @@ class Recording(RunDescription):
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
         """The numbers of the chunks of the file that hold each topic."""
         return chunks_by_topic(self.file.index, self.file, str(self.path))
-
-    @cached_property
-    def _topics_by_name(self) -> Mapping[str, Topic]:
-        """The topics that a recording of its kind has, by name."""
-        return {topic.name: topic for topic in self.topics}
 
     @cached_property
     def train(self) -> Phase:
@@ -247,7 +243,7 @@ class Phase:
     """A phase of an open recording; each of its tables has the messages of a topic."""
 
     def __init__(self, recording: Recording, name: str) -> None:
-        topics = schema.topics_of(kind_of(recording.run), name)
+        topics = schema.topics_of(name)
         self.name, self.title = name, schema.PHASE_NAMES[name]
         steps = recording.table(topics.steps)
         assert isinstance(steps, Steps)

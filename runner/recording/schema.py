@@ -418,7 +418,7 @@ PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}
 
 @dataclass(frozen=True, eq=False)
 class PhaseTopics:
-    """The topics of a phase; those that a kind of recording does not have are empty."""
+    """The topics of a phase; those that a kind of recording does not have are empty there."""
 
     steps: Topic
     actions: Topic
@@ -432,10 +432,9 @@ class PhaseTopics:
 
 
 @cache
-def topics_of(kind: str, phase: str) -> PhaseTopics:
-    """Return the topics of a phase in a kind of recording."""
-    every = (*KINDS["loop"], *KINDS["job"], *KINDS[kind])
-    own = {topic.name.rpartition("/")[2]: topic for topic in every if topic.phase == phase}
+def topics_of(phase: str) -> PhaseTopics:
+    """Return the topics of a phase."""
+    own = {topic.name.rpartition("/")[2]: topic for topic in ALL_TOPICS if topic.phase == phase}
     names = ("step", "actions", "episode", "reset", "reset_state", "info", "frame", "extra", "metrics")
     return PhaseTopics(*(own[name] for name in names))
 

@@ -58,7 +58,7 @@ def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
     Nothing is imported or made.
     """
     if maker is None:
-        return "The recording does not state how its environment was made: an earlier version recorded it."
+        return "The recording does not state how its environment was made."
     if maker.make and trust:
         return why_not_imported(maker.make, trust)
     if maker.make and (maker.reason or not maker.spec):

@@ -121,7 +121,7 @@ def marking_nothing(is_strange: bool = True) -> Iterator[None]:
 
 
 def _canonical(environment: EnvironmentMaker | JsonView) -> str:
-    """Return JSON of what makes an environment; empty values are left out, as earlier versions had fewer."""
+    """Return JSON of what makes an environment; empty values are left out."""
     if isinstance(environment, EnvironmentMaker):
         environment = vars(environment) | {"vector": environment.vector and vars(environment.vector)}
     covered = {name: value for name, value in environment.items() if value and name not in _NOT_COVERED}

@@ -231,7 +231,7 @@ def system(path: Path) -> bytes:
         host = read_host(recording, clock)
     shown = partials()
     if clock is None:
-        return str(shown.paragraphs(["Its recording has no clock: an earlier version made it."])).encode()
+        return str(shown.paragraphs(["Its recording has no clock."])).encode()
     facts = machine_facts(clock, host)
     text = ""
     if host is None:
