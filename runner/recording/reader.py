@@ -271,7 +271,9 @@ class Phase:
         stride = self._recording.environments
         total, ended = self.steps.total(), self.episodes.count()
         if not total:
-            raise RecordingError(f"{self._recording.path}: has no {self.title} steps.")
+            recording = self._recording
+            advice = f"; `dualtaxi rerecord {recording.run_id}` records them" * recording.leaves_out_steps
+            raise RecordingError(f"{recording.path}: has no {self.title} steps{advice}.")
         start = 0
         stop = 0
         if 0 <= episode < ended and len(records := self.episodes.array(episode, episode + 1)):

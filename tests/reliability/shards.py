@@ -37,10 +37,11 @@ from runner.errors import RunnerError
 from runner.execution.verify import verify
 from runner.loops import loop_run
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES
+from runner.recording.blocks import HEADER_BYTES, rows_of
+from runner.recording.layout import Layout
 from runner.recording.liveness import owner
 from runner.recording.messages import decode
-from runner.recording.metadata import check_run, dtypes_of
+from runner.recording.metadata import layout_of_run
 from runner.recording.records import MetadataRecord, ReadChunk
 from runner.recording.repair import DamagedFile
 from runner.runs.listing import run_at
@@ -213,33 +214,32 @@ def steps_below(folder: Path) -> Counter[bytes]:
 def steps_in(path: Path) -> Counter[bytes]:
     """Return the values of the steps in the whole chunks of a file, however damaged."""
     steps: Counter[bytes] = Counter()
-    dtypes: dict[schema.Topic, Any] = {}
+    layout: Layout | None = None
     if not path.stat().st_size:
         return steps
     try:
         with open_regular(path) as stream:
             for record in DamagedFile(stream, path).good_records():
                 if isinstance(record, ReadChunk):
-                    if record.topic.message in schema.STEP_MESSAGES:
-                        steps.update(values_of(record, dtypes))
+                    if record.topic.message is schema.STEP and layout is not None:
+                        steps.update(values_of(record, layout))
                 elif isinstance(record, MetadataRecord) and record.name == "run":
-                    check_run(record.entries, str(path))
-                    dtypes = dtypes_of(record.entries, str(path))
+                    layout = layout_of_run(record.entries, str(path))
     except RunnerError:
         pass
     return steps
 
 
-def values_of(chunk: ReadChunk, dtypes: dict[schema.Topic, Any]) -> list[bytes]:
+def values_of(chunk: ReadChunk, layout: Layout) -> list[bytes]:
     """Return what the steps of a chunk hold that no fold may change; none of a reset in place of a step."""
-    topic = chunk.topic
-    if topic in dtypes:
-        rows = np.frombuffer(chunk.records, dtypes[topic])
+    dtype, message = layout.dtype(chunk.topic), layout.message(chunk.topic)
+    if dtype is not None:
+        rows = rows_of(message, np.frombuffer(chunk.records, dtype))
         rows = rows[rows["t"] != schema.RESET_ONLY]
         names = [name for name in _VALUES if name in rows.dtype.names]
         return [b"".join(row[name].tobytes() for name in names) for row in rows]
-    messages = (decode(topic.message, record[HEADER_BYTES:]) for record in chunk.messages)
-    return [repr([message[name] for name in _VALUES if name in message]).encode() for message in messages]
+    decoded = (decode(message, record[HEADER_BYTES:]) for record in chunk.messages)
+    return [repr([fields[name] for name in _VALUES if name in fields]).encode() for fields in decoded]
 
 
 if __name__ == "__main__":

@@ -121,7 +121,8 @@ def test_many_slow_clients_do_not_block_others(impatient):
     slow = [socket.create_connection(("localhost", impatient)) for _ in range(200)]
     try:
         for connection in slow:
-            connection.sendall(b"GET / HTTP/1.1\r\nHost: loc")
+            with contextlib.suppress(OSError):  # on a slow machine the first ones are cut off already
+                connection.sendall(b"GET / HTTP/1.1\r\nHost: loc")
         assert httpx.get(f"http://localhost:{impatient}/healthz", timeout=2).status_code == 200
     finally:
         for connection in slow:
