@@ -80,6 +80,10 @@ class RecordingError(RunnerError):
     """A recording cannot be read: it is damaged, of another program, or of an unknown version."""
 
 
+class OtherVersion(RecordingError):
+    """A recording has another version of the format than this program reads."""
+
+
 class NotInRecording(RecordingError):
     """A recording has no such episode, evaluation, trial or step."""
 

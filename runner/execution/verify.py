@@ -25,6 +25,7 @@ from runner.errors import (
     CutOff,
     Diverged,
     EnvironmentNotUsable,
+    OtherVersion,
     RecordingError,
     RunnerError,
 )
@@ -89,11 +90,13 @@ def damage_of(path: Path, report: BytesReport = lambda *_: None) -> RecordingErr
     """Return the first damage of a recording's bytes, if there is any.
 
     Raises:
-        RecordingError: there is no such file, or it is not a dualtaxi recording.
+        RecordingError: there is no such file, or it is no recording of a version that is read.
     """
     refuse_foreign(path)
     try:
         check_integrity(path, report)
+    except OtherVersion:
+        raise
     except RecordingError as error:
         return error
     return None

@@ -45,7 +45,7 @@ class CopiedRows(SingleRows):
         steps = recorder.dtype(self._topics.steps)
         self._fields = _FIELDS & set(steps.names or ())
         self._room = recorder.capacity(self._topics.steps)
-        self._copied = np.zeros(self._room, steps)
+        self._copied = np.zeros(self._room, [(name, steps[name]) for name in (*sorted(self._fields), "t")])
         self._scratch = np.zeros(self._room, self._scratch.dtype)
 
     def reshape(self, described: Described) -> None:  # noqa: ARG002
@@ -70,7 +70,8 @@ class CopiedRows(SingleRows):
         while len(rows):
             part, rows = np.split(rows, [self._room - self._filled])
             at, self._filled = self._filled, self._filled + len(part)
-            self._copied[at : self._filled] = part
+            for name in self._copied.dtype.names or ():
+                self._copied[name][at : self._filled] = part[name]
             scratch = self._scratch[at : self._filled]
             scratch["rewards"][:, 0] = part["rewards"]
             scratch["ends"][:, 0, 0], scratch["ends"][:, 1, 0] = part["terminated"], part["truncated"]

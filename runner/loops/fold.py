@@ -44,6 +44,7 @@ from runner.recording.metadata import json_object, layout_of_run, write_result
 from runner.recording.recorder import Recorder
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.spaces import Description, parts_of
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.marks import merge_marks
@@ -132,6 +133,16 @@ def _remove_folded(run: Run, unfolded: Mapping[str, str]) -> None:
             (run.folder / UNFOLDED_FOLDER).mkdir(exist_ok=True)
             folder.rename(run.folder / UNFOLDED_FOLDER / folder.name)
     shutil.rmtree(run.folder / SHARDS_FOLDER)
+
+
+def _widest(a: Description, b: Description) -> Description:
+    """Return the description of a space, with the wider numbers of each part of two."""
+    if (parts := parts_of(a)) is None:
+        widths = [np.dtype(one.get("dtype", "V0")).itemsize for one in (a, b)]
+        return a if widths[0] >= widths[1] else b
+    pairs = zip(parts, parts_of(b) or (), strict=True)
+    wider = {key: _widest(part, other) for (key, part), (_, other) in pairs}
+    return {**a, "spaces": wider if a["type"] == "Dict" else [*wider.values()]}
 
 
 class _Fold:
@@ -228,12 +239,11 @@ class _Fold:
         )
 
     def _spaces(self) -> str:
-        """Return the description of the spaces, with the widest actions that a process recorded."""
-
-        def width(source: Source) -> int:
-            return source.recording.train.steps.row_dtype["action"].itemsize
-
-        return max(self._sources, key=width).recording.run["spaces"]
+        """Return the description of the spaces, with the widest numbers of all recorded actions."""
+        spaces = dict(self._first.spaces)
+        for source in self._sources[1:]:
+            spaces["action"] = _widest(spaces["action"], source.recording.spaces["action"])
+        return json.dumps(spaces)
 
     def _own_makers(self) -> dict[str, EnvironmentMaker]:
         """Return how the environments of shards were made, where it was otherwise than those of the run."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import space_fields
 from runner.recording.schema import MessageType, Topic
-from runner.recording.space_fields import are_exact, has_one_size, put_constants, stored_dtype, tag
+from runner.recording.space_fields import are_exact, has_one_size, put_constants, put_ones, stored_dtype, tag
 from runner.util.arrays import Records
 
 HEADER: Final = [
@@ -98,6 +98,18 @@ def blank_records(topic: Topic, message: MessageType, n: int) -> NDArray[np.void
     if dtype is None:
         return np.zeros(n, row_dtype(message))
     return np.frombuffer(bytearray(_blank_record(topic, message)) * n, dtype)
+
+
+@lru_cache(64)
+def constant_bytes(topic: Topic, message: MessageType) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return a blank message record of one size, and which of its bytes after the header no value changes."""
+    blank, full = blank_records(topic, message, 1), blank_records(topic, message, 1)
+    for field in message.fields:
+        put_ones(field, full[field.name])
+    bytes_of = [record.view(np.uint8) for record in (blank, full)]
+    is_constant = bytes_of[0] == bytes_of[1]
+    is_constant[:HEADER_BYTES] = False
+    return bytes_of[0], is_constant
 
 
 @lru_cache(256)

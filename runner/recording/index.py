@@ -39,13 +39,13 @@ from runner.recording.records import (
     LARGE,
     MAX_NAME_BYTES,
     MAX_NAMED,
-    MAX_RECORD_BYTES,
     RawRecord,
     bytes_of,
     check_unpacked_size,
+    most_bytes,
     raw_records,
 )
-from runner.recording.schema import ALL_TOPICS, FORMAT_VERSION, MESSAGES, PROFILE, TOPIC_OF, Topic
+from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, Topic
 from runner.util.arrays import Records
 
 K = TypeVar("K")
@@ -112,14 +112,14 @@ class ChunkTable:
         """Set the channel of the last chunk's messages.
 
         Raises:
-            RecordingError: it was set before, or no recording has such a channel.
+            RecordingError: it was set before.
         """
         at = len(self._packed) - _ENTRY.size + _CHANNEL_AT
         (known,) = _CHANNEL.unpack_from(self._packed, at)
-        if known or channel not in TOPIC_OF:
+        if known:
             raise RecordingError(
-                f"chunk at {self[len(self) - 1].offset}: found messages of channel {channel}"
-                f"{f' and {known}' if known else ''}, expected those of one topic"
+                f"chunk at {self[len(self) - 1].offset}: found messages of the channels {known} and "
+                f"{channel}, expected those of one topic"
             )
         _CHANNEL.pack_into(self._packed, at, channel)
 
@@ -184,10 +184,10 @@ class Index:
         Raises:
             RecordingError: it cannot be read, or contradicts those before it.
         """
-        if raw.length > MAX_RECORD_BYTES and raw.kind not in LARGE:
+        if raw.length > most_bytes(raw.kind) and raw.kind not in LARGE:
             raise RecordingError(
                 f"the record at {raw.offset} declares {raw.length:,} bytes, "
-                f"expected at most {MAX_RECORD_BYTES:,}"
+                f"expected at most {most_bytes(raw.kind):,}"
             )
         match raw.kind:
             case Opcode.CHUNK:
@@ -440,10 +440,10 @@ def _chunk_entry(raw: RawRecord) -> ChunkEntry:
         (uncompressed,) = struct.unpack_from("<Q", body, map_end + 12 + name_length + 8)
     except struct.error as error:
         raise RecordingError(f"the ChunkIndex record at {raw.offset} cannot be read") from error
-    if len(channels) > 1 or not TOPIC_OF.keys() >= set(channels):
+    if len(channels) > 1:
         raise RecordingError(
-            f"the ChunkIndex record at {raw.offset} names the channels {channels}, expected one channel of "
-            f"version {FORMAT_VERSION} of the format"
+            f"the ChunkIndex record at {raw.offset} names {len(channels)} channels, "
+            "expected that of one topic"
         )
     return ChunkEntry(offset, length, uncompressed, start, end, channels[0] if channels else 0)
 

@@ -10,16 +10,18 @@ import contextlib
 import itertools
 import operator
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
-from runner.errors import CutOff, RecordingError
-from runner.recording.blocks import RECORD_HEAD
+from runner.errors import CutOff, OtherVersion, RecordingError
+from runner.recording.blocks import RECORD_HEAD, constant_bytes
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, message_index
 from runner.recording.index import Index, beginning_of, check_beginning, checksum
+from runner.recording.layout import Layout
 from runner.recording.metadata import layout_of_run
 from runner.recording.records import (
     MetadataRecord,
@@ -97,9 +99,11 @@ def survey(path: Path, keep_result: bool = False, report: Report = lambda *_: No
         declared.check_unpacked_size(str(path))
         try:
             contents.header_end = check_beginning(stream)
-            _take_records(stream, contents, keep_result, report)
+            _take_records(stream, contents, keep_result, report, str(path))
+        except OtherVersion:
+            raise
         except RecordingError as error:
-            contents.reason = str(error)
+            contents.reason = str(error).removeprefix(f"{path}: ").removesuffix(".")
     return contents
 
 
@@ -126,26 +130,42 @@ def _reading(path: Path) -> Iterator[BinaryIO]:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
 
 
-def _check_beginning(raw: RawRecord, contents: Index, run: Mapping[str, str]) -> None:
+def _check_beginning(raw: RawRecord, contents: Index, layout: Layout) -> None:
     """Compare what stands before the metadata record `run` of a recording with what belongs there.
 
     Raises:
-        RecordingError: they differ, or the record is damaged.
+        RecordingError: they differ.
     """
-    expected = beginning_of(layout_of_run(run, "the recording"))
+    expected = beginning_of(layout)
     size = len(expected.schema_records) + len(expected.channel_records)
     is_whole = contents.beginning[2:] == expected[2:] and raw.offset == contents.header_end + size
     if not is_whole:
         raise RecordingError("found other schemas or channels than a recording of its kind begins with")
 
 
-def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: Report) -> None:
+def _check_constants(chunk: ReadChunk, layout: Layout) -> None:
+    """Check the bytes of a loop's messages that are the same in each: retraining compares those of a job.
+
+    Raises:
+        RecordingError: other readers would find other values there.
+    """
+    dtype = layout.dtype(chunk.topic) if chunk.topic in layout.topics and layout.kind != "job" else None
+    if dtype is not None and len(chunk.records) == len(chunk.times) * dtype.itemsize:
+        blank, is_constant = constant_bytes(chunk.topic, layout.message(chunk.topic))
+        rows = np.frombuffer(chunk.records, np.uint8).reshape(-1, dtype.itemsize)
+        if (rows[:, is_constant] != blank[is_constant]).any():
+            raise RecordingError(f"chunk at {chunk.offset}: found tags that no recorder writes")
+
+
+def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: Report, path: str) -> None:
     """Note the good records of the data section.
 
     Raises:
-        RecordingError: one is damaged, or the file ends before the data section does.
+        OtherVersion: the recording has another version of the format.
+        RecordingError: a record is damaged, or the file ends before the data section does.
     """
     indexed = True
+    layout: Layout | None = None
     chunk: ReadChunk | None = None
     """The record before, if it is a chunk."""
     for raw in walk(stream, contents.size):
@@ -161,6 +181,8 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
         record = read_record(raw)
         if isinstance(record, ReadChunk):
             _check_times(record)
+            if layout is not None:
+                _check_constants(record, layout)
             chunk = record._replace(body=b"")
             del record  # memory that is free for the next record makes a survey a third quicker
             continue
@@ -168,7 +190,12 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
             continue
         contents.add(raw)
         if isinstance(record, MetadataRecord) and record.name == "run":
-            _check_beginning(raw, contents, record.entries)
+            try:
+                layout = layout_of_run(record.entries, path)
+            except RecordingError:
+                contents.end = 0  # nothing can be read without it, and no repair mends it
+                raise
+            _check_beginning(raw, contents, layout)
         if isinstance(record, MetadataRecord) and record.name == "config":
             indexed = asks_for_indexes(record.entries)
         contents.end = raw.end

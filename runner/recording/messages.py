@@ -19,7 +19,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, blank_records, row_dtype
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, Field, MessageType
-from runner.recording.space_fields import decoded, encoded, is_text, raw_field, varint
+from runner.recording.space_fields import Decoder, Encoder, decoder, encoder, is_text, raw_field, varint
 from runner.recording.spaces import NUMBERS
 from runner.util.arrays import Array, Records
 
@@ -115,6 +115,16 @@ def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
 
 
 @lru_cache(64)
+def _encoders(message: MessageType) -> dict[str, Encoder]:
+    return {field.name: encoder(field) for field in message.fields if field.is_value}
+
+
+@lru_cache(64)
+def _decoders(message: MessageType) -> dict[str, Decoder]:
+    return {field.name: decoder(field) for field in message.fields if field.is_value}
+
+
+@lru_cache(64)
 def _numbers_of(message: MessageType) -> MessageType:
     """Return a message with the fields alone that come before its values of varying size."""
     fields = tuple(field for field in message.fields if not field.is_value)
@@ -123,13 +133,13 @@ def _numbers_of(message: MessageType) -> MessageType:
 
 def encode_rows(message: MessageType, rows: Records) -> list[bytes]:
     """Return a message for each row; those of varying size."""
-    numbers, values = _numbers_of(message), [field for field in message.fields if field.is_value]
+    numbers = _numbers_of(message)
     records = blank_records(schema.LOG_TOPIC, numbers, len(rows))
     for field in numbers.fields:
         records[field.name] = rows[field.name]
     payloads = [record[HEADER_BYTES:] for record in records.view(f"V{records.itemsize}").tolist()]
-    for field in values:
-        parts = (encoded(field, value) for value in rows[field.name].tolist())
+    for name, encode_value in _encoders(message).items():
+        parts = (encode_value(value, 0)[0] for value in rows[name].tolist())
         payloads = [payload + part for payload, part in zip(payloads, parts, strict=True)]
     return payloads
 
@@ -140,7 +150,7 @@ def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> 
     Raises:
         RecordingError: one is not as `encode_rows` writes them.
     """
-    numbers, values = _numbers_of(message), [field for field in message.fields if field.is_value]
+    numbers, decoders = _numbers_of(message), _decoders(message)
     blank = blank_records(schema.LOG_TOPIC, numbers, len(messages))
     size = blank.itemsize - HEADER_BYTES
     head = bytes(HEADER_BYTES)
@@ -154,8 +164,8 @@ def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> 
         rows[field.name] = records[field.name]
     for k, (_, payload) in enumerate(messages):
         end = size
-        for field in values:
-            rows[field.name][k], end = decoded(field, payload, end)
+        for name, decode_value in decoders.items():
+            rows[name][k], end = decode_value(payload, end)
         if end != len(payload):
             raise RecordingError(f"found {len(payload)} bytes, expected {end} in a {message.full_name}")
     return rows

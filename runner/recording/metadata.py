@@ -24,7 +24,7 @@ from runner.environments.mdp import (
     from_parts,
 )
 from runner.environments.scene import scene_mistake
-from runner.errors import RecordingError
+from runner.errors import OtherVersion, RecordingError
 from runner.recording import schema
 from runner.recording.index import Index, beginning_of
 from runner.recording.layout import Layout, layout_of
@@ -97,12 +97,13 @@ def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
         RecordingError: it is of another version, is damaged, or has another schema or channel.
     """
     expected = beginning_of(layout_of_run(run, path))
-    for channel in expected.channels:
-        found = index.channels.get(channel.id)
+    topics = {channel.id: channel for channel in expected.channels}
+    for number in sorted(topics.keys() | index.channels.keys()):
+        found, channel = index.channels.get(number), topics.get(number)
         if found != channel:
             raise RecordingError(
-                f"{path}: found channel {channel.id} for {found and found.topic!r}, "
-                f"expected {channel.topic!r}: not written by dualtaxi."
+                f"{path}: found channel {number} for {found and found.topic!r}, "
+                f"expected {channel and channel.topic!r}: not written by dualtaxi."
             )
     for message in expected.schemas:
         if index.schemas.get(message.id) != message and message.name in _OF_SPACES:
@@ -120,7 +121,7 @@ def check_run(run: Mapping[str, str], path: str) -> None:
     """
     version = run.get("format_version", "?")
     if version != str(schema.FORMAT_VERSION):
-        raise RecordingError(
+        raise OtherVersion(
             f"{path}: found a recording of version {version}, expected {schema.FORMAT_VERSION}: "
             "it takes another version of dualtaxi to read it."
         )

@@ -56,7 +56,7 @@ _IN_DATA: Final = frozenset(
 LARGE: Final = frozenset({Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA, Opcode.ATTACHMENT})
 """The kinds of records that may have more bytes than `MAX_RECORD_BYTES`."""
 MAX_RECORD_BYTES: Final = 1 << 16
-"""The largest record of a summary, schema or channel; the recorder's are below 4 kB."""
+"""The largest record of a summary or channel; the recorder's are below 4 kB."""
 _BEGINNING_BYTES: Final = 1 << 10
 """Bytes of a body in which a chunk's head is, or a name of `MAX_NAME_BYTES`."""
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
@@ -167,6 +167,11 @@ Record = MetadataRecord | AttachmentRecord | ReadChunk
 """A record that a copy of a recording takes over; the other kinds follow from these."""
 
 
+def most_bytes(kind: int) -> int:
+    """Return the most bytes of a record of a kind that is not `LARGE`; schemas name all parts of spaces."""
+    return MAX_METADATA_BYTES if kind == Opcode.SCHEMA else MAX_RECORD_BYTES
+
+
 def raw_records(stream: BinaryIO, start: int, end: int, whole: bool = False) -> Iterator[RawRecord]:
     """Yield the records in a part of a file, up to the last one that is not cut off.
 
@@ -178,7 +183,7 @@ def raw_records(stream: BinaryIO, start: int, end: int, whole: bool = False) -> 
         kind, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
         if start + RECORD_HEAD.size + length > end:
             return
-        most = MAX_CHUNK_BYTES if whole else _BEGINNING_BYTES if kind in LARGE else MAX_RECORD_BYTES
+        most = MAX_CHUNK_BYTES if whole else _BEGINNING_BYTES if kind in LARGE else most_bytes(kind)
         yield RawRecord(kind, length, start, stream.read(min(length, most)))
         start += RECORD_HEAD.size + length
 

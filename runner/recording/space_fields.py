@@ -16,7 +16,7 @@ NumPy array. In records, values stand as `spaces` describes them: those of varyi
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final
@@ -80,13 +80,16 @@ def _identifiers(keys: list[str]) -> list[str]:
     """
     names: list[str] = []
     taken: set[str] = set()
+    last: dict[str, int] = {}
     for key in keys:
         base = re.sub(r"[^A-Za-z0-9_]", "_", key)
         base = f"_{base}" if base[:1].isdigit() else base
-        name, number = base, 1
+        number = last.get(_folded(base), 0) + 1
+        name = base if number == 1 else f"{base}_{number}"
         while _folded(name) in taken or _folded(f"{name}_raw") in taken:
             number += 1
             name = f"{base}_{number}"
+        last[_folded(base)] = number
         taken |= {_folded(name), _folded(f"{name}_raw")}
         names.append(name)
     return names
@@ -168,6 +171,14 @@ def put_constants(field: Field, stored: Array, at: int = 0) -> None:
         put_constants(part, stored, start)
 
 
+def put_ones(field: Field, stored: Any) -> None:
+    """Set every byte of some stored values, but none between the parts of a value."""
+    if field.parts is None:
+        stored[...] = np.frombuffer(b"\xff" * stored.dtype.itemsize, stored.dtype)[0]
+    for part in field.parts or ():
+        put_ones(part, stored[part.name])
+
+
 def varint(number: int) -> bytes:
     """Return a number as Protobuf writes lengths: seven bits a byte, the lowest first."""
     low = []
@@ -180,70 +191,110 @@ def varint(number: int) -> bytes:
 # --- values of varying size ---------------------------------------------------------------------------
 
 
-def encoded(field: Field, value: bytes) -> bytes:
-    """Return the field of a message with a value that `spaces` describes."""
-    data, _ = _encoded(field, value, 0)
-    return data
+Encoder = Callable[[bytes, int], tuple[bytes, int]]
+"""Takes bytes with a value that `spaces` describes, and where it begins; returns the field of a message, and
+where the value ends."""
+Decoder = Callable[[bytes, int], tuple[bytes, int]]
+"""Takes a message, and where a field begins; returns the field's value, and where the field ends.
+
+Raises a `RecordingError` if the field is not there, or is not as an encoder writes it."""
 
 
-def _encoded(field: Field, value: bytes, at: int) -> tuple[bytes, int]:
-    """Return the field, and where the value that begins at `at` ends."""
+def encoder(field: Field) -> Encoder:
+    """Return the function that encodes the values of a field."""
     if field.parts is not None:
-        pieces = []
-        for part in field.parts:
-            piece, at = _encoded(part, value, at)
-            pieces.append(piece)
-        return _delimited(field.number, b"".join(pieces)), at
+        encoders = [*map(encoder, field.parts)]
+
+        def nested(value: bytes, at: int) -> tuple[bytes, int]:
+            pieces = []
+            for encode in encoders:
+                piece, at = encode(value, at)
+                pieces.append(piece)
+            return _delimited(head, b"".join(pieces)), at
+
+        head = _head(field.number)
+        return nested
     if is_text(field):
-        end = at + 4 + text_length(value, at)
-        text = value[at + 4 : end]
-        return _delimited(field.number if _is_utf8(text) else field.number + _RAW, text), end
-    assert field.dtype is not None
-    end = at + field.dtype.itemsize
-    number = np.frombuffer(value[at:end], field.dtype.base)
-    return tag(field) + number.astype(stored_dtype(field).base, copy=False).tobytes(), end
+        heads = _head(field.number + _RAW), _head(field.number)
+
+        def text(value: bytes, at: int) -> tuple[bytes, int]:
+            end = at + 4 + text_length(value, at)
+            data = value[at + 4 : end]
+            return _delimited(heads[_is_utf8(data)], data), end
+
+        return text
+    dtype, stored, constant = _number_dtypes(field)
+
+    def number(value: bytes, at: int) -> tuple[bytes, int]:
+        data = value[at : at + size]
+        if stored != dtype:
+            data = np.frombuffer(data, dtype).astype(stored).tobytes()
+        return constant + data, at + size
+
+    size = field.dtype.itemsize if field.dtype is not None else 0
+    return number
 
 
-def decoded(field: Field, message: bytes, at: int) -> tuple[bytes, int]:
-    """Return the value in the field of a message that begins at `at`, and where the field ends.
+def decoder(field: Field) -> Decoder:
+    """Return the function that decodes the values of a field."""
+    if field.parts is not None:
+        decoders = [*map(decoder, field.parts)]
 
-    Raises:
-        RecordingError: the field is not there, or is not as it is always written.
-    """
-    if is_text(field) or field.parts is not None:
-        number = field.number
-        if is_text(field) and not message.startswith(_head(number), at):
-            number += _RAW
-        start, end = _span(field, message, at, _head(number))
-        if field.parts is None:
-            text = message[start:end]
-            if _is_utf8(text) != (number == field.number):
+        def nested(message: bytes, at: int) -> tuple[bytes, int]:
+            at, end = _span(field, message, at, head)
+            pieces = []
+            for decode in decoders:
+                piece, at = decode(message, at)
+                pieces.append(piece)
+            if at != end:
                 raise _refused(field)
-            return encode_bytes(text), end
-        pieces = []
-        for part in field.parts:
-            piece, start = decoded(part, message, start)
-            pieces.append(piece)
-        if start != end:
+            return b"".join(pieces), end
+
+        head = _head(field.number)
+        return nested
+    if is_text(field):
+        heads = _head(field.number + _RAW), _head(field.number)
+
+        def text(message: bytes, at: int) -> tuple[bytes, int]:
+            is_utf8 = message.startswith(heads[True], at)
+            start, end = _span(field, message, at, heads[is_utf8])
+            data = message[start:end]
+            if _is_utf8(data) != is_utf8:
+                raise _refused(field)
+            return encode_bytes(data), end
+
+        return text
+    dtype, stored, constant = _number_dtypes(field)
+
+    def number(message: bytes, at: int) -> tuple[bytes, int]:
+        start = at + len(constant)
+        end = start + size
+        if not message.startswith(constant, at) or end > len(message):
             raise _refused(field)
-        return b"".join(pieces), end
+        data = message[start:end]
+        if stored != dtype:
+            values = np.frombuffer(data, stored).astype(dtype)
+            if values.astype(stored).tobytes() != data:
+                raise _refused(field)
+            data = values.tobytes()
+        return data, end
+
+    size = stored_dtype(field).itemsize
+    return number
+
+
+def _number_dtypes(field: Field) -> tuple[np.dtype[Any], np.dtype[Any], bytes]:
+    """Return the dtypes of the numbers of a field, in rows and as they are stored, and its constant bytes."""
     assert field.dtype is not None
-    dtype, constant = stored_dtype(field), tag(field)
-    end = at + len(constant) + dtype.itemsize
-    stored = np.frombuffer(message[at + len(constant) : end], dtype.base)
-    value = stored.astype(field.dtype.base, copy=False)
-    is_exact = value.astype(dtype.base, copy=False).tobytes() == stored.tobytes()
-    if not message.startswith(constant, at) or end > len(message) or not is_exact:
-        raise _refused(field)
-    return value.tobytes(), end
+    return field.dtype.base, stored_dtype(field).base, tag(field)
 
 
 def _head(number: int) -> bytes:
     return varint(number << 3 | _DELIMITED)
 
 
-def _delimited(number: int, data: bytes) -> bytes:
-    return _head(number) + varint(len(data)) + data
+def _delimited(head: bytes, data: bytes) -> bytes:
+    return head + varint(len(data)) + data
 
 
 def _span(field: Field, message: bytes, at: int, head: bytes) -> tuple[int, int]:

@@ -28,7 +28,7 @@ from runner.util.values import is_text, is_whole
 MAX_VALUE_BYTES: Final = 16 << 20
 """The most that one value of a space of fixed width may take."""
 _MAX_DEPTH: Final = 16
-_MAX_LEAVES: Final = 4096
+_MAX_PARTS: Final = 4096
 NUMBERS: Final = re.compile(r"(?:\|[biu]1|<[iu][248]|<f[248])")
 """The dtypes that stand in a recording."""
 _LENGTH: Final = struct.Struct("<I")
@@ -57,8 +57,8 @@ def leaves_of(description: object, where: str) -> list[Leaf]:
     """
     try:
         leaves = list(_leaves(description, ()))
-        if len(leaves) > _MAX_LEAVES:
-            raise ValueError(f"{len(leaves):,} parts")
+        if (parts := _count(description)) > _MAX_PARTS:
+            raise ValueError(f"{parts:,} parts, expected {_MAX_PARTS:,} at most")
         size = sum(leaf.dtype.itemsize for leaf in leaves if leaf.dtype is not None)
         if size > MAX_VALUE_BYTES:
             raise ValueError(f"{size:,} bytes a value, expected {MAX_VALUE_BYTES:,} at most")
@@ -141,6 +141,12 @@ def _leaves(description: object, path: tuple[str, ...]) -> Iterator[Leaf]:
         if not is_text(name) or not name:
             raise ValueError(f"a part is called {name!r}")
         yield from _leaves(part, (*path, name))
+
+
+def _count(description: Any) -> int:
+    """Return how many parts a space has, with the parts that have parts themselves."""
+    parts = parts_of(description)
+    return 1 if parts is None else len(parts) + sum(_count(part) for _, part in parts if parts_of(part))
 
 
 def leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:

@@ -12,6 +12,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
@@ -127,6 +128,29 @@ class Wide(gymnasium.Env):
             self.np_random.random() < 0.1,
             {},
         )
+
+
+class Parted(Wide):
+    """Takes actions of two parts, of which each process has a wide one."""
+
+    action_space = spaces.Dict(a=spaces.Box(-9, 9, (), np.float16), b=spaces.Box(-9, 9, (2,), np.float32))
+
+    def step(self, action):
+        return super().step(np.array([action["a"]]))
+
+
+def test_the_widest_numbers_of_each_part_of_an_action_are_kept(tmp_path):
+    dtypes = {"owner": (np.float64, np.float32), "other": (np.float16, np.float64)}
+    with runner.record(Parted(), tmp_path, name="owner") as rec:
+        other = runner.record(Parted(), join=rec.run, shard="other")
+        for own, (a, b) in zip((rec, other), dtypes.values(), strict=True):
+            own.reset(seed=0)
+            own.step({"a": a(0.1), "b": np.full(2, 0.1, b)})
+        other.close()
+    with open_recording(rec.run.recording) as recording:
+        actions = np.concatenate([block["action"] for block in recording.train.steps.blocks()])
+    assert sorted(actions["a"].tolist()) == [float(np.float16(0.1)), 0.1]
+    assert sorted(actions["b"][:, 0].tolist()) == [0.1, float(np.float32(0.1))]
 
 
 def test_the_widest_actions_and_all_extras_are_kept(tmp_path):

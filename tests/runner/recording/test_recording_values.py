@@ -19,10 +19,13 @@ from mcap_protobuf.decoder import DecoderFactory
 import runner
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.integrity import check_integrity
 from runner.recording.layout import layout_of
 from runner.recording.messages import decode_rows, encode_rows, file_descriptor_set
 from runner.recording.reader import open_recording
 from runner.recording.space_fields import space_field
+from runner.recording.spaces import leaves_of
+from tests.runner.altering import altered
 from tests.runner.loops.making import Leaving
 
 STEPS = 7
@@ -243,3 +246,57 @@ def test_messages_of_varying_size_that_no_recorder_writes_are_refused(change):
     assert back["next_observation"] == b"\3\0\0\0abc"
     with pytest.raises(RecordingError):
         decode_rows(message, [(0, change(payload))])
+
+
+def test_a_space_of_thousands_of_parts_is_recorded_and_read(tmp_path):
+    observation = spaces.Dict({f"k{i}": spaces.Text(2) for i in range(1900)})
+    path, seen = loop_over(observation, spaces.Discrete(2), tmp_path)
+    check_integrity(path)
+    with open_recording(path) as recording:
+        *_, last = recording.train.transitions()
+        assert recording.train.steps.count() == len(seen)
+    assert last["next_observation"] == seen[-1][1]
+
+
+def test_parts_with_equal_names_are_numbered_quickly_and_too_many_are_refused():
+    parts = {chr(0x4E00 + i): {"type": "Box", "dtype": "<f4", "shape": []} for i in range(4096)}
+    field = space_field(2, "action", {"type": "Dict", "spaces": parts})
+    assert [part.stored_name for part in field.parts[:3]] == ["_", "__2", "__3"]
+    many = {chr(0x4E00 + i): {"type": "Tuple", "spaces": []} for i in range(5000)}
+    with pytest.raises(RecordingError, match="5,000 parts, expected 4,096 at most"):
+        leaves_of({"type": "Dict", "spaces": many}, "a space")
+
+
+def test_a_number_that_is_cut_in_a_message_of_varying_size_is_refused():
+    text, number = {"type": "Text", "max_length": 9}, {"type": "Box", "dtype": "<f8", "shape": [2]}
+    layout = layout_of("loop", 1, 0, json.dumps({"observation": number, "action": text}))
+    message = layout.message(schema.TRAIN_STEP)
+    rows = np.zeros(1, layout.rows(schema.TRAIN_STEP))
+    rows["action"][0], rows["next_observation"][0] = b"\1\0\0\0a", bytes(16)
+    (payload,) = encode_rows(message, rows)
+    for size in range(len(payload)):
+        with pytest.raises(RecordingError):
+            decode_rows(message, [(0, payload[:size])])
+
+
+def test_tags_that_other_readers_would_not_know_are_damage(tmp_path):
+    class Sensors(Any):
+        def __init__(self):
+            parts = {"at": spaces.Box(-1, 1, (2,), np.float32), "lit": spaces.Discrete(2)}
+            super().__init__(spaces.Dict(parts), spaces.Discrete(2))
+
+    with runner.record(Sensors(), tmp_path / "runs") as rec:
+        rec.reset(seed=1)
+        for _ in range(5):
+            rec.step(1)
+
+    def change(records):
+        stored = records.view(np.uint8).reshape(len(records), -1)
+        at = records.dtype.fields["next_observation"][1]
+        assert stored[2, at] == 0x0A  # the tag of `at`, the first part
+        stored[2, at] = 0x1A
+        return records
+
+    odd = altered(rec.run.recording, tmp_path / "odd.mcap", schema.TRAIN_STEP, change)
+    with pytest.raises(RecordingError, match="tags that no recorder writes"):
+        check_integrity(odd)
