@@ -53,14 +53,15 @@ def link(path: str, values: Mapping[str, object]) -> str:
 
 
 def step_in(text: str) -> EpisodeRef:
-    """Return the step that an address names by its episode: without a recording no word can be looked up.
+    """Return the step that an address names by its episode: words may differ between two runs.
 
     Raises:
         RunnerError: the text is no such reference.
     """
-    step = EpisodeRef.parse(text)
+    expected = "EPISODE:T such as 120:5, or eval:N:TRIAL:T"
+    step = EpisodeRef.parse(text, expected)
     if step.word:
-        raise RunnerError(f"found {text[:60]!r}, expected EPISODE:T such as 120:5, or eval:N:TRIAL:T.")
+        raise RunnerError(f"found {text[:60]!r}, expected {expected}.")
     return step
 
 

@@ -19,7 +19,6 @@ from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.episodes import (
-    TYPICAL,
     EpisodeRef,
     StepLike,
     first_state,
@@ -166,14 +165,14 @@ def random_policy(path: Path) -> bytes:
         return str(escape(random_policy_sentence(recording))).encode()
 
 
-def typical_episode(path: Path) -> bytes:
-    """Return the address of the episode to show first, below that of the replay: `eval/3000/17`."""
+def resolved_step(path: Path, at: EpisodeRef) -> bytes:
+    """Return a step as JSON, with an episode of the recording in place of a word."""
     with open_recording(path) as recording:
-        return EpisodeRef(word=TYPICAL).resolved(recording).episode_path.encode()
+        return as_json(at.resolved(recording))
 
 
 def latest_episode(path: Path) -> bytes:
-    """Return the address of the training episode that ended last, as `typical_episode`; empty without one."""
+    """Return the address of the training episode that ended last, as `train/120`; empty without one."""
     with open_recording(path) as recording:
         ended = recording.train.episodes.count()
         has_one = ended and any(phase.steps for phase in recording.phases)

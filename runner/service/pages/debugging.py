@@ -9,13 +9,12 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.service import fragments
-from runner.service.addresses import step_in
 from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.fragments import ShownBranches
 from runner.service.pages.frame import run_page
-from runner.service.pages.replay import BEFORE, T, stage_of
+from runner.service.pages.replay import BEFORE, T, stage_of, step_of
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -33,7 +32,7 @@ async def what_if(
     t: T | None = None,
 ) -> Response:
     """Show where each joint action leads, and the replay of one: the recorded one unless it is named."""
-    step = step_in(at)
+    step = await step_of(run, compute, at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
     branches = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)

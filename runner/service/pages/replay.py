@@ -14,7 +14,7 @@ from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.episodes import EpisodeRef, reference_to
+from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
 from runner.drawing import svg
 from runner.errors import RunnerError
@@ -27,7 +27,14 @@ from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import EPISODES, CatalogueOf, ComputationOf, PicturesOf, RecordedRun
+from runner.service.dependencies import (
+    EPISODES,
+    CatalogueOf,
+    Computation,
+    ComputationOf,
+    PicturesOf,
+    RecordedRun,
+)
 from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import message_of, page
 from runner.util.values import JsonView
@@ -103,15 +110,29 @@ async def chosen_replay(
     episode: str = "",
     after: str = "",
     trial: str = "",
+    at: Annotated[str, Query(max_length=60)] = "",
 ) -> Response:
-    """Redirect to the episode that a form names, or to a typical one."""
+    """Redirect to the step `at`, to the episode that a form names, or to a typical one."""
     if phase == "train":
-        path = EpisodeRef(_whole(episode)).episode_path
+        step = EpisodeRef(_whole(episode))
     elif phase == "eval" and after:
-        path = EpisodeRef(_whole(trial), after=_whole(after)).episode_path
+        step = EpisodeRef(_whole(trial), after=_whole(after))
     else:
-        path = (await compute(fragments.typical_episode, run.recording)).decode()
-    return RedirectResponse(f"/runs/{run.run_id}/replay/{path}", HTTPStatus.FOUND)
+        step = await step_of(run, compute, at or TYPICAL)
+    address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
+    return RedirectResponse(address, HTTPStatus.FOUND)
+
+
+async def step_of(run: Run, compute: Computation, text: str) -> EpisodeRef:
+    """Return the step of a run that an address names, with an episode in place of a word.
+
+    Raises:
+        RunnerError: the text is no reference, or the run has no episode for the word.
+    """
+    step = EpisodeRef.parse(text)
+    return (
+        await compute.shown(EpisodeRef, fragments.resolved_step, run.recording, step) if step.word else step
+    )
 
 
 @router.get("/latest")

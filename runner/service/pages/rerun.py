@@ -17,14 +17,16 @@ from typing import Annotated, Final
 from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
+from starlette.concurrency import run_in_threadpool
 
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
-from runner.service.addresses import link, step_in
+from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
 from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import page
+from runner.service.pages.replay import step_of
 from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
 
@@ -42,14 +44,18 @@ _SECONDS: Final = 60
 
 
 @router.get("/runs/{run}/rerun")
-def viewer(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
+async def viewer(
+    request: Request, run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
+) -> Response:
     """Show the Rerun viewer, opened at a step."""
-    step = step_in(at) if at else None
+    step = await step_of(run, compute, at) if at else None
+    if step:  # an error is shown here rather than in the frame
+        await compute(fragments.viewer_place, run, step)
     content = f"{step.heading}, step {step.t}." if step else OVERVIEW
     back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
     values = {"content": content, "back": back, "frame": frame}
-    return run_page(request, run, "rerun", "run_rerun.html", values)
+    return await run_in_threadpool(run_page, request, run, "rerun", "run_rerun.html", values)
 
 
 @router.get("/runs/{run}/rerun/frame")
@@ -57,7 +63,7 @@ async def frame(
     request: Request, run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show the viewer alone, opened at a step."""
-    step = step_in(at) if at else None
+    step = await step_of(run, compute, at) if at else None
     place = json.loads(await compute(fragments.viewer_place, run, step))
     query: dict[str, object] = {}
     if step:

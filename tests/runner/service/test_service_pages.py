@@ -14,6 +14,7 @@ import pytest
 from checked_pages import ACCEPT_HTML, page_of
 
 import runner
+from runner.analysis.episodes import EpisodeRef
 from runner.environments.naming import agent_actions_in_words, states_in_words
 from runner.execution.branching import branch_training
 from runner.integrations.tensorboard import SummaryWriter
@@ -169,7 +170,11 @@ MISSING = [
     ("/runs/nothing", 404, "No run"),
     ("/runs/first/replay/train/60", 404, "there are 60, from 0"),
     ("/runs/first/replay/eval/7/0", 404, "the nearest after 10"),
+    ("/runs/first/replay?at=eval:9999:1", 404, "the nearest after 60"),
+    ("/runs/first/replay?at=train:x", 400, "expected EPISODE:T"),
+    ("/runs/first/replay?at=step:999999", 404, "found no training step 999,999"),
     ("/runs/first/rerun?at=1:x", 400, "expected EPISODE:T"),
+    ("/runs/first/rerun?at=eval:9999:1", 404, "the nearest after 60"),
     ("/compare?run=first", 400, "expected 2 to 60"),
     ("/compare/replay?run=first&run=second&at=eval", 400, "expected EPISODE:T"),
     ("/sweeps/nothing", 404, "No sweep"),
@@ -180,6 +185,23 @@ MISSING = [
 def test_missing_pages_say_what_exists(client):
     for address, status, message in MISSING:
         assert message in page_of(client, address, status)
+
+
+def test_pages_take_every_reference_to_a_step(client, recordings):
+    with open_recording(find_run("first", recordings).recording) as recording:
+        run_id = recording.run_id
+        steps = {
+            at: EpisodeRef.parse(at).resolved(recording)
+            for at in ("3:2", "eval:60:1:2", "typical", "best:1", "worst", "last:1", "step:100")
+        }
+    for at, step in steps.items():
+        address = client.get(f"/runs/first/replay?at={at}", follow_redirects=False).headers["location"]
+        query = f"?t={step.t}" if step.t else ""
+        assert address == f"/runs/{run_id}/replay/{step.episode_path}{query}"
+        assert f"{step.heading}, step {step.t}." in page_of(client, f"/runs/first/rerun?at={at}")
+        page_of(client, f"/runs/first/rerun/frame?at={at}")
+        what_if = page_of(client, f"/runs/first/what-if/{at}")
+        assert f"What if? {step.heading}, step {step.t:,}" in what_if
 
 
 def test_only_the_frame_of_the_viewer_may_compile(client):
