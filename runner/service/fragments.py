@@ -102,6 +102,7 @@ class ShownDifference:
 def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
     """Return a part of an episode as JSON for `replay.js`."""
     with open_recording(path) as recording:
+        at = replace(at, t=max(at.t, start))  # the step that an error names
         episode = playback_of(recording, at, steps, max(0, start - _STEPS_BEFORE))
         scene = recording.environment["scene"] if episode.grid else None
         has_pictures, note = picture_note(recording, at.phase)

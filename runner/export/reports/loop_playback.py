@@ -79,7 +79,7 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     phase, number = recording.phase(at.phase), at.number_in(recording)
     span = phase.episode_span(number)
     if not 0 <= first < len(span):
-        raise at.no_step(recording, len(span), first)
+        raise at.no_step(recording, len(span), max(first, at.t))
     part = span[first : first + limit]
     parts, notes = _shown_parts(recording)
     in_words = step_actions_in_words(recording, at.phase)

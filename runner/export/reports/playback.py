@@ -64,7 +64,7 @@ def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, fi
         steps = steps_of(recording, at.phase, number)
         shown = steps[first : first + limit]
         if not len(shown):
-            raise at.no_step(recording, len(steps), first)
+            raise at.no_step(recording, len(steps), max(first, at.t))
         check_steps(shown, recording.mdp, str(recording.path))
         values = _values(recording, shown, at)
         ended = ending_of(recording, at.phase, number)

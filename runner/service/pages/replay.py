@@ -177,8 +177,10 @@ def _add_route(path: str, episode: Callable[..., EpisodeRef]) -> None:
         """Show a step of an episode."""
         part: bytes | RunnerError
         preparing = asyncio.create_task(prepare_pictures(run, streams, replace(at, t=t)))
+        start = max(0, t - BEFORE)
+        step = replace(at, t=t) if start else at  # one part, cached once, for all of the first steps
         try:
-            part = await compute(fragments.episode_part, run.recording, at, max(0, t - BEFORE), STEPS)
+            part = await compute(fragments.episode_part, run.recording, step, start, STEPS)
         except RunnerError as error:
             part = error
         await preparing

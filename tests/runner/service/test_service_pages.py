@@ -170,6 +170,7 @@ MISSING = [
     ("/runs/nothing", 404, "No run"),
     ("/runs/first/replay/train/60", 404, "there are 60, from 0"),
     ("/runs/first/replay/eval/7/0", 404, "the nearest after 10"),
+    ("/runs/first/replay/train/3?t=99999", 404, "from 0; found no step 99,999"),
     ("/runs/first/replay?at=eval:9999:1", 404, "the nearest after 60"),
     ("/runs/first/replay?at=train:x", 400, "expected EPISODE:T"),
     ("/runs/first/replay?at=step:999999", 404, "found no training step 999,999"),
@@ -185,6 +186,9 @@ MISSING = [
 def test_missing_pages_say_what_exists(client):
     for address, status, message in MISSING:
         assert message in page_of(client, address, status)
+    part = client.get("/api/v1/runs/first/replay/train/3?start=99999")
+    assert part.status_code == 404
+    assert "from 0; found no step 99,999" in part.json()["error"]["message"]
 
 
 def test_pages_take_every_reference_to_a_step(client, recordings):
