@@ -92,7 +92,7 @@ def whole_ranges(
         if not start < stop <= count:
             raise NotInRecording(
                 f"{where}: found no {schema.PHASE_NAMES[phase]} episodes {start}..{stop}; "
-                f"there are {count:,}, from 0. Ranges are START..STOP, STOP not included."
+                f"there are {count:,}, from 0. Ranges are of whole episodes: START..STOP, STOP not included."
             )
     return whole
 

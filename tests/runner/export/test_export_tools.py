@@ -124,7 +124,9 @@ def assert_measures(run, metrics):
 @pytest.mark.parametrize("form", ["csv", "parquet", "minari"])
 @pytest.mark.parametrize("ranges", ["9999:", "0:9999", "5:3"])
 def test_missing_episodes_are_refused(export, taxis, form, ranges):
-    assert "found no training episodes" in export(form, taxis.recording, "--episodes", ranges, code=2).stderr
+    errors = export(form, taxis.recording, "--episodes", ranges, code=2).stderr
+    assert "found no training episodes" in errors
+    assert "Ranges are of whole episodes: START..STOP, STOP not included." in " ".join(errors.split())
     assert not [path for path in Path().rglob("*") if path.is_file()]
 
 
