@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from runner.analysis.episodes import EpisodeRef
+from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef
 from runner.errors import RunnerError
 
 
@@ -55,3 +55,11 @@ def test_a_training_step_by_its_number_is_named_as_such():
 def test_anything_else_is_refused_with_what_is_expected(text):
     with pytest.raises(RunnerError, match="expected EPISODE:T such as 120:5, step:N, or eval:N:TRIAL:T"):
         EpisodeRef.parse(text)
+
+
+def test_the_nearest_word_is_suggested_where_it_is_accepted():
+    for text in ("bset", "bset:5"):
+        with pytest.raises(RunnerError, match=r"worst or last\. Did you mean 'best'\?"):
+            EpisodeRef.parse(text)
+    with pytest.raises(RunnerError, match=r"step by its number\.$"):
+        EpisodeRef.parse("bset", EXPECTED_OF_TRAINING)
