@@ -177,7 +177,9 @@ def _axis(text: str) -> Axis:
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = Completed("filter", _filter_words)
-EPISODE: Final = Parsed("episode", "N, eval:N:TRIAL, typical, best, worst or last", _episode)
+EPISODE: Final = Parsed(
+    "episode", "N, train:N, eval:N:TRIAL, typical, best, worst or last, without a step", _episode
+)
 TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", lambda text: _episode(f"eval:{text}"))
 RANGES: Final = Parsed("ranges", "START..STOP or N, such as 0..20,49980..50000", ranges_in)
 NUMBERS: Final = Parsed(

@@ -80,6 +80,10 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
         (["--eval", "20:5"], "found no trial 5 of the evaluation after 20 episodes; it has 5, from 0"),
         (["--eval", "x"], "expected N:TRIAL"),
         (["--eval", "3:x"], "expected N:TRIAL"),
+        (
+            ["--episode", "1:5"],
+            "expected N, train:N, eval:N:TRIAL, typical, best, worst or last, without a step",
+        ),
         (["--episode", "30"], "no training episode 30"),
         (["--episode", "-1"], "--episode"),
         (["--speed", "0"], "--speed"),
