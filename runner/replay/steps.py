@@ -30,7 +30,7 @@ def step_of_episode(recording: Recording, episode: int) -> int:
     ended = recording.train.episodes.count()
     if not 0 <= episode <= ended:
         raise NotInRecording(
-            f"{recording.path}: found {ended} training episodes, expected at least {episode}."
+            f"{recording.path}: found {ended:,} training episodes, expected at least {episode:,}."
         )
     if episode == 0:
         return 0

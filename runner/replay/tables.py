@@ -148,7 +148,7 @@ class TableReplay(StepReplay):
         taken = recording.result.get("train_steps", stop) if recording.leaves_out_steps else self._recorded
         if not recording.leaves_out_steps or taken < stop:
             return NotInRecording(
-                f"{recording.path}: found {taken} training steps, expected at least {stop}."
+                f"{recording.path}: found {taken:,} training steps, expected at least {stop:,}."
             )
         later = next((snapshot.step for snapshot in recording.snapshots() if snapshot.step >= stop), None)
         return RecordingError(

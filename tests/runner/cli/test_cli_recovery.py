@@ -326,8 +326,9 @@ def test_qtable_of_a_state(recorded, recorded_run):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--step", 10**9), "expected at least 1000000000"),
+        (("--step", 10**9), "expected at least 1,000,000,000"),
         (("--episode", 31), "found 30 training episodes"),
+        (("--episode", 99_999), "expected at least 99,999"),
         (("--state", 10**7), "found '10000000', expected a state"),
         (("--step", 1, "--episode", 1), "choose one"),
         (("--step", -1), "-1"),

@@ -138,7 +138,7 @@ def test_an_evaluation_of_an_evaluation(whole, tmp_path):
 
 
 def test_no_such_step_no_run(whole, tmp_path):
-    with pytest.raises(RecordingError, match="expected at least 999999"):
+    with pytest.raises(RecordingError, match="expected at least 999,999"):
         evaluate(whole, tmp_path, step=999_999)
     with pytest.raises(RunnerError, match="start: found state 1000000"):
         evaluate(whole, tmp_path, start=10**6)

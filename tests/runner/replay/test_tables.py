@@ -170,7 +170,7 @@ def test_without_steps_the_error_names_where_tables_are(tmp_path):
         with pytest.raises(RecordingError, match=nearest):
             tables_at(recording, middle + 1)
         with pytest.raises(
-            RecordingError, match=f"found {last} training steps, expected at least {last + 1}"
+            RecordingError, match=f"found {last:,} training steps, expected at least {last + 1:,}"
         ):
             tables_at(recording, last + 1)
 
@@ -178,7 +178,7 @@ def test_without_steps_the_error_names_where_tables_are(tmp_path):
 def test_what_is_not_there(run, steps):
     with open_recording(run.recording) as recording:
         with pytest.raises(
-            RecordingError, match=f"found {steps} training steps, expected at least {steps + 1}"
+            RecordingError, match=f"found {steps:,} training steps, expected at least {steps + 1:,}"
         ):
             tables_at(recording, steps + 1)
         with pytest.raises(RecordingError, match="found 60 training episodes, expected at least 61"):
