@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Final
 
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from runner.config.document import Document, Place, Problem
+from runner.config.model import SECTION_OF
 from runner.config.schema import Schema, choices_of, expected, keys_of, schema_at
 from runner.config.values import REFUSED, Path, value_at
 from runner.errors import ConfigError, ConfigProblem, nearest, shortened
@@ -35,7 +37,7 @@ _BRANCHES = frozenset(
 )
 """Names in a location that stand for the branch of a union; none is a key."""
 
-_ELSEWHERE = {
+_ELSEWHERE: Final[dict[str, str]] = {
     **dict.fromkeys(("alpha", "learning_rate", "lr"), "step_size"),
     **dict.fromkeys(("gamma", "discount_factor"), "discount"),
     **dict.fromkeys(("eps", "exploration_rate"), "epsilon"),
@@ -43,8 +45,9 @@ _ELSEWHERE = {
     **dict.fromkeys(("eval", "eval_every"), "evaluation"),
     **dict.fromkeys(("decay", "decay_rate"), "factor"),
     **dict.fromkeys(("end", "min", "minimum"), "floor"),
+    **{section.algorithm: key for key, section in SECTION_OF.items()},
 }
-"""Names of keys in other programs and in textbooks."""
+"""Names of keys in other programs and in textbooks, and algorithms by the key of their section."""
 
 
 def problems_in(error: ValidationError, value: object, schema: Schema | None = None) -> list[Problem]:

@@ -26,6 +26,7 @@ ALGORITHMS = get_args(Algorithm)
         ("epsilonn: 0.5", "2:1: epsilonn: unknown key. Did you mean 'epsilon'?"),
         ("log: {evry_steps: 5}", "2:7: log.evry_steps: unknown key. Did you mean 'every_steps'?"),
         ("gamma: 0.5", "2:1: gamma: unknown key. Did you mean 'discount'?"),
+        ("n_step_q_learning: {n: 2}", "2:1: n_step_q_learning: unknown key. Did you mean 'n_step'?"),
         ("learning_rate: 0.5", "2:1: learning_rate: unknown key. Did you mean 'step_size'?"),
         (
             "epsilon: {schedule: exponential, start: 1, decay: 0.9}",
