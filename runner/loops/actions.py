@@ -90,14 +90,16 @@ def parsed_action(space: Space, given: object, recorded: Value, names: Names) ->
     if not isinstance(names, Mapping):
         return _parsed(space, given, recorded, names, "action")
     assert isinstance(space, spaces.Dict)
-    if isinstance(given, str):
-        agent, equals, value = given.partition("=")
-        given = {agent: value} if equals else None
+    if isinstance(given, str) and "=" in given:
+        agent, _, value = given.partition("=")
+        given = {agent: value}
     acting = {str(agent): agent for agent in recorded}
-    if not isinstance(given, Mapping) or not all(str(agent) in acting for agent in given):
+    agents = map(str, given) if isinstance(given, Mapping) else ()
+    wrong = next((agent for agent in agents if agent not in acting), given)
+    if wrong is not given or not isinstance(given, Mapping):
         raise ConfigError(
-            f"action: found {_short(given)}, expected AGENT=VALUE of an agent that acts at this step: "
-            f"{', '.join(acting)}"
+            f"action: found {_short(wrong)}, expected AGENT=VALUE of an agent that acts at this step: "
+            f"{', '.join(acting)}.{nearest(str(wrong), acting)}"
         )
     own = {acting[str(agent)]: value for agent, value in given.items()}
     return recorded | {

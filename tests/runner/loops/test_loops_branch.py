@@ -285,8 +285,14 @@ def test_a_game_of_several_agents(tmp_path):
     assert own[:4].tobytes() == rows(rec.run, 1)[:4].tobytes()
     assert [tuple(each) for each in own["action"][4:].tolist()] == [(1, 0, 3)] * 6
     assert set(branch.outcome.returns) == {"agent_0", "agent_1", "agent_2"}
-    with pytest.raises(ConfigError, match="expected AGENT=VALUE of an agent that acts at this step: agent_0"):
-        runner.branch(rec.run, at="1:4", action="1", recordings=tmp_path)
+    expected = "expected AGENT=VALUE of an agent that acts at this step: agent_0, agent_1, agent_2."
+    for action, message in (
+        ("1", f"found '1', {expected}"),
+        ("agnt_0=1", f"found 'agnt_0', {expected} Did you mean 'agent_0'"),
+        ({"agent_1": 1, "agnt_2": 1}, f"found 'agnt_2', {expected} Did you mean 'agent_2'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            runner.branch(rec.run, at="1:4", action=action, recordings=tmp_path)
 
 
 def test_steps_of_evaluation_names_of_actions_and_an_episode_that_was_cut(tmp_path):
