@@ -130,7 +130,7 @@ def branch_job(
     if wanted.episodes <= where.episode:
         raise ConfigError(
             f"episodes: found {wanted.episodes:,}, expected more than {where.episode:,}: the branch begins "
-            "in this training episode, and those before it count too."
+            "in this training episode, and those before it count too. `--episodes N` trains more."
         )
     branch = Branch(
         run=recording.run_id,
@@ -166,8 +166,9 @@ def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
     differing = [key for key, value in wanted if value != getattr(now, key)]
     fixed = [key for key in differing if key not in (*Changes.model_fields, *OF_THE_WHOLE)]
     if fixed:
+        can = [key for key in Changes.model_fields if getattr(now, key) is not None]
         raise ConfigError(
-            f"{fixed[0]}: cannot change at a step of training; {', '.join(Changes.model_fields)} can. "
+            f"{fixed[0]}: cannot change at a step of training; {', '.join(can)} can. "
             "A new run with this setting can begin with the tables of a step: "
             "`initial_q: {run: RUN, step: STEP}`."
         )
