@@ -105,17 +105,8 @@ def why_in(
         "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
     )
     step = None if at is None else EpisodeRef.parse(at).resolved(recording)
-    algorithm = recording.config["algorithm"]
-    if algorithm == "random":
-        raise RunnerError(
-            f"{recording.path}: has no Q-values, as its algorithm is `random`, which learns nothing; choose "
-            "a run of another algorithm."
-        )
-    if ALGORITHMS[algorithm].remember:
-        raise RunnerError(
-            f"{recording.path}: `why` cannot follow {algorithm}, where one step changes the values of many "
-            "steps before it; choose a run of an algorithm that changes one value a step, such as q_learning."
-        )
+    if refusal := why_refusal(recording):
+        raise RunnerError(refusal)
     if not 0 <= limit <= MAX_LIMIT:
         raise ConfigError(f"limit: found {limit}, expected 0 to {MAX_LIMIT:,}.")
     mdp = recording.mdp
@@ -162,9 +153,22 @@ def why_in(
         ),
         steps=tuple(_steps(recording, weights.largest, learner)),
         moves=moves,
-        note=POLICY_NOTE if ALGORITHMS[algorithm].draws_actions else "",
+        note=POLICY_NOTE if ALGORITHMS[recording.config["algorithm"]].draws_actions else "",
         picture=_picture(mdp, cell.state, moves),
     )
+
+
+def why_refusal(recording: Recording) -> str:
+    """Return why the Q-values of a job cannot be explained; empty if they can."""
+    algorithm = recording.config["algorithm"]
+    if algorithm == "random":
+        return "Random agents learn no Q-values; choose a run of another algorithm."
+    if ALGORITHMS[algorithm].remember:
+        return (
+            f"`why` cannot follow {algorithm}, where a step changes the values of earlier steps; choose a "
+            "run of an algorithm where a step changes only its own value, such as q_learning."
+        )
+    return ""
 
 
 def _learner(recording: Recording, agent: str | None) -> int:

@@ -105,14 +105,19 @@ def _type_of(view: View) -> type[BaseModel]:
 
 
 def _page(request: Request, run: Run, shown: dict[str, Any], status: HTTPStatus) -> Response:
-    """Return the page of a view, with the texts to choose from in its form."""
+    """Return the page of a view, with the texts to choose from in its form, or why it has none."""
     view: View = shown["view"]
-    choices = {}
+    choices, refusal = {}, ""
+    if view.refusal is not None and run.can_train_again:
+        with open_recording(run.recording) as recording:
+            refusal = view.refusal(recording)
     for each in view.inputs.values():
         if each.choices is not None:
             with open_recording(run.recording) as recording:
                 choices[each.name] = each.choices(recording)
-    return run_page(request, run, view.name, "run_view.html", shown | {"choices": choices}, status)
+    return run_page(
+        request, run, view.name, "run_view.html", shown | {"choices": choices, "refusal": refusal}, status
+    )
 
 
 for _view in VIEWS.values():

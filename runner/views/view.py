@@ -96,6 +96,8 @@ class View:
     file_help: str = ""
     exclusive_spool: bool = False
     """Whether the function writes large temporary files, so that one computation runs at a time."""
+    refusal: Callable[[Recording], str] | None = None
+    """Returns why no question about a job can be answered, shown instead of the form; empty if some can."""
 
     @cached_property
     def inputs(self) -> Mapping[str, Input]:

@@ -75,6 +75,12 @@ def why(
     return why_in(recording, state, action, agent, at, limit, report)
 
 
+def _refusal(recording: Recording) -> str:
+    from runner.debugging.why import why_refusal
+
+    return why_refusal(recording)
+
+
 VIEW: Final = View(
     "why",
     "Why?",
@@ -84,4 +90,5 @@ VIEW: Final = View(
     "ones, and by which moves they came.",
     page_values=(("limit", _STEPS),),
     exclusive_spool=True,
+    refusal=_refusal,
 )

@@ -5,11 +5,15 @@ from __future__ import annotations
 import html
 import json
 
+import pytest
+from loop_replays import serving
+
 import runner
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.views.why import VIEW
 from tests.runner.export.outline import Outline
+from tests.runner.recording.making import LAKE, make_run
 
 RUN = "/runs/first"
 
@@ -70,6 +74,24 @@ def test_the_page_shows_a_mistake_escaped(client):
     assert answer.status_code == 400
     assert "<b>" not in answer.text
     assert f'value="{html.escape("<b>")}"' in answer.text
+
+
+@pytest.mark.parametrize("algorithm", ["sarsa_lambda", "n_step_q_learning", "random"])
+def test_the_page_of_values_without_an_explanation_has_no_form(tmp_path, algorithm):
+    run = make_run(tmp_path, LAKE, algorithm=algorithm)
+    with serving(tmp_path) as client:
+        form = client.get(f"/runs/{run.run_id}/why")
+        asked = client.get(f"/runs/{run.run_id}/why?state=0&action=0")
+        refused = client.get(f"/api/v1/runs/{run.run_id}/why?state=0&action=0")
+    assert (form.status_code, asked.status_code, refused.status_code) == (200, 400, 400)
+    for page in (form, asked):
+        outline = Outline()
+        outline.feed(page.text)
+        assert outline.open == []
+        assert "choose a run of an" in page.text
+        assert 'name="state"' not in page.text
+        assert "weighted sum" not in page.text
+        assert "recording.mcap" not in page.text
 
 
 def test_a_loop_has_neither_the_page_nor_an_answer(loops_client, loops):
