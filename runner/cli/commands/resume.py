@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -30,9 +31,9 @@ from runner.cli.runs import (
     run_as_json,
     run_facts,
 )
-from runner.errors import ExitCode
+from runner.errors import ExitCode, RecordingError
 from runner.runs.run import Run, recordings_folder
-from runner.util.humanize import number
+from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:
     from runner.execution.rerecord import Start
@@ -63,6 +64,8 @@ def resume_command(
 
     run = find(run_name, recordings)
     was_finished = is_finished(run)
+    if not was_finished and run.status != "running":
+        _announce(run)
     with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
         run = resume(run, accept_changes, report, interrupt, trust)
     if as_json or not was_finished:
@@ -72,6 +75,15 @@ def resume_command(
     if interrupt.came and run.status == "interrupted":
         say(f"Interrupted again; `{command_for(run, 'resume')}` continues from there.")
         raise click.exceptions.Exit(ExitCode.INTERRUPTED)
+
+
+def _announce(run: Run) -> None:
+    """Print from where a run is resumed, if its recording can be read."""
+    from runner.recording.reader import open_recording
+
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        episodes = counted(recording.done()["episodes"], "episode")
+        say(f"Resumed after {episodes}: what was recorded is trained again first, and compared.")
 
 
 @click.command("rerecord", cls=Command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -131,7 +132,10 @@ def test_resume_as_text(command, copied):
     assert result.exit_code == 0
     assert "finished" in result.stdout
     assert f"dualtaxi show {copied.run_id}" in result.stdout
-    assert not result.stderr
+    (line,) = result.stderr.splitlines()
+    assert re.fullmatch(
+        r"Resumed after \d+ episodes: what was recorded is trained again first, and compared\.", line
+    )
 
 
 def test_nothing_to_resume(command, copied):
