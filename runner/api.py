@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Final
 from runner.config import ConfigError, ExperimentConfig, from_mapping, load
 from runner.config.job import Job, jobs_of
 from runner.config.sections import RunTable
+from runner.errors import RunNotFound
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.values import checked_name
 
@@ -154,7 +155,10 @@ def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
     if isinstance(config.initial_q, RunTable):
         from runner.execution.initial_tables import resolve_initial_q
 
-        config = resolve_initial_q(config, recordings)
+        try:
+            config = resolve_initial_q(config, recordings)
+        except RunNotFound as error:
+            raise RunNotFound(f"initial_q.run: {error}") from None
     return jobs_of(config)
 
 

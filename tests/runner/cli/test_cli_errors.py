@@ -41,6 +41,7 @@ def test_several_problems_follow_the_word_error(command, bad):
         (["ls", "--nope"], "--nope"),
         (["shwo"], "Did you mean 'show'?"),
         (["push"], "Did you mean 'remote push'?"),
+        (["run", "quick", "--set", "initial_q.run=nosuch"], "initial_q.run: no run 'nosuch'"),
         (["run", "quick", "--episodes", "3"], "changed by --set episodes=VALUE"),
         (["view", "x", "--size", "foo"], "1600x900"),
     ],
