@@ -148,7 +148,7 @@ class EpisodeRef:
         """Return the evaluation of a trial.
 
         Raises:
-            NotInRecording: there is none after so many training episodes.
+            NotInRecording: no evaluation followed that training episode.
         """
         return evaluation_after(evaluations_of(recording), self.after or 0, str(recording.path))
 

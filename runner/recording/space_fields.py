@@ -101,7 +101,7 @@ def _folded(name: str) -> str:
 
 
 def raw_field(field: Field) -> Field:
-    """Return the field beside the field of a text, for texts that are no UTF-8."""
+    """Return the second field of a text, for texts that are not valid UTF-8."""
     name = f"{field.stored_name}_raw"
     return Field(field.number + _RAW, name, Pb.TYPE_BYTES)
 

@@ -5,9 +5,9 @@ or all of them are killed (SIGKILL); jobs are cancelled and resumed, by several 
 
 1. every job is finished: none stands still, and none has lost or repeated a run;
 2. every run has the content digest of an undisturbed run;
-3. the log of every job tells its states in an order that can be, each event once, whoever watched.
+3. the log of every job has its states in a possible order, and each event once for every watcher.
 
-`--jobs N` submits so many small jobs at once instead, and prints how long they take.
+`--jobs N` submits N small jobs at once instead, and prints how long they take.
 """
 
 from __future__ import annotations
