@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from runner.recording.blocks import HEADER, HEADER_BYTES
+from runner.recording.blocks import HEADER, HEADER_BYTES, blank_records
 from runner.recording.chunks import encode_chunk
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
@@ -67,7 +67,12 @@ def _records(recording: Any, topic: Topic, change: Change) -> tuple[list[bytes],
     if (dtype := recording.layout.dtype(topic)) is not None:
         if not (stored := bytearray(b"".join(recording.table(topic).records()))):
             return [], []
-        whole = change(np.frombuffer(stored, dtype))
+        records = np.frombuffer(stored, dtype)
+        whole = change(records)
+        if whole.base is not records and whole is not records:  # NumPy copies no bytes between nested fields
+            copied, whole = whole, blank_records(topic, recording.layout.message(topic), len(whole))
+            for name in dtype.names or ():
+                whole[name] = copied[name]
         return [record.tobytes() for record in whole], whole["log_time"].tolist()
     messages = change(list(recording.table(topic).messages()))
     return [_record(topic, *message) for message in messages], [time for time, _ in messages]

@@ -7,15 +7,12 @@ import io
 
 import gymnasium
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from mpe2 import simple_spread_v3
 from PIL import Image
 
 import runner
-from runner.archive import layout
-from runner.archive.manifest import Manifest, entries_of, read_manifest
 from runner.archive.restoring import restore
 from runner.errors import CannotRedo, ConfigError
 from runner.export.encoded import encoded_pictures
@@ -25,7 +22,7 @@ from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from tests.runner.archive.whole import archived, contents
 from tests.runner.loops.making import N_COUNTING as N
-from tests.runner.loops.making import Counting, Rooms, counting, play, record_counting
+from tests.runner.loops.making import Rooms, counting, play, record_counting
 
 
 def shown_states(recording, phase, episode):
@@ -134,29 +131,6 @@ def test_frames_that_cannot_be_rendered_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="frames_every: found an environment with render_mode=None"):
         runner.record_parallel(simple_spread_v3.parallel_env(), tmp_path, frames_every=1)
     assert not list(tmp_path.iterdir())
-
-
-def test_frames_of_earlier_versions_have_their_places_too(tmp_path, monkeypatch):
-    """They do not mark resets, and archives of them have no column for it."""
-    with monkeypatch.context() as patched:
-        patched.setattr("runner.loops.messages.frame_id", lambda phase, *_: phase)
-        with runner.record(Counting(0), tmp_path, frames_every=1) as rec:
-            for seed in range(4):
-                rec.reset(seed=seed)
-                for _ in range(3):  # an episode that is left before its end
-                    rec.step(0)
-    folder = archived(rec.run.recording, tmp_path / "archive")
-    pq.write_table(pq.read_table(folder / layout.FRAMES).drop("frame_id"), folder / layout.FRAMES)
-    manifest = read_manifest((folder / layout.MANIFEST).read_bytes(), "")
-    earlier = Manifest(manifest.run, manifest.topics, entries_of(folder))
-    (folder / layout.MANIFEST).write_bytes(earlier.to_json())
-    restore(folder, tmp_path / "back.mcap")
-    assert contents(tmp_path / "back.mcap") == contents(rec.run.recording)
-    with open_recording(tmp_path / "back.mcap") as recording:
-        for number in range(4):
-            expected = [[0, number, t] for t in range(4)]
-            assert shown_states(recording, "train", number) == expected
-            assert encoded_states(tmp_path / "back.mcap", "train", number) == expected
 
 
 def test_frames_are_exact_and_carry_their_moment(tmp_path):

@@ -192,8 +192,8 @@ def test_a_sweep_uses_the_free_workers(client, submit, recordings, tmp_path):
     assert len(runs) == 6
     best = progress[-1]["best"]
     assert any(f"trial {best['trial']} is the best so far" in data.get("text", "") for _, _, data in seen)
-    first = client.get("/sweeps/small").text
-    assert "Comparing the trials of 6 runs …" in first
+    compared = "Comparing the trials of 6 runs …"  # as soon as the index has all of them
+    first = until(lambda page: compared in page, lambda: client.get("/sweeps/small").text)
     assert 'data-later="/sweeps/small/pictures"' in first
 
     def texts():
