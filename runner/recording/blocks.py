@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import space_fields
 from runner.recording.schema import MessageType, Topic
-from runner.recording.space_fields import are_exact, has_one_size, put_constants, put_ones, stored_dtype, tag
+from runner.recording.space_fields import are_exact, has_one_size, put_constants, stored_dtype, tag
 from runner.util.arrays import Records
 
 HEADER: Final = [
@@ -103,27 +103,27 @@ def blank_records(topic: Topic, message: MessageType, n: int) -> NDArray[np.void
 @lru_cache(64)
 def constant_bytes(topic: Topic, message: MessageType) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return a blank message record of one size, and which of its bytes after the header no value changes."""
-    blank, full = blank_records(topic, message, 1), blank_records(topic, message, 1)
-    for field in message.fields:
-        put_ones(field, full[field.name])
-    bytes_of = [record.view(np.uint8) for record in (blank, full)]
-    is_constant = bytes_of[0] == bytes_of[1]
+    blank, full = (np.frombuffer(_blank_record(topic, message, fill), np.uint8) for fill in (0, 255))
+    is_constant = blank == full
     is_constant[:HEADER_BYTES] = False
-    return bytes_of[0], is_constant
+    return blank, is_constant
 
 
 @lru_cache(256)
-def _blank_record(topic: Topic, message: MessageType) -> bytes:
+def _blank_record(topic: Topic, message: MessageType, fill: int = 0) -> bytes:
+    """Return a message record of one size with its constant bytes, and this byte in all of its values."""
     dtype = record_dtype(message)
-    one = np.zeros((), dtype=dtype)
+    assert dtype is not None
+    stored = np.full(dtype.itemsize, fill, np.uint8)
+    stored[:HEADER_BYTES] = 0
+    one: Records = stored.view(dtype)
     one["opcode"] = MESSAGE
-    one["record_length"] = one.itemsize - RECORD_HEAD.size
+    one["record_length"] = dtype.itemsize - RECORD_HEAD.size
     one["channel_id"] = topic.channel
-    stored = one.reshape(1).view(np.uint8)
     for field in message.fields:
         one[f"tag_{field.name}"] = list(tag(field))
-        put_constants(field, stored, one.dtype.fields[field.name][1])  # type: ignore[index]
-    return one.tobytes()
+        put_constants(field, stored, dtype.fields[field.name][1])  # type: ignore[index]
+    return stored.tobytes()
 
 
 def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:

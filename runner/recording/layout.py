@@ -88,12 +88,11 @@ class Layout:
                     types["step"] = replace(types["step"], fields=more)
         sizes = {"rewards": self.learners, "returns": self.learners, "events": self.events}
         types = {name: sized(message, sizes) for name, message in types.items()}
-        values = [field for message in types.values() for field in message.fields if field.is_value]
-        if not all(map(has_one_size, values)):
-            types = {
-                name: _values_last(message) if name != "episode" else message
-                for name, message in types.items()
-            }
+        values = {
+            name: [field for field in message.fields if field.is_value] for name, message in types.items()
+        }
+        if not all(has_one_size(field) for fields in values.values() for field in fields):
+            types |= {name: _values_last(types[name]) for name, fields in values.items() if fields}
         return {
             topic: types[topic.name.rpartition("/")[2]] for topic in self.topics if topic in schema.ROW_TOPICS
         }

@@ -272,7 +272,9 @@ class Phase:
         total, ended = self.steps.total(), self.episodes.count()
         if not total:
             recording = self._recording
-            advice = f"; `dualtaxi rerecord {recording.run_id}` records them" * recording.leaves_out_steps
+            advice = ""
+            if recording.leaves_out_steps:
+                advice = f"; `dualtaxi rerecord {recording.run_id}` records them"
             raise RecordingError(f"{recording.path}: has no {self.title} steps{advice}.")
         start = 0
         stop = 0

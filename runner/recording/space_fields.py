@@ -171,14 +171,6 @@ def put_constants(field: Field, stored: Array, at: int = 0) -> None:
         put_constants(part, stored, start)
 
 
-def put_ones(field: Field, stored: Any) -> None:
-    """Set every byte of some stored values, but none between the parts of a value."""
-    if field.parts is None:
-        stored[...] = np.frombuffer(b"\xff" * stored.dtype.itemsize, stored.dtype)[0]
-    for part in field.parts or ():
-        put_ones(part, stored[part.name])
-
-
 def varint(number: int) -> bytes:
     """Return a number as Protobuf writes lengths: seven bits a byte, the lowest first."""
     low = []

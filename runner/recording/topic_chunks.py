@@ -180,10 +180,14 @@ class TopicChunks:
 
     def last(self) -> np.void | None:
         """Return the last message, as `rows` does; None if there is none."""
-        if not self or self.dtype is not None:
-            return self._rows_of(len(self) - 1)[-1] if self else None
-        data, times, offsets = self._checked(len(self) - 1)
-        message: np.void = self._decoded([(int(times[-1]), data[int(offsets[-1]) + HEADER_BYTES :])])[0]
+        if not self:
+            return None
+        number = len(self) - 1
+        if self.dtype is not None:
+            message: np.void = self._rows_of(number)[-1]
+        else:  # decoding the whole chunk would take long
+            data, times, offsets = self._checked(number)
+            message = self._decoded([(int(times[-1]), data[int(offsets[-1]) + HEADER_BYTES :])])[0]
         return message
 
     def _blocks_from(self, start: int, stop: int) -> Iterator[NDArray[np.void]]:
