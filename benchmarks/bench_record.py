@@ -33,6 +33,7 @@ Targets = tuple[float, float]
 TARGETS: dict[str, tuple[Targets, Targets]] = {
     "Taxi-v4": ((2, 1.3), (36, 30)),
     "CartPole-v1": ((4, 3), (60, 45)),
+    "a Dict of three parts": ((4, 2.6), (60, 45)),
 }
 """Targets (at least, aim) in microseconds and in bytes per step."""
 
@@ -65,8 +66,14 @@ def measure(quick: bool) -> list[Figure]:
         warnings.simplefilter("ignore")
         os.environ["MINARI_DATASETS_PATH"] = str(Path(folder, "minari"))
         figures = []
-        for name in ("Taxi-v4", "CartPole-v1"):
-            figures += _environment(name, Path(folder), steps, repetitions)
+        for name, make in (
+            ("Taxi-v4", partial(gymnasium.make, "Taxi-v4")),
+            ("CartPole-v1", partial(gymnasium.make, "CartPole-v1")),
+            ("a Dict of three parts", Driving),
+        ):
+            figures += _environment(name, make, Path(folder), steps, repetitions)
+        figures += _actions_alone(Path(folder), steps)
+        figures += _minigrid(Path(folder), steps // 10, repetitions)
         for name, kind, count in (("Blackjack-v1", "short", steps // 20), ("Taxi-v4", "long", steps // 2)):
             figures += _against_minari(name, kind, Path(folder), count, repetitions)
         figures += _pong(Path(folder), steps // 10, repetitions)
@@ -116,9 +123,35 @@ def _overhead(make: Callable[[], Env], folder: Path, steps: int, repetitions: in
     return _Overhead(added, statistics.median(whole), alone[0] / steps * 1e6, size)
 
 
-def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[Figure]:
+class Driving(gymnasium.Env[Any, Any]):
+    """An environment whose observations and actions have parts, and that takes no time."""
+
+    observation_space = spaces.Dict(
+        camera=spaces.Box(0, 255, (8, 8), np.uint8),
+        speed=spaces.Box(-1, 1, (), np.float32),
+        gear=spaces.Discrete(5),
+    )
+    action_space = spaces.Dict(steer=spaces.Box(-1, 1, (2,), np.float32), brake=spaces.Discrete(2))
+
+    def __init__(self) -> None:
+        self.observation_space.seed(0)
+        self._observation, self._t = self.observation_space.sample(), 0
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:  # noqa: ARG002
+        """Return the observation, the same each time."""
+        return self._observation, {}
+
+    def step(self, action: Any) -> Any:  # noqa: ARG002
+        """Return the observation; every 50th step ends an episode."""
+        self._t += 1
+        return self._observation, 1.0, self._t % 50 == 0, False, {}
+
+
+def _environment(
+    name: str, make: Callable[[], Env], folder: Path, steps: int, repetitions: int
+) -> list[Figure]:
     """Return the overhead per step of recording an environment, and its size on disk."""
-    of = _overhead(partial(gymnasium.make, name), folder, steps, repetitions)
+    of = _overhead(make, folder, steps, repetitions)
     time_targets, size_targets = TARGETS[name]
     detail = f"processor time of the loop's thread; all threads {of.whole:.2f} us"
     added = figure(
@@ -127,6 +160,31 @@ def _environment(name: str, folder: Path, steps: int, repetitions: int) -> list[
     return [
         added,
         figure(f"  on disk, {name}", [of.size], "bytes/step", size_targets, higher_is_better=False),
+    ]
+
+
+def _actions_alone(folder: Path, steps: int) -> list[Figure]:
+    """Return the size of CartPole's steps recorded by their actions alone."""
+    with runner.record(gymnasium.make("CartPole-v1"), folder / "recordings", steps="actions") as env:
+        drive(env, steps)
+    size = env.run.summary["bytes"] / steps
+    return [figure("actions alone, CartPole-v1", [size], "bytes/step", (1, 0.7), higher_is_better=False)]
+
+
+def _minigrid(folder: Path, steps: int, repetitions: int) -> list[Figure]:
+    """Return the overhead per step of MiniGrid, whose observations have a text."""
+    try:
+        import minigrid
+    except ImportError:
+        print("    MiniGrid is left out: minigrid is not installed")
+        return []
+    minigrid.register_minigrid_envs()
+    of = _overhead(
+        partial(gymnasium.make, "MiniGrid-DoorKey-5x5-v0", max_episode_steps=100), folder, steps, repetitions
+    )
+    return [
+        figure("added per step, MiniGrid", of.added, "us", higher_is_better=False),
+        figure("  on disk, MiniGrid", [of.size], "bytes/step", higher_is_better=False),
     ]
 
 

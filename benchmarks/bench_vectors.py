@@ -25,15 +25,15 @@ def measure(quick: bool) -> list[Figure]:
     steps, repetitions = (4_000, 3) if quick else (20_000, 5)
     with tempfile.TemporaryDirectory() as folder:
         figures = [_vector(count, Path(folder), steps, repetitions) for count in (1, 4, 16)]
+        figures.append(_vector(16, Path(folder), steps, repetitions, AutoresetMode.SAME_STEP, length=8))
         return figures + [_batches(count, Path(folder), steps * 200, repetitions) for count in (16, 1024)]
 
 
 class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
-    """Vector environments that take no time: prepared arrays, in which one step in 22 ends an episode."""
+    """Vector environments that take no time: one step in `length` of the prepared arrays ends an episode."""
 
-    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - as in Gymnasium
-
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, mode: AutoresetMode = AutoresetMode.NEXT_STEP, length: int = 22) -> None:
+        self.metadata = {"autoreset_mode": mode}
         self.num_envs = count
         self.single_observation_space = spaces.Box(-9, 9, (4,), np.float32)
         self.single_action_space = spaces.Discrete(2)
@@ -42,7 +42,13 @@ class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
         draws = np.random.default_rng(0)
         self._observations = draws.normal(size=(1024, count, 4)).astype(np.float32)
         self._rewards = np.ones(count)
-        self._ends = draws.random((1024, count)) < 1 / 22
+        self._ends = draws.random((1024, count)) < 1 / length
+        last = np.empty(count, object)
+        last[:] = list(self._observations[0])
+        self._infos = [
+            {"final_obs": last, "_final_obs": ends} if mode == AutoresetMode.SAME_STEP and ends.any() else {}
+            for ends in self._ends
+        ]
         self._never = np.zeros(count, np.bool_)
         self._t = 0
 
@@ -53,20 +59,29 @@ class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def step(self, actions: Any) -> Any:  # noqa: ARG002
         """Return the next of the prepared arrays."""
         self._t = t = (self._t + 1) % 1024
-        return self._observations[t], self._rewards, self._ends[t], self._never, {}
+        return self._observations[t], self._rewards, self._ends[t], self._never, self._infos[t]
 
 
-def _vector(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
-    """Return the overhead of recording per step of a vector environment."""
+def _vector(
+    count: int,
+    folder: Path,
+    steps: int,
+    repetitions: int,
+    mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+    length: int = 22,
+) -> Figure:
+    """Return the overhead of recording per step of a vector environment; `length` is the mean episode's."""
+    make = partial(Prepared, count, mode, length)
     added, whole = [], []
     for _ in range(repetitions):
-        alone = processor_seconds(partial(_drive_vector, Prepared(count), steps))
-        with runner.record_vector(Prepared(count), folder / "recordings") as envs:
+        alone = processor_seconds(partial(_drive_vector, make(), steps))
+        with runner.record_vector(make(), folder / "recordings") as envs:
             recorded = processor_seconds(partial(_drive_vector, envs, steps))
         added.append((recorded[0] - alone[0]) / steps * 1e6)
         whole.append((recorded[1] - alone[1]) / steps * 1e6)
     return figure(
-        f"vector step, {count} environment{'s' if count > 1 else ''}",
+        f"vector step, {count} environment{'s' if count > 1 else ''}"
+        + (f", SameStep, {length} steps" if mode == AutoresetMode.SAME_STEP else ""),
         added,
         "us",
         (20, 6),
