@@ -93,7 +93,11 @@ def measure_many(count: int) -> list[Figure]:
             ]
 
         return [
-            *measured("index rebuild", *command("index", "rebuild")),
+            *measured("first ls", *command("ls", "--limit", "50")),
+            *measured("ls", *command("ls", "--limit", "50"), times=3),
+            *measured(
+                "ls, filtered and sorted", *command("ls", "--sort", "-success_percent", FILTER), times=3
+            ),
             *measured("first du", *command("du")),
             *measured("du", *command("du"), times=3),
             *measured("the page /disk", sys.executable, "-c", DISK, times=3),
