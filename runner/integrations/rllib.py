@@ -17,6 +17,7 @@ from typing import Any, Final, Unpack
 
 import numpy as np
 
+from runner.environments.games import MultiAgent
 from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
 from runner.integrations.libraries import as_setting, check_callback, require_tested
 from runner.integrations.shapes import as_run_name
@@ -36,7 +37,6 @@ from runner.loops.vector import (
     record_vector,
 )
 from runner.recording.maker import EnvironmentMaker
-from runner.replay.games import MultiAgent
 from runner.runs.run import Run
 from runner.util.values import Json, flatten
 

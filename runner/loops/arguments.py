@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from gymnasium.utils import EzPickle, RecordConstructorArgs
 
-from runner.replay.makers import class_name
+from runner.environments.layers import class_name
 
 _SHOWN: Final = "render_mode"
 """A parameter that changes no step."""

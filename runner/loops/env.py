@@ -11,6 +11,7 @@ import gymnasium
 from gymnasium.vector import VectorEnv
 
 from runner.environments.gym_types import Env, ResetOptions, ResetResult, StepResult
+from runner.environments.layers import class_name, layers_of
 from runner.errors import ConfigError
 from runner.loops.description import describe
 from runner.loops.generators import GeneratorWatch
@@ -21,7 +22,6 @@ from runner.loops.recorded import RecordedAlone, require_pictures
 from runner.loops.single_rows import SingleRows, single_rows
 from runner.loops.values import UNCHANGEABLE, as_given, check_phase
 from runner.loops.wrappers import return_name
-from runner.replay.makers import class_name, layers_of
 from runner.runs.run import Run
 
 

@@ -22,7 +22,9 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorActionWrapper
 from gymnasium.wrappers import OrderEnforcing
 
+from runner.environments.games import MultiAgent, Turns
 from runner.environments.gym_types import AnyVectorEnv
+from runner.environments.layers import class_name, layers_of, name_of, spaces_of_one, top_package
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
 from runner.loops.arguments import CannotBeMade, arguments_of, is_plain, plain_kwargs, plain_number
@@ -33,16 +35,11 @@ from runner.loops.wrappers import (
     entry_point_of,
     game_wrapper_fields,
     only_observes,
-    top_package,
     wrapper_fields,
     wrappers_as_fields,
 )
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, Registered, VectorMaker
-from runner.replay.games import MultiAgent, Turns
-from runner.replay.makers import class_name, layers_of
 from runner.replay.scripts import MAIN
-from runner.replay.stepping_vector import spaces_of_one
-from runner.replay.trust import name_of
 from runner.util.values import MAX_TEXT
 
 NAME_MAKE: Final = 'name a function that makes it: make="module:function"'

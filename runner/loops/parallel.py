@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
+from runner.environments.games import ByAgent, GameStepResult, Turns, game_spaces, is_in_turns
 from runner.environments.gym_types import Info, ResetOptions
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
@@ -20,8 +21,6 @@ from runner.loops.single_rows import AgentRows
 from runner.loops.values import as_given, check_phase
 from runner.loops.vector import by_field
 from runner.recording.spaces import Value
-from runner.replay.games import ByAgent, GameStepResult, Turns, is_in_turns
-from runner.replay.stepping import game_spaces
 
 
 class RecordedParallel(RecordedAlone[AgentRows]):

@@ -21,6 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.games import game_spaces
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari_episodes import episodes_in
 from runner.loops.env import record
@@ -30,7 +31,6 @@ from runner.recording.gym_spaces import restore_space
 from runner.recording.gym_values import element_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import make_environment, why_not_alone, why_not_made
-from runner.replay.stepping import game_spaces
 from runner.replay.trust import trusting
 from runner.runs.checkpoints import Checkpoint
 from runner.runs.marks import marking_nothing

@@ -15,6 +15,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWra
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import AnyVectorEnv, Info, ResetOptions, ResetResult, VectorStepResult
+from runner.environments.layers import class_name, layers_of, spaces_of_one
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
 from runner.loops.generators import States, VectorWatch
@@ -27,8 +28,6 @@ from runner.loops.vector_rows import VectorRows
 from runner.loops.wrappers import return_name
 from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
-from runner.replay.makers import class_name, layers_of
-from runner.replay.stepping_vector import spaces_of_one
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[object, object, object, object, object]

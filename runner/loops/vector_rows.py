@@ -7,13 +7,13 @@ from typing import Any, Final
 
 import numpy as np
 
+from runner.environments.layers import final_observations
 from runner.loops.description import Described
 from runner.loops.generators import States
 from runner.loops.rows import MAX_SEED, Rows
 from runner.recording.episode_log import Flags
 from runner.recording.gym_values import Put, element_of, filler, fitted
 from runner.recording.recorder import Recorder
-from runner.replay.stepping_vector import final_observations
 from runner.util.arrays import Array, Ints
 
 _TRUE: Final = b"\1"

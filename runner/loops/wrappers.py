@@ -13,11 +13,11 @@ from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 
+from runner.environments.layers import class_name, creator_of, name_of
 from runner.loops.arguments import VARIABLE, CannotBeMade, arguments_of, factory_of, plain_kwargs
 from runner.recording.maker import FUNCTION_NAME
-from runner.replay.makers import class_name, creator_of
 from runner.replay.scripts import MAIN
-from runner.replay.trust import is_left_out, name_of
+from runner.replay.trust import is_left_out
 from runner.util.values import MAX_TEXT
 
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
@@ -112,11 +112,6 @@ def game_wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object
         entry_point, kwargs, is_certain = factory_of(wrapper)
     assumed += [] if is_certain else [name]
     return {"entry_point": entry_point, "kwargs": kwargs}
-
-
-def top_package(module: str) -> str:
-    """Return the top package of a module, or of `module:class`."""
-    return module.partition(":")[0].partition(".")[0]
 
 
 def entry_point_of(value: object) -> str:

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.environments.games import as_parallel
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.description import environment_count
@@ -18,7 +19,6 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.topic_chunks import FOREVER
 from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned, Start
-from runner.replay.games import as_parallel
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.stepping import GameStepper, Stepper

@@ -14,11 +14,12 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
+from runner.environments.games import as_parallel
+from runner.environments.layers import class_name, creator_of, layers_of, name_of
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
-from runner.replay.games import as_parallel
 from runner.replay.scripts import MAIN, definition
 from runner.replay.specifications import (
     EnvironmentSpec,
@@ -31,7 +32,6 @@ from runner.replay.specifications import (
 from runner.replay.trust import (
     advice,
     is_left_out,
-    name_of,
     packages,
     require_listed_game,
     require_listed_wrapper,
@@ -41,7 +41,6 @@ from runner.replay.trust import (
 )
 from runner.runs.marks import own_mark
 from runner.util.processes import raise_if_out_of_memory
-from runner.util.values import MAX_TEXT
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -304,28 +303,6 @@ def _attribute(name: str) -> Any:
 def _creator(entry_point: str) -> Any:
     """Return what Gymnasium takes as an entry point: a definition of the script itself, else its name."""
     return _attribute(entry_point) if entry_point.startswith(f"{MAIN}:") else entry_point
-
-
-def creator_of(spec: EnvSpec) -> object:
-    """Return the class or function that makes the environment of a specification."""
-    from gymnasium.envs.registration import load_env_creator
-
-    return load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
-
-
-def layers_of(env: object) -> Iterator[Any]:
-    """Yield an environment's wrappers from the outermost in, and the environment inside of them."""
-    innermost = getattr(env, "unwrapped", env)
-    while env is not innermost and env is not None:
-        yield env
-        # PettingZoo's wrappers look up what they do not have inside: `env` comes first.
-        env = getattr(env, "env", None) or getattr(env, "aec_env", None)
-    yield innermost
-
-
-def class_name(instance: object) -> str:
-    """Return `module:class` of an instance, cut at the length that a recording holds."""
-    return f"{type(instance).__module__}:{type(instance).__qualname__}"[:MAX_TEXT]
 
 
 def _without_display() -> None:

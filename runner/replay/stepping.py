@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
+from runner.environments.games import game_spaces
 from runner.environments.gym_types import Space
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_spaces import describe_space, value_of
@@ -271,13 +272,6 @@ class GameStepper(Stepper):
             ]
         values = values_in(by_agent, np.array(column))
         return [{agent: action[agent] for agent in some} for action, some in zip(values, acting, strict=True)]
-
-
-def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
-    """Return the spaces of the observations and actions of all agents of a game."""
-    agents = env.possible_agents
-    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
-    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})
 
 
 def values_in(space: Space, column: NDArray[Any]) -> Sequence[Value]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.gym_types import AnyVectorEnv, Space
+from runner.environments.gym_types import Space
+from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo
 from runner.recording import schema
 from runner.recording.gym_values import element_of, filler, leaves_of
@@ -130,20 +131,3 @@ class VectorStepper(Stepper):
         if pictures is None or len(pictures) != self.n:
             raise CannotRedo("The vector environment draws no pictures of its environments.")
         return pictures[self._drawn]
-
-
-def spaces_of_one(envs: AnyVectorEnv) -> tuple[Space, Space]:
-    """Return the spaces of observation and action of one environment of a vector.
-
-    Older vectors, such as SuperSuit's, have no `single_` spaces: their spaces are those of one environment.
-    """
-    observation = getattr(envs, "single_observation_space", None) or envs.observation_space
-    return observation, getattr(envs, "single_action_space", None) or envs.action_space
-
-
-def final_observations(infos: Any) -> Value:
-    """Return the last observations of the episodes that ended in a step, by environment; None if none did."""
-    if isinstance(infos, Mapping):
-        return infos.get("final_obs")
-    last = [info.get("terminal_observation") for info in infos]  # as SuperSuit's vectors return them
-    return last if any(value is not None for value in last) else None

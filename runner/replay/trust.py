@@ -9,7 +9,6 @@ and wrappers of `WRAPPERS`. A server (`OWN_ONLY`) makes no environment of a loop
 from __future__ import annotations
 
 import contextlib
-import functools
 import importlib
 import importlib.util
 import json
@@ -20,8 +19,9 @@ import sys
 from collections.abc import Iterator, Mapping
 from multiprocessing import parent_process
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
+from runner.environments.layers import name_of, top_package
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker
 from runner.replay.scripts import MAIN, script_of_run, why_not_defined
@@ -227,7 +227,7 @@ def require_registered_arguments(
         CannotRedo: it is such a one.
     """
     entry_point = name_of(registered.vector_entry_point if vector else registered.entry_point)
-    package = _top(entry_point)
+    package = top_package(entry_point)
     if package not in packages():
         raise CannotRedo(
             f"The environment {name} is {entry_point}, of no known package of environments. {advice()}"
@@ -286,7 +286,7 @@ def require_listed_game(entry_point: str, kwargs: Mapping[str, object]) -> None:
     """
     if not _GAMES.fullmatch(entry_point):
         raise CannotRedo(f"The environment is made by {entry_point}, which is not a known game. {advice()}")
-    require_plain("keyword argument", kwargs, {}, _top(entry_point))
+    require_plain("keyword argument", kwargs, {}, top_package(entry_point))
 
 
 def require_listed_wrapper(entry_point: str, kwargs: Mapping[str, object]) -> None:
@@ -313,7 +313,7 @@ def is_left_out(entry_point: str) -> bool:
 
 def why_not_imported(module: str, trust: bool) -> str:
     """Return why a module may not or cannot be imported; empty if it can be tried."""
-    path, root = module.partition(":")[0], _top(module)
+    path, root = module.partition(":")[0], top_package(module)
     if root == MAIN:
         return why_not_defined()
     if not trust and root not in packages() and path not in WRAPPERS:
@@ -330,16 +330,3 @@ def why_not_imported(module: str, trust: bool) -> str:
         else ""
     )
     return f"The package {root}, which the environment needs, is not installed here.{hint}"
-
-
-def name_of(entry_point: Any) -> str:
-    """Return `module:name` of an entry point, of the function in a partial; empty if there is none."""
-    if entry_point is None or isinstance(entry_point, str):
-        return entry_point or ""
-    while isinstance(entry_point, functools.partial):
-        entry_point = entry_point.func
-    return f"{getattr(entry_point, '__module__', '')}:{getattr(entry_point, '__qualname__', '')}"
-
-
-def _top(module: str) -> str:
-    return module.partition(":")[0].partition(".")[0]

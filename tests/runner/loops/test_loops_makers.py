@@ -22,6 +22,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.cli.episode import Episode
+from runner.environments.layers import name_of
 from runner.errors import ConfigError, RecordingError
 from runner.execution.verify import verify
 from runner.export.pictures import describer
@@ -30,7 +31,6 @@ from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
 from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.replay.environment import rerun
-from runner.replay.trust import name_of
 from tests.runner.loops.making import Leaving
 
 

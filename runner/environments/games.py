@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gymnasium import spaces
+
     from runner.environments.gym_types import Space
 
 ByAgent = dict[Any, Any]
@@ -29,6 +31,15 @@ def is_multi_agent(env: object) -> bool:
 def is_in_turns(env: object) -> bool:
     """Return whether an environment has the interface of an `AECEnv`."""
     return all(hasattr(env, part) for part in ("agent_iter", "last", "observe"))
+
+
+def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
+    """Return the spaces of the observations and actions of all agents of a game."""
+    from gymnasium import spaces  # slow to import
+
+    agents = env.possible_agents
+    observations = spaces.Dict({agent: env.observation_space(agent) for agent in agents})
+    return observations, spaces.Dict({agent: env.action_space(agent) for agent in agents})
 
 
 class Turns:
