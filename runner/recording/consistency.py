@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.description import environment_count
+from runner.recording.differences import first_differing_row
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.reader import Recording
 from runner.recording.schema import RESET_ONLY
@@ -189,20 +190,18 @@ class _PhaseCheck:
         if self._recording.has_states:
             expected |= self._states(rows, given, was_reset, only_reset)
         elif only_reset.any() and "next_observation" in names:
-            same = _equal(rows["next_observation"][only_reset], given[only_reset])
-            if not same.all():
-                number = numbers[np.flatnonzero(only_reset)[np.argmin(same)]]
+            observed = rows["next_observation"][only_reset]
+            if (row := first_differing_row(observed, given[only_reset], 0.0)) is not None:
+                number = numbers[np.flatnonzero(only_reset)[row]]
                 value = "that of the reset before it"
                 raise self._wrong("step", number, "next_observation", "another value", value)
         if self._learners == 1 and "agents_terminated" in names:
             expected |= {
                 f"agents_{name}": rows[name].astype(np.uint32) for name in ("terminated", "truncated")
             }
-        for name, values in expected.items():
-            self._compare("step", numbers, name, rows[name], values)
+        self._compare("step", rows.ravel(), expected)
         for resets in self._numbered_resets.before(numbers.stop):
-            number = episodes.number[self._places(first, resets)]
-            self._compare("reset", resets["reset"], "episode", resets["episode"], number)
+            self._compare("reset", resets, {"episode": episodes.number[self._places(first, resets)]})
         over = ends[0] | ends[1]
         began = ~only_reset & np.vstack([self._over, over[:-1]])
         self._count_beginnings(first, was_reset | (rows["t"] > 0), began)
@@ -303,12 +302,7 @@ class _PhaseCheck:
                 f"/{self._own.name}/episode: found {first + have} episodes, expected one that ended at step "
                 f"{expected['last_step'][have]}"
             )
-        for name, values in expected.items() if have else ():
-            same = _equal(found[name], values[:have].astype(found[name].dtype))
-            if not same.all():
-                k = int(np.argmin(same))
-                expected_value = f"{values[k]} by its steps"
-                raise self._wrong("episode", found["episode"][k], name, found[name][k], expected_value)
+        self._compare("episode", found, {name: values[:have] for name, values in expected.items()})
 
     def _finish(self, steps: int) -> None:
         """Check the resets after the last step, and that there is nothing else."""
@@ -319,8 +313,7 @@ class _PhaseCheck:
             environment %= self._n
             first_of_each = np.sort(np.unique(environment, return_index=True)[1])
             self._compare_episodes(self._episodes.interrupt(steps, environment[first_of_each]))
-            expected = self._episodes.episode[environment]
-            self._compare("reset", resets["reset"], "episode", resets["episode"], expected)
+            self._compare("reset", resets, {"episode": self._episodes.episode[environment]})
         has_more = {
             "reset": len(self._resets.left) > 0,
             "episode": self._own.episodes.count() > self._episodes.ended,
@@ -329,11 +322,14 @@ class _PhaseCheck:
             if found:
                 raise Inconsistent(f"/{self._own.name}/{name}: found more records than the steps account for")
 
-    def _compare(self, what: str, numbers: range | Ints, name: str, found: Array, expected: Array) -> None:
-        """Compare a field of steps, resets or episodes, which have these numbers."""
-        if (wrong := np.flatnonzero(found != expected)).size:
-            k = wrong[0]
-            raise self._wrong(what, numbers[k], name, found.flat[k], expected.flat[k])
+    def _compare(self, what: str, found: NDArray[np.void], expected: Columns) -> None:
+        """Compare fields of steps, resets or episodes; `what` is the field with their number, too."""
+        for name, values in expected.items():
+            columns = found[name], values.reshape(found[name].shape)
+            if (row := first_differing_row(*columns, 0.0)) is not None:
+                was, should = (column[row] for column in columns)
+                should = f"{should} by its steps" if what == "episode" else should
+                raise self._wrong(what, found[what][row], name, was, should)
 
     def _out_of_order(self) -> Inconsistent:
         return Inconsistent(f"/{self._own.name}/reset: found resets out of order, or of no environment")
@@ -371,15 +367,3 @@ def _numbered(table: TopicChunks, name: str = "") -> Iterator[NDArray[np.void]]:
             raise Inconsistent(f"{name or table.topic.name}: found {number} {found}, expected {expected}")
         yield block
         first += len(block)
-
-
-def _equal(found: Array, expected: Array) -> Flags:
-    """Return which rows are the same, byte for byte; of numbers NaN equals NaN."""
-    if found.dtype.names or found.dtype.kind == "V":
-        found, expected = (
-            np.ascontiguousarray(part).view(np.uint8).reshape(len(part), -1) for part in (found, expected)
-        )
-    same = found == expected
-    if found.dtype.kind == "f":
-        same |= np.isnan(found) & np.isnan(expected)
-    return np.asarray(same.reshape(len(found), -1).all(axis=1))

@@ -14,18 +14,18 @@ _COMPARED_BYTES: Final = 1 << 16
 
 
 def first_difference(
-    recorded: Records, got: Records, names: Iterable[str], tolerance: float = 0.0
+    recorded: Records, got: Records, names: Iterable[str], tolerance: float | None = None
 ) -> tuple[int, str] | None:
     """Return the first row in which fields of records differ, and the first of the fields; None if none does.
 
     Args:
-        tolerance: absolute and relative, for floating-point numbers; 0 compares bytes.
+        tolerance: absolute and relative, for floating-point numbers; None compares bytes.
     """
     rows = ((first_differing_row(recorded[name], got[name], tolerance), name) for name in names)
     return min(((row, name) for row, name in rows if row is not None), key=lambda at: at[0], default=None)
 
 
-def first_differing_row(recorded: Array, got: Array, tolerance: float) -> int | None:
+def first_differing_row(recorded: Array, got: Array, tolerance: float | None = None) -> int | None:
     """Return the number of the first row that differs; None if none does.
 
     Args:
@@ -42,7 +42,7 @@ def first_differing_row(recorded: Array, got: Array, tolerance: float) -> int | 
         left, right = recorded[start : start + rows], got[start : start + rows]
         if left.tobytes() == right.tobytes():
             continue
-        if tolerance:
+        if tolerance is not None:
             differs = _beyond(left, right, tolerance)
         else:
             a, b = (

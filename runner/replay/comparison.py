@@ -126,7 +126,7 @@ class Comparison:
     """
 
     def __init__(self, recording: Recording, tolerance: float) -> None:
-        self._recording, self._tolerance = recording, tolerance
+        self._recording, self._tolerance = recording, tolerance or None
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
 
     def of(self, phase: str, environment: int, returned: Returned) -> RerunSteps:
@@ -230,7 +230,7 @@ def _failed_at(returned: Returned, text: str) -> tuple[int, int, int]:
 
 
 def differing_value(
-    recorded: Value, got: Value, description: Description, tolerance: float = 0.0
+    recorded: Value, got: Value, description: Description, tolerance: float | None = None
 ) -> tuple[str, object, object]:
     """Return where in two observations the first difference is, such as `[2]`, and both values there.
 
