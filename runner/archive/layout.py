@@ -24,6 +24,7 @@ STEPS: Final = "steps.parquet"
 EPISODES: Final = "episodes.parquet"
 Q_TABLES: Final = "q_tables.parquet"
 RESETS: Final = "resets.parquet"
+RESET_OPTIONS: Final = "reset_options.parquet"
 INFOS: Final = "infos.parquet"
 SCALARS: Final = "scalars.parquet"
 ARRAYS: Final = "arrays.parquet"
@@ -63,6 +64,7 @@ TOPICS: Final = {
     "checkpoints.parquet": ("/checkpoint",),
     EXTRA_COLUMNS: ("/extra",),
     EXTRAS: ("/train/extra", "/eval/extra"),
+    RESET_OPTIONS: ("/train/reset_options", "/eval/reset_options"),
     "reset_states.parquet": ("/train/reset_state", "/eval/reset_state"),
 }
 """The tables of messages in the order in which they are written, without Q-tables, and their topics."""
@@ -115,8 +117,8 @@ Q_TABLE_COLUMNS: Final = pa.schema(
 )
 
 LEFT_OUT_IF_EMPTY: Final = {
-    *("clock.parquet", "host.parquet", "console.parquet", "checkpoints.parquet", "reset_states.parquet"),
-    *(EXTRA_COLUMNS, EXTRAS),
+    *("clock.parquet", "host.parquet", "console.parquet", "checkpoints.parquet"),
+    *(RESET_OPTIONS, "reset_states.parquet", EXTRA_COLUMNS, EXTRAS),
 }
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"

@@ -98,9 +98,16 @@ class BatchRows(VectorRows):
                 self._recorder.write_if_full()
         self._current = seen[-1].copy()
 
-    def reset(self, observation: object, seeds: Sequence[int | None], which: Flags, states: States) -> None:
+    def reset(
+        self,
+        observation: object,
+        seeds: Sequence[int | None],
+        which: Flags,
+        states: States,
+        options: str = "",
+    ) -> None:
         """Record a reset of all environments; arguments as for a vector."""
-        super().reset(observation, seeds, which, states)
+        super().reset(observation, seeds, which, states, options)
         self._current = self._fitted(observation, self._n)
 
     def continues_with(self, observations: object) -> bool:

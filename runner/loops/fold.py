@@ -42,6 +42,8 @@ from runner.recording.messages import (
 )
 from runner.recording.metadata import json_object, layout_of_run, write_result
 from runner.recording.recorder import Recorder
+from runner.recording.reset_options import ResetOptions
+from runner.recording.reset_states import ResetState
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.spaces import Description, parts_of
@@ -369,13 +371,12 @@ class _Fold:
     def _messages(self, source: Source, topic: Topic) -> Iterator[tuple[int, bytes]]:
         """Yield position and payload in the run of a process's messages of a topic."""
         phase, read = topic.phase, self._read[source.number]
-        if topic.message == schema.RESET_STATE:
-            for state in source.recording.phase(phase).reset_states():
+        if topic.message in (schema.RESET_OPTIONS, schema.RESET_STATE):
+            for attached in _of_resets(source, topic):
                 read[topic.name] += 1
-                units = source.units[phase][source.units[phase]["reset"] == state.reset]
+                units = source.units[phase][source.units[phase]["reset"] == attached.reset]
                 for unit in units:
-                    environment = source.environment + state.environment
-                    moved = state._replace(reset=int(unit["new_reset"]), environment=environment)
+                    moved = attached._replace(reset=int(unit["new_reset"]))
                     yield int(unit["new_position"]), moved.to_payload()
             return
         for fields in source.recording.table(topic).decoded():
@@ -427,6 +428,15 @@ class _Fold:
         elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
             # Of a machine or a process, such as what it printed.
             yield place, encode(topic.message, fields)
+
+
+def _of_resets(source: Source, topic: Topic) -> Iterator[ResetOptions] | Iterator[ResetState]:
+    """Yield what a process recorded of its resets in a topic, with the environments' numbers in the run."""
+    phase = source.recording.phase(topic.phase)
+    if topic.message == schema.RESET_OPTIONS:
+        return phase.reset_options()
+    states = phase.reset_states()
+    return (state._replace(environment=source.environment + state.environment) for state in states)
 
 
 def _kept(name: str, reason: str) -> str:

@@ -17,13 +17,12 @@ from runner.loops.media import media_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.pictures import Picture
-from runner.loops.rows import MAX_SEED, Rows
+from runner.loops.rows import Rows
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
-from runner.recording.reset_states import ResetState
-from runner.recording.schema import STEP_NANOSECONDS, Topic, topics_of
+from runner.recording.schema import STEP_NANOSECONDS, topics_of
 from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
 from runner.util.jsonable import as_json, is_packed, packed
@@ -32,14 +31,14 @@ from runner.util.values import is_utf8
 MAX_INFO_BYTES: Final = 4 << 20
 """The most bytes of JSON for the info of one step."""
 _MAX_WAITING: Final = 1024
-"""Logged numbers, or states, that wait for the recorder; it gets them twice a second at the latest."""
+"""Logged numbers that wait for the recorder; it gets them twice a second at the latest."""
 _MAX_SERIES: Final = 4096
 """The most names of logged numbers whose encoders are kept at hand."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
 
 
-def _info_text(what: str, value: Any, limit: int) -> str:
+def _info_text(value: Any, limit: int) -> str:
     """Return a field of an info as JSON of at most `limit` bytes."""
     text, is_array = "", is_packed(value)
     if is_array and value.nbytes <= limit:
@@ -49,7 +48,7 @@ def _info_text(what: str, value: Any, limit: int) -> str:
     elif not is_array:
         text = json.dumps(as_json(value, packs=True))
     if not 0 < len(text) <= limit:
-        raise ValueError(f"{what} takes more than {MAX_INFO_BYTES:,} bytes of JSON")
+        raise ValueError(f"it takes more than {MAX_INFO_BYTES:,} bytes of JSON")
     return text
 
 
@@ -105,8 +104,6 @@ class Messages:
         self._series: dict[tuple[str, str], _Series] = {}
         self._numbers: list[tuple[_Series, float, tuple[int, int, int]]] = []
         """Logged numbers that the recorder does not have yet, with position, step and episode."""
-        self._states: list[tuple[Topic, ResetState, int]] = []
-        """Reset states that it does not have yet, with their positions."""
 
     def log(self, phase: str, name: str, value: object) -> None:
         """Record a number, a text, an array, a picture or a histogram under a name, at this moment."""
@@ -139,10 +136,7 @@ class Messages:
                 self.commit()
 
     def commit(self) -> None:
-        """Hand logged numbers and reset states to the recorder. The caller holds the lock."""
-        states, self._states = self._states, []
-        for topic, state, position in states:
-            self._recorder.append(topic, state.to_payload(), position)
+        """Hand logged numbers to the recorder. The caller holds the lock."""
         numbers, self._numbers = self._numbers, []
         if numbers:
             payloads = [series.encode(value, step, episode) for series, value, (_, step, episode) in numbers]
@@ -202,57 +196,48 @@ class Messages:
             self.has_logged = True
         return digest
 
-    def info(self, phase: str, info: Mapping[str, object], reset: Mapping[str, object] | None = None) -> None:
-        """Record the chosen fields of an info, of the step or reset that was just put down.
-
-        Args:
-            reset: options and seed of the reset, if it is a reset.
-        """
+    def info(self, phase: str, info: Mapping[str, object], is_reset: bool = False) -> None:
+        """Record the chosen fields of an info, of the step or reset that was just put down."""
         names = self._options.info
         chosen = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
-        if not chosen and not reset:
+        if not chosen:
             return
-        text = '{"info": ' + self._json_of("info", chosen)
-        text += ', "reset": ' + self._json_of("reset", reset) + "}" if reset else "}"
+        text = self._json_of(chosen)
         with self._loop.lock:
             if not self._loop.records():
                 return
             step, _ = self._loop.rows(phase).place
-            is_reset = reset is not None
             fields = {"step": step if is_reset else step - 1, "reset": is_reset, "json": text}
             self._recorder.append(topics_of(phase).infos, encode(schema.INFO, fields), self._loop.position)
 
-    def reset_info(
-        self, phase: str, info: Mapping[str, object], options: Mapping[str, object] | None, seed: object
-    ) -> None:
-        """Record the chosen fields of a reset's info, its options, and a seed too large for its record."""
-        reset: dict[str, object] = {"options": options} if options else {}
-        if isinstance(seed, int) and seed > MAX_SEED:
-            reset["seed"] = {"value": str(seed)}
-        if reset or self._options.info:
-            self.info(phase, info, reset)
+    def options_text(self, options: Mapping[str, object] | None) -> str:
+        """Return the options of a reset as JSON; empty for none. The environment may change its own."""
+        if not options:
+            return ""
+        try:
+            text = json.dumps({str(key): as_json(value) for key, value in options.items()})
+            if len(text) > MAX_INFO_BYTES:
+                raise ValueError(f"they take more than {MAX_INFO_BYTES:,} bytes of JSON")
+        except (ValueError, RecursionError) as error:
+            return self._reason("the options of a reset are", error)
+        return text
 
-    def _json_of(self, what: str, fields: Mapping[str, object]) -> str:
-        """Return fields as a JSON object; a field that cannot be recorded is replaced by the reason."""
+    def _json_of(self, fields: Mapping[str, object]) -> str:
+        """Return fields of an info as a JSON object; where one cannot be recorded the reason stands."""
         pieces, size = [], 0
         for key, value in fields.items():
             try:
-                text = _info_text(what, value, MAX_INFO_BYTES - size)
+                text = _info_text(value, MAX_INFO_BYTES - size)
             except (ValueError, RecursionError) as error:
-                text = json.dumps(f"not recorded: {error}")
-                self._loop.warn_once(
-                    f"{what}[{key!r}] is not recorded where {error}. This warning is given once."
-                )
+                text = self._reason(f"info[{key!r}] is", error)
             size += len(text)
             pieces.append(f"{json.dumps(str(key))}: {text}")
         return "{" + ", ".join(pieces) + "}"
 
-    def reset_state(self, phase: str, state: ResetState) -> None:
-        """Record what a reset depended on, of the reset that was just put down. The caller holds the lock."""
-        if self._loop.records():
-            self._states.append((topics_of(phase).reset_states, state, self._loop.position))
-            if len(self._states) == _MAX_WAITING:
-                self.commit()
+    def _reason(self, what: str, error: Exception) -> str:
+        """Warn that something is not recorded, and return the reason as JSON."""
+        self._loop.warn_once(f"{what} not recorded where {error}. This warning is given once.")
+        return json.dumps(f"not recorded: {error}")
 
     def frame(self, phase: str, image: object, is_reset: bool, environment: int | None = None) -> None:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.

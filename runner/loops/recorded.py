@@ -17,7 +17,6 @@ from runner.loops.loop import Loop, R
 from runner.loops.messages import Messages
 from runner.loops.options import Arguments, Options
 from runner.loops.single_rows import SingleRows
-from runner.loops.values import frozen_options
 from runner.recording.episode_log import Flags
 from runner.runs.run import Run
 
@@ -257,7 +256,7 @@ class RecordedAlone(Recorded[S]):
 
     def _recorded_reset(self, seed: int | None, options: ResetOptions | None) -> ResetResult:
         """Reset the environment, and record it: the seed, the options, the observation."""
-        before = frozen_options(options or {})
+        text = self._messages.options_text(options)
         with self._loop.lock:  # another thread may be committing steps
             steps = self._rows.place[0]
         state = self._watch.before(steps) if seed is None else None
@@ -267,10 +266,9 @@ class RecordedAlone(Recorded[S]):
             observation, info = result
             with self._loop.lock:
                 self._loop.activate(self._rows)
-                self._rows.reset(observation, seed)
-                if state is not None:
-                    self._messages.reset_state(self._phase, state._replace(reset=self._rows.resets - 1))
-            self._messages.reset_info(self._phase, self._info_by_field(info), before, seed)
+                self._rows.reset(observation, seed, text, state)
+            if self._options.info:
+                self._messages.info(self._phase, self._info_by_field(info), is_reset=True)
             self._record_frame(is_reset=True)
         except Exception as error:
             self._loop.fail(error)

@@ -7,6 +7,7 @@ of episodes) is computed for a whole block at once.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -20,6 +21,7 @@ from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.gym_values import Put, leaves_of
 from runner.recording.recorder import BLOCK_BYTES, Recorder
+from runner.recording.reset_options import ResetOptions
 from runner.recording.reset_states import ResetState
 from runner.util.arrays import Array, Ints, Records, zeros
 
@@ -67,8 +69,8 @@ class Rows:
         self._resets = np.zeros(room, [*_RESET, ("observation", observation)])
         self._waiting, self._reset_room = 0, room
         """Resets that are not committed, and the most of them."""
-        self._states: dict[int, ResetState] = {}
-        """What those resets depended on, by their place, where it is to be recorded."""
+        self._attached: dict[int, list[ResetOptions | ResetState]] = defaultdict(list)
+        """The options and states of those resets, by their place, where there are some."""
         self._state = np.zeros(self._n, np.int64)
         """The observations before the first row, where both spaces are discrete."""
         self._last_position = 0
@@ -134,6 +136,14 @@ class Rows:
         if self._held > BLOCK_BYTES:
             self._room = min(self._room, self._filled + 1)  # still 0 before the first step
             self._reset_room = self._waiting + 1
+
+    def _put_seed(self, k: int, seed: int | None, options: str) -> None:
+        """Put down the seed and the options, as JSON, of the reset in a place."""
+        is_large = seed is not None and seed > MAX_SEED
+        if seed is not None and 0 <= seed <= MAX_SEED:
+            self._resets["seed"][k], self._resets["seeded"][k] = seed, True
+        if options or is_large:
+            self._attached[k].append(ResetOptions(json=options, large_seed=seed if is_large else None))
 
     # --- records --------------------------------------------------------------------------------------
 
@@ -235,8 +245,10 @@ class Rows:
         columns["episode"] = episode[resets["row"], resets["environment"] % self._n]
         columns |= {"reset": number + np.arange(len(order)), "step": first + steps}
         self._recorder.put(self._topics.resets, columns, before + steps)
-        for place, k in enumerate(order.tolist() if self._states else ()):
-            if k in self._states:
-                payload = self._states[k]._replace(reset=number + place).to_payload()
-                self._recorder.append(self._topics.reset_states, payload, before + int(steps[place]))
-        self._states = {}
+        for place, k in enumerate(order.tolist() if self._attached else ()):
+            for attached in self._attached.get(k, ()):
+                is_state = isinstance(attached, ResetState)
+                topic = self._topics.reset_states if is_state else self._topics.reset_options
+                payload = attached._replace(reset=number + place).to_payload()
+                self._recorder.append(topic, payload, before + int(steps[place]))
+        self._attached.clear()

@@ -9,11 +9,12 @@ from typing import Any, Final, SupportsFloat
 import numpy as np
 
 from runner.loops.description import Described
-from runner.loops.rows import MAX_SEED, Rows
+from runner.loops.rows import Rows
 from runner.loops.values import lone_number, warn_user, whole_number
 from runner.recording.episode_log import Columns, Flags
 from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent
 from runner.recording.recorder import Recorder
+from runner.recording.reset_states import ResetState
 from runner.util.arrays import Array, Records
 
 _DISCRETE: Final = struct.Struct("<qqd??")
@@ -38,15 +39,23 @@ class SingleRows(Rows):
         """The steps of the phase so far, and the number of the episode that began last; 0 before any."""
         return self._recorder.steps[self._phase] + self._filled, max(self._begun - 1, 0)
 
-    def reset(self, observation: object, seed: int | None) -> None:
-        """Put down a reset; it ends an episode in progress, neither terminated nor truncated."""
+    def reset(
+        self, observation: object, seed: int | None, options: str = "", state: ResetState | None = None
+    ) -> None:
+        """Put down a reset; it ends an episode in progress, neither terminated nor truncated.
+
+        Args:
+            options: those of the reset as JSON; empty for none.
+            state: what the reset depended on, if it is to be recorded.
+        """
         k = self._waiting
         self._put_first(k, observation)
         if self._are_bytes:
             self._hold(self._resets["observation"][k])
         self._resets["row"][k] = self._filled
-        if seed is not None and 0 <= seed <= MAX_SEED:
-            self._resets["seed"][k], self._resets["seeded"][k] = seed, True
+        self._put_seed(k, seed, options)
+        if state is not None:
+            self._attached[k].append(state)
         self._fresh = True
         self.resets += 1
         self._waiting = k + 1

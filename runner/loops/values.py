@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +18,7 @@ from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.gym_values import SCALARS
 from runner.recording.spaces import Value
 from runner.util.arrays import Array
-from runner.util.jsonable import as_json, as_mapping
+from runner.util.jsonable import as_mapping
 from runner.util.values import is_utf8
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
@@ -146,17 +146,6 @@ def check_phase(phase: str) -> None:
     """
     if phase not in schema.PHASES:
         raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
-
-
-def frozen_options(options: Mapping[str, object]) -> dict[str, object]:
-    """Return the options of a reset as JSON holds them, as the environment may change those that it gets.
-
-    Options that JSON cannot hold are returned as they are; they are recorded as the reason for that.
-    """
-    try:
-        return {str(key): as_json(value) for key, value in options.items()}
-    except (ValueError, RecursionError):
-        return dict(options)
 
 
 def require_reset(resets: int, phase: str) -> None:

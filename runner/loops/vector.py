@@ -23,7 +23,7 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures, without_none
-from runner.loops.values import as_given, check_phase, frozen_options
+from runner.loops.values import as_given, check_phase
 from runner.loops.vector_rows import VectorRows
 from runner.loops.wrappers import return_name
 from runner.recording.episode_log import Flags
@@ -153,14 +153,16 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     ) -> ResetResult:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
         n, mask = self.env.num_envs, (options or {}).get("reset_mask")
-        others = frozen_options({key: own for key, own in (options or {}).items() if key != "reset_mask"})
+        text = self._messages.options_text(
+            {key: own for key, own in (options or {}).items() if key != "reset_mask"}
+        )
         which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
         states = self._watch.before_reset(which, seeds)
         result = self.env.reset(**without_none(seed=seed, options=options))
         states = self._watch.after_reset(states, which, seeds)
         try:
-            self.record_reset(*result, seeds, which, states, others)
+            self.record_reset(*result, seeds, which, states, text)
         except Exception as error:
             self._loop.fail(error)
         return result
@@ -172,7 +174,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         seeds: Sequence[int | None] = (),
         which: NDArray[np.bool_] | None = None,
         states: States | None = None,
-        options: Mapping[str, object] | None = None,
+        options: str = "",
     ) -> None:
         """Record a reset of some environments, or of all, that was just done.
 
@@ -180,12 +182,14 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             seeds: of all environments; empty for none.
             which: [N], the environments; all unless given.
             states: what the reset depended on, as far as it is to be recorded.
+            options: those of the reset as JSON; empty for none.
         """
         which = np.ones(self.env.num_envs, np.bool_) if which is None else which
         with self._loop.lock:
             self._loop.activate(self._rows)
-            self._rows.reset(observations, seeds, which, states or {})
-        self._messages.reset_info(self._phase, _by_environment(infos), options, None)
+            self._rows.reset(observations, seeds, which, states or {}, options)
+        if self._options.info:
+            self._messages.info(self._phase, _by_environment(infos), is_reset=True)
         if self._options.frames_every:
             self._record_frames(resets=which)
 

@@ -10,7 +10,7 @@ import numpy as np
 from runner.environments.layers import final_observations
 from runner.loops.description import Described
 from runner.loops.generators import States
-from runner.loops.rows import MAX_SEED, Rows
+from runner.loops.rows import Rows
 from runner.recording.episode_log import Flags
 from runner.recording.gym_values import Put, element_of, filler, fitted
 from runner.recording.recorder import Recorder
@@ -127,21 +127,28 @@ class VectorRows(Rows):
         """Return a batch of observations as they are recorded."""
         return fitted(self._leaves[0], observations, batch, self._resets.dtype["observation"])
 
-    def reset(self, observation: object, seeds: Sequence[int | None], which: Flags, states: States) -> None:
+    def reset(
+        self,
+        observation: object,
+        seeds: Sequence[int | None],
+        which: Flags,
+        states: States,
+        options: str = "",
+    ) -> None:
         """Record a reset of some environments; it ends episodes in progress in them.
 
         Args:
             seeds: of all environments; empty for none.
             which: [N], the environments.
             states: what the reset depended on, if it is to be recorded.
+            options: those of the reset as JSON; empty for none.
         """
         chosen, over, start = np.flatnonzero(which), self.over, self._waiting
         self._add_resets(self._filled, chosen, self._fitted(observation, self._n)[chosen])
         for k, i in enumerate(chosen.tolist(), start):
-            if len(seeds) and (seed := seeds[i]) is not None and 0 <= seed <= MAX_SEED:
-                self._resets["seed"][k], self._resets["seeded"][k] = seed, True
+            self._put_seed(k, seeds[i] if len(seeds) else None, options)
             if i in states:
-                self._states[k] = states[i]
+                self._attached[k].append(states[i])
         if not over[chosen].all() or self._waiting >= self._reset_room:
             self.commit()
 
@@ -173,7 +180,7 @@ class VectorRows(Rows):
         for row, states in self._autoreset_states.items():
             for k in np.flatnonzero(rows == row).tolist():
                 if (i := int(which[k])) in states:
-                    self._states[start + k] = states[i]
+                    self._attached[start + k].append(states[i])
         begins = was_reset | only_reset
         begins[0] |= self._over  # they ended among the steps of another phase, and were not reset since
         return begins, only_reset, False

@@ -42,6 +42,7 @@ from runner.recording.messages import (
 from runner.recording.metadata import check_file
 from runner.recording.metrics import RECENT_EPISODES, finite_mean
 from runner.recording.record_store import RecordStore
+from runner.recording.reset_options import ResetOptions, decode_reset_options
 from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.run_file import RecentTraining, run_title
 from runner.recording.schema import Topic, topics_of
@@ -322,6 +323,18 @@ class Phase:
     def reset_values(self) -> Iterator[Any]:
         """Yield the resets one by one, as `transitions` yields steps."""
         return self._values(self.resets, observation="observation")
+
+    def reset_options(self, times: range | None = None) -> Iterator[ResetOptions]:
+        """Yield what resets of a loop were called with, besides their seeds, in the order of the resets.
+
+        Only resets with options, or with a seed of more than 64 bits, have some; jobs have none. `times` as
+        for `TopicChunks.rows`.
+
+        Raises:
+            RecordingError: they are damaged.
+        """
+        options = self._recording.table(self.topics.reset_options)
+        return (given for _, given in options.parsed(decode_reset_options, times=times))
 
     def reset_states(self, times: range | None = None) -> Iterator[ResetState]:
         """Yield what resets of a loop without a seed depend on, in the order of the resets.

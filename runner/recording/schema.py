@@ -208,6 +208,10 @@ RESET_STATE = MessageType(
     ),
 )
 """What a reset without a seed depends on; `reset_states` describes its fields."""
+RESET_OPTIONS = MessageType(
+    "ResetOptions", (Field(1, "reset", _SFIXED64), Field(2, "json", _STRING), Field(3, "large_seed", _STRING))
+)
+"""What a reset was called with, if there is more than a seed; `reset_options` describes its fields."""
 INFO = MessageType("Info", (Field(1, "step", _SFIXED64), Field(2, "reset", _BOOL), Field(3, "json", _STRING)))
 SCALAR = MessageType(
     "Scalar",
@@ -360,6 +364,7 @@ MACHINE_TOPICS: Final = (CLOCK_TOPIC, HOST_TOPIC, CONSOLE_TOPIC)
 """The topics of how the recording went on its machine: other messages each time a job is run."""
 IMAGE_TOPIC = Topic("/image", 50, IMAGE, digested=False)
 """Pictures that were logged under a name, which is their `frame_id`; a film is an animated WebP."""
+TRAIN_RESET_OPTIONS, EVAL_RESET_OPTIONS = _both("reset_options", 33, RESET_OPTIONS)
 TRAIN_ACTIONS, EVAL_ACTIONS = _both("actions", 40, ACTIONS, digested=False)
 
 _LOOP_TOPICS: Final = (
@@ -367,6 +372,8 @@ _LOOP_TOPICS: Final = (
     EVAL_STEP,
     TRAIN_RESET,
     EVAL_RESET,
+    TRAIN_RESET_OPTIONS,
+    EVAL_RESET_OPTIONS,
     TRAIN_EPISODE,
     EVAL_EPISODE,
     TRAIN_INFO,
@@ -424,6 +431,7 @@ class PhaseTopics:
     actions: Topic
     episodes: Topic
     resets: Topic
+    reset_options: Topic
     reset_states: Topic
     infos: Topic
     frames: Topic
@@ -435,8 +443,8 @@ class PhaseTopics:
 def topics_of(phase: str) -> PhaseTopics:
     """Return the topics of a phase."""
     own = {topic.name.rpartition("/")[2]: topic for topic in ALL_TOPICS if topic.phase == phase}
-    names = ("step", "actions", "episode", "reset", "reset_state", "info", "frame", "extra", "metrics")
-    return PhaseTopics(*(own[name] for name in names))
+    names = "step actions episode reset reset_options reset_state info frame extra metrics"
+    return PhaseTopics(*(own[name] for name in names.split()))
 
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", RESET: "reset"}

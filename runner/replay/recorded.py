@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import heapq
-import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.description import environment_count
 from runner.recording.reader import Recording
+from runner.recording.reset_options import ResetOptions
 from runner.recording.reset_states import ResetState
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value, decode
@@ -22,6 +22,7 @@ from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
 
 _BLOCK_BYTES: Final = 16 << 20
+M = TypeVar("M", ResetOptions, ResetState)
 
 
 class RecordedReset(NamedTuple):
@@ -116,104 +117,65 @@ def _in_turn(resets: list[Piece], last_phase: str) -> list[Piece]:
 
 
 def resets_of(
-    recording: Recording,
-    phase: str,
-    start_time: int = 0,
-    stop_time: int | None = None,
-    without_infos: bool = False,
+    recording: Recording, phase: str, start_time: int = 0, stop_time: int | None = None
 ) -> Iterator[RecordedReset]:
-    """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`.
-
-    Options and large seeds stand among the infos, once for a call of `reset`. If several calls came without
-    a step between them, and fewer infos, these belong to the last calls.
-
-    Args:
-        without_infos: leave out options, large seeds and states, so that no infos are read.
-    """
+    """Yield the resets of a phase in order, from `start_time` up to and with `stop_time`."""
     times = range(start_time, FOREVER if stop_time is None else stop_time + 1)
-    states = iter(()) if without_infos else recording.phase(phase).reset_states(times)
-    extras = iter(()) if without_infos else _extras(recording, phase, times)
-    state, extra = next(states, None), next(extras, None)
+    tables = recording.phase(phase)
+    options_of, state_of = _by_reset(tables.reset_options(times)), _by_reset(tables.reset_states(times))
     names = ("reset", "environment", "episode", "step", "log_time", "seed", "seeded")
-    resets = (
-        RecordedReset(phase, number, environment, episode, step, time, observation, seed if seeded else None)
-        for block in recording.phase(phase).resets.rows(times)
+    for block in tables.resets.rows(times):
         for number, environment, episode, step, time, seed, seeded, observation in zip(
             *(block[name].tolist() for name in names), block["observation"], strict=True
-        )
-    )
-    for moment, group in groupby(resets, key=lambda reset: (reset.time, reset.step)):
-        given = []
-        while extra is not None and extra[:2] <= moment:
-            given += [extra[2:]] if extra[:2] == moment else []
-            extra = next(extras, None)
-        of_group = list(calls(group))
-        without = len(of_group) - len(given)
-        for k, call in enumerate(of_group):
-            options, seed = given[k - without] if k >= without else (None, None)
-            for reset in call:
-                while state is not None and state.reset < reset.number:
-                    state = next(states, None)
-                known = state if state is not None and state.reset == reset.number else None
-                yield RecordedReset(*reset[:7], seed if reset.seed is None else reset.seed, options, known)
+        ):
+            given = options_of(number) or ResetOptions()
+            place = phase, number, environment, episode, step, time
+            known_seed = seed if seeded else given.large_seed
+            yield RecordedReset(*place, observation, known_seed, given.options, state_of(number))
 
 
-def resets_back(
-    recording: Recording, phase: str, time: int, without_infos: bool = False
-) -> Iterator[RecordedReset]:
-    """Yield the resets up to a time, from the last to the first, reading no more than needed.
+def _by_reset(messages: Iterator[M]) -> Callable[[int], M | None]:
+    """Return a function that returns the message of a reset, given by its number; numbers must ascend."""
+    waiting = next(messages, None)
 
-    `without_infos` is as for `resets_of`.
-    """
+    def message_of(number: int) -> M | None:
+        nonlocal waiting
+        while waiting is not None and waiting.reset < number:
+            waiting = next(messages, None)
+        return waiting if waiting is not None and waiting.reset == number else None
+
+    return message_of
+
+
+def resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
+    """Yield the resets up to a time, from the last to the first, reading no more than needed."""
     width, stop = 1_000 * STEP_NANOSECONDS, time
     while stop >= 0:
         start = max(stop - width, 0)
-        yield from reversed(list(resets_of(recording, phase, start, stop, without_infos)))
+        yield from reversed(list(resets_of(recording, phase, start, stop)))
         stop, width = start - 1, 4 * width
 
 
 def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
     """Return the last reset of an episode's environment at or before its first step; None if it was lost.
 
-    It has no options, and a seed only up to 64 bits.
-
     Raises:
         RecordingError: there is no such episode, or its first step was lost.
     """
     span, n = recording.phase(phase).episode_span(episode), recording.environments
     time = int(recording.phase(phase).steps.one(span.start)["log_time"])
-    for reset in resets_back(recording, phase, time, without_infos=True):
+    for reset in resets_back(recording, phase, time):
         if reset.environment % n == span.start % n and reset.step <= span.start:
             return reset
     return None
 
 
-def _extras(
-    recording: Recording, phase: str, times: range
-) -> Iterator[tuple[int, int, dict[str, object] | None, int | None]]:
-    """Yield time, step, options and large seed of calls of `reset` that had one of both."""
-    for info in recording.phase(phase).infos.decoded(times=times):
-        if not info["reset"] or '"reset": {' not in info["json"]:
-            continue
-        try:
-            reset = json.loads(info["json"])["reset"]
-            options, seed = reset.get("options"), reset.get("seed", {}).get("value", "")
-        except (ValueError, RecursionError, LookupError, TypeError, AttributeError):
-            continue  # not of a recorder
-        is_number = isinstance(seed, str) and seed.isdecimal() and len(seed) < 100
-        yield (
-            info["log_time"],
-            info["step"],
-            options if isinstance(options, dict) else None,
-            int(seed) if is_number else None,
-        )
-
-
 def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
-    """Yield the resets of each call; within a call, the environments are in order."""
+    """Yield the resets of each call: the environments are in order, and have the same options."""
     call: list[RecordedReset] = []
     for reset in resets:
-        if call and reset.environment <= call[-1].environment:
+        is_next = bool(call) and reset.environment > call[-1].environment
+        if call and not (is_next and reset.options == call[-1].options):
             yield call
             call = []
         call.append(reset)

@@ -31,7 +31,7 @@ from runner.recording import schema
 from runner.recording.actions import COLUMNS as KEPT_COLUMNS
 from runner.recording.description import environment_count
 from runner.recording.messages import frame_place
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Phase, Recording, open_recording
 from runner.recording.run_file import has_environment
 
 Column = NDArray[Any]
@@ -91,29 +91,19 @@ def _phase_tables(recording: Recording, phase: str) -> Iterator[tuple[str, Table
     if recording.eval.has_metrics:
         yield "metrics", _of_messages(recording.phase(phase).metrics.decoded())
         return
-    infos = _decoded(recording, f"/{phase}/info")
-    parsed = [info | json.loads(info.pop("json")) for info in infos]
     yield (
         "infos",
         _of_messages(
             {
                 "position": one["position"],
                 "step": one["step"],
-                "is_reset": one["is_reset"],
-                "info": one["info"],
+                "is_reset": one["reset"],
+                "info": json.loads(one["json"]),
             }
-            for one in parsed
-            if one["info"]
+            for one in _decoded(recording, f"/{phase}/info")
         ),
     )
-    yield (
-        "reset_options",
-        _of_messages(
-            {"step": one["step"], "options": None, "seed": None} | one["reset_with"]
-            for one in parsed
-            if one["reset_with"]
-        ),
-    )
+    yield "reset_options", _of_messages(_reset_options(recording.phase(phase), resets))
     yield "reset_states", _of_messages(state._asdict() for state in recording.phase(phase).reset_states())
     yield "frames", _images(_decoded(recording, f"/{phase}/frame"))
     for name in recording.phase(phase).extras:
@@ -124,6 +114,13 @@ def _phase_tables(recording: Recording, phase: str) -> Iterator[tuple[str, Table
             whole = {key: np.concatenate([block[key] for block in blocks]) for key in ("log_time", "step")}
             values = np.concatenate([block["values"][name] for block in blocks])
             yield f"extras.{name}", _of_columns(_positioned(whole) | {"value": values})
+
+
+def _reset_options(phase: Phase, resets: Table) -> Iterator[dict[str, object]]:
+    """Yield the options of each reset that has some, or a seed of more than 64 bits."""
+    for given in phase.reset_options():
+        seed = None if given.large_seed is None else {"value": str(given.large_seed)}
+        yield {"step": int(resets["step"][given.reset]), "options": given.options, "seed": seed}
 
 
 def _with(blocks: Iterable[Column], name: str) -> Iterator[Column]:
@@ -263,10 +260,6 @@ def _decoded(recording: Recording, name: str) -> list[dict[str, Any]]:
     for fields in recording.table(name).decoded():
         message = dict(fields)
         message["position"] = message.pop("log_time") // schema.STEP_NANOSECONDS
-        if "json" in message:  # of an info, which holds the options of a reset too
-            parsed = json.loads(message["json"])
-            message["json"] = json.dumps({"info": parsed["info"], "reset_with": parsed.get("reset", {})})
-            message["is_reset"] = message.pop("reset")
         messages.append(message)
     return messages
 

@@ -33,8 +33,8 @@ def csv(
     """Export RUN as CSV: steps.csv, episodes.csv and metrics.csv in a folder.
 
     Columns are named as the recording's fields; each agent's action and reward has its own. metrics.csv has
-    a row for each value of a metric. A loop has resets.csv and infos.csv too, and a column for each number of
-    an observation or action. Numbers are written with all their digits.
+    a row for each value of a metric. A loop has resets.csv, reset_options.csv and infos.csv too,
+    and a column for each number of an observation or action. Numbers are written with all their digits.
 
     Examples:
       dualtaxi export csv @latest
@@ -54,8 +54,8 @@ def parquet(
     """Export RUN as Parquet: steps.parquet, episodes.parquet and metrics.parquet in a folder.
 
     Columns are named as the recording's fields; each agent's action and reward has its own. For a loop there
-    are resets.parquet and infos.parquet too, and each number of an observation or action has a column; an
-    array of more than 64 is one column of bytes.
+    are resets.parquet, reset_options.parquet and infos.parquet too, and each number of an observation or
+    action has a column; an array of more than 64 is one column of bytes.
 
     Examples:
       dualtaxi export parquet @latest

@@ -203,6 +203,8 @@ _MESSAGES: Final = {
     "/train/extra": "steps with extras",
     "/eval/extra": "evaluation steps with extras",
     "/checkpoint": "checkpoints",
+    "/train/reset_options": "options of resets",
+    "/eval/reset_options": "options of evaluation resets",
     "/train/reset_state": "states before resets",
     "/eval/reset_state": "states before evaluation resets",
     "/clock": "samples of the clock",

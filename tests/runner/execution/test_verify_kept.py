@@ -74,7 +74,7 @@ def test_environments_in_parallel_are_distinguished():
 def test_kept_loops_have_every_kind_of_message_but_frames():
     kept = {topic for name in (*LOOPS, *TOGETHER) for topic in EXPECTED[name]["messages"]}
     every = {topic.name for topic in schema.KINDS["loop"]}
-    others = ("frame", "extra", "actions")
+    others = ("frame", "extra", "actions", "reset_options")
     left_out = {f"/{phase}/{name}" for phase in schema.PHASES for name in others}
     assert kept == every - left_out - {
         "/extra",

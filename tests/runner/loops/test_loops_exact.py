@@ -117,7 +117,7 @@ def test_a_recording_without_steps_is_complete(tmp_path):
 
 def infos(run: Any) -> list[Any]:
     with open_recording(run.recording) as recording:
-        return [json.loads(one["json"])["info"] for one in recording.train.infos.decoded()]
+        return [json.loads(one["json"]) for one in recording.train.infos.decoded()]
 
 
 def test_all_fields_of_info_are_recorded_by_a_star(tmp_path):

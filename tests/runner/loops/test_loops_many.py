@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import gymnasium
@@ -143,7 +142,7 @@ def test_agents_that_leave_are_recorded(tmp_path):
     assert steps[1]["next_observation"]["a"].tolist() == [0, 0]
     assert steps[1]["next_observation"]["b"].tolist() == [2, 2]
     assert ended["returns"].tolist() == [[1, 2, 3]] * 2
-    assert infos[1]["json"] == '{"info": {"left": {"b": "b", "c": "b"}}}'
+    assert infos[1]["json"] == '{"left": {"b": "b", "c": "b"}}'
 
 
 def test_agents_without_names_are_refused_before_there_is_a_run(tmp_path):
@@ -313,8 +312,8 @@ def test_options_are_recorded_as_they_were_before_a_game_took_them(tmp_path):
     with runner.record_parallel(Taking(), tmp_path) as rec:
         rec.reset(options={"map": "small"})
     with open_recording(rec.run.recording) as recording:
-        (info,) = recording.train.infos.decoded()
-    assert json.loads(info["json"])["reset"] == {"options": {"map": "small"}}
+        (given,) = recording.train.reset_options()
+    assert (given.reset, given.options) == (0, {"map": "small"})
 
 
 def test_a_game_is_made_with_the_arguments_it_had(tmp_path):

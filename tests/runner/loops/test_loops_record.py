@@ -213,9 +213,11 @@ def test_chosen_fields_of_info_are_recorded_where_they_occur(tmp_path):
             env.step(env.action_space.sample())
     with open_recording(env.run.recording) as recording:
         infos = list(recording.train.infos.decoded())
+        (given,) = recording.train.reset_options()
     records = [(one["step"], one["reset"], json.loads(one["json"])) for one in infos]
-    assert records[0] == (0, True, {"info": {"first": True}, "reset": {"options": options}})
-    assert records[1:] == [(step, False, {"info": {"luck": 0.5}}) for step in (0, 2, 4)]
+    assert records[0] == (0, True, {"first": True})
+    assert records[1:] == [(step, False, {"luck": 0.5}) for step in (0, 2, 4)]
+    assert (given.reset, given.options, given.large_seed) == (0, options, None)
 
 
 def test_a_reset_ends_an_episode_in_progress(tmp_path):

@@ -191,8 +191,10 @@ def test_texts_infos_options_frames_and_checkpoints_come_along(tmp_path):
         with runner.record(Rooms(with_text=True), join=rec.run, shard="two", **options) as two:
             do(two, 2)
     with open_recording(rec.run.recording) as recording:
-        infos = [one["json"] for one in recording.train.infos.decoded()]
-        assert sum('"start": 1' in info for info in infos) == sum('"start": 2' in info for info in infos) == 1
+        given = list(recording.train.reset_options())
+        assert [own.options for own in given] == [{"start": 1}, {"start": 2}]
+        seeds = np.concatenate([block["seed"] for block in recording.train.resets.rows()])
+        assert [int(seeds[own.reset]) for own in given] == [1, 2]
         logs = [one["message"] for one in recording.table("/log").decoded()]
         assert sorted(logs) == ["of 1", "of 2"]
         frames = recording.train.frames.count()

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.recording.reader import open_recording
@@ -74,6 +75,11 @@ class Counter(gymnasium.Env[Any, Any]):
 
     def reward(self) -> float:
         return 1.0
+
+
+def counters() -> SyncVectorEnv:
+    """Return three of them that are reset by hand."""
+    return SyncVectorEnv([counter] * 3, autoreset_mode=AutoresetMode.DISABLED)
 
 
 class Ordered(Counter):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
 import time
 from functools import partial
@@ -161,6 +160,32 @@ def test_options_of_resets_are_given_again(tmp_path):
     assert rerun_steps(env.run.recording, trust=True) == (30, None)
 
 
+def test_options_and_large_seeds_of_resets_in_a_vector_are_given_again(tmp_path):
+    with runner.record_vector(loops.counters(), tmp_path, make=loops.counters) as envs:
+        envs.reset(seed=[2**80, 4, None], options={"add": 500})
+        for k in range(30):
+            over = envs.step(np.zeros(3, np.int64))[2]
+            if over.any():
+                mask = np.arange(3) == (k + 1) // 10 % 3
+                envs.reset(seed=[7, 2**70, 9], options={"add": k, "reset_mask": mask})
+                envs.reset(options={"reset_mask": ~mask})
+    with open_recording(envs.run.recording) as recording:
+        given = list(recording.train.reset_options())
+        resets = recording.train.resets.array()
+    assert [(own.reset, own.options, own.large_seed) for own in given[:3]] == [
+        (0, {"add": 500}, 2**80),
+        (1, {"add": 500}, None),
+        (2, {"add": 500}, None),
+    ]
+    assert [(own.reset, own.options) for own in given[3:]] == [
+        (3, {"add": 9}),
+        (6, {"add": 19}),
+        (9, {"add": 29}),
+    ]
+    assert resets["environment"][3:6].tolist() == [1, 0, 2]
+    assert rerun_steps(envs.run.recording, trust=True) == (90, None)
+
+
 def test_options_that_the_environment_changes_are_recorded_as_they_were(tmp_path):
     class Taking(loops.Counter):
         def reset(self, *, seed=None, options=None):
@@ -171,8 +196,8 @@ def test_options_that_the_environment_changes_are_recorded_as_they_were(tmp_path
         env.reset(seed=1, options={"start": {"add": 500}})
         env.step(0)
     with open_recording(env.run.recording) as recording:
-        (info,) = recording.train.infos.decoded()
-    assert json.loads(info["json"])["reset"] == {"options": {"start": {"add": 500}}}
+        (given,) = recording.train.reset_options()
+    assert (given.reset, given.options) == (0, {"start": {"add": 500}})
 
 
 @pytest.mark.parametrize("is_shared", [True, False])

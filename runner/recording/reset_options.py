@@ -1,0 +1,54 @@
+"""What `reset` was called with, besides a seed that the record of the reset holds."""
+
+from __future__ import annotations
+
+import json
+from typing import Final, NamedTuple
+
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.messages import decode, encode
+
+_MAX_DIGITS: Final = 100
+
+
+class ResetOptions(NamedTuple):
+    """The options of a reset, and a seed that is too large for its record."""
+
+    reset: int = -1
+    """The number of the reset in its phase, as in `dualtaxi.Reset`."""
+    json: str = ""
+    """The options as a JSON object, or as text the reason why they are not recorded; empty for none."""
+    large_seed: int | None = None
+    """The seed, if it has more than 64 bits."""
+
+    @property
+    def options(self) -> dict[str, object] | None:
+        """The options; None if there are none, or none that could be recorded."""
+        options = json.loads(self.json) if self.json else None
+        return options if isinstance(options, dict) else None
+
+    def to_payload(self) -> bytes:
+        """Return the message."""
+        seed = "" if self.large_seed is None else str(self.large_seed)
+        return encode(schema.RESET_OPTIONS, {"reset": self.reset, "json": self.json, "large_seed": seed})
+
+
+def decode_reset_options(payload: bytes) -> ResetOptions:
+    """Return the options in a `dualtaxi.ResetOptions`.
+
+    Raises:
+        RecordingError: they are no JSON, or the seed is no number.
+    """
+    fields = decode(schema.RESET_OPTIONS, payload)
+    seed = fields["large_seed"]
+    if seed and not (seed.isascii() and seed.isdecimal() and len(seed) < _MAX_DIGITS):
+        raise RecordingError(
+            f"found the seed {seed[:40]!r} of a reset, expected at most {_MAX_DIGITS} digits"
+        )
+    given = ResetOptions(fields["reset"], fields["json"], int(seed) if seed else None)
+    try:
+        given.options  # noqa: B018 - read once, to refuse what is no JSON
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"found options of a reset that are no JSON ({error})") from error
+    return given
