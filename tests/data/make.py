@@ -6,6 +6,7 @@ python -m tests.data.make
 from __future__ import annotations
 
 import json
+import os
 import platform
 import tempfile
 from importlib.metadata import version
@@ -24,6 +25,7 @@ from runner.loops import loop_run
 from runner.recording.reader import open_recording
 from runner.replay.steps import last_step
 from runner.replay.tables import tables_at
+from runner.runs.provenance import CODE_VARIABLE
 from runner.runs.run import Run
 from tests.runner.loops.making import Leaving, drive, parallel, play
 from tests.runner.loops.making import make as make_env
@@ -72,7 +74,6 @@ def loop_expectations(path: Path) -> dict[str, Any]:
 
 def make(name: str) -> None:
     """Make one of them, with nothing about the machine but its kind."""
-    session.provenance = made_by
     config = load(HERE / f"{name}.yaml")
     facts = {
         "run_id": name,
@@ -88,7 +89,6 @@ def make(name: str) -> None:
 
 def make_loop(name: str) -> None:
     """Make the recording of a loop that acts at random, with all that a loop can record but frames."""
-    loop_run.provenance = made_by
     with tempfile.TemporaryDirectory() as folder:
         env = make_env(LOOPS[name])
         with runner.record(env, folder, name=name, seed=5, info=["luck"], config={"kept": True}) as rec:
@@ -105,7 +105,6 @@ def make_loop(name: str) -> None:
 
 def make_together(name: str) -> None:
     """Make the recording of a loop over environments side by side, or of a game of several agents."""
-    loop_run.provenance = made_by
     with tempfile.TemporaryDirectory() as folder:
         if name == "vector":
             envs = SyncVectorEnv([lambda: make_env("CartPole-v1")] * 3)
@@ -117,7 +116,7 @@ def make_together(name: str) -> None:
         rec.run.recording.replace(HERE / f"{name}.mcap")
 
 
-def made_by() -> dict[str, str]:
+def made_by(with_command: bool = True) -> dict[str, str]:
     """Return a provenance with nothing about the machine but its kind."""
     packages = {f"package.{package}": version(package) for package in ("numpy", "numba", "llvmlite")}
     own = {"dualtaxi": runner.__version__, "python": platform.python_version()}
@@ -125,6 +124,8 @@ def made_by() -> dict[str, str]:
 
 
 if __name__ == "__main__":
+    os.environ[CODE_VARIABLE] = "off"
+    session.provenance_entries = loop_run.provenance_entries = made_by
     for name in NAMES:
         make(name)
     for name in LOOPS:
