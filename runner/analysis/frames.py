@@ -30,6 +30,7 @@ from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.schema import SCALAR_TOPIC
+from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.run import Run
 from runner.util.arrays import Array
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 Source = Run | Recording | str | os.PathLike[str]
 Phase = Literal["train", "eval"]
 
-_BEFORE: Final = ("step", "episode", "t", "state", "action", "next_state", "next_observation")
+_BEFORE: Final = ("step", "episode", "t", "environment", "state", "action", "next_state", "next_observation")
 _AFTER: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
 """The fields of a step in the order of its columns: those before the rewards, and those after them."""
 
@@ -98,11 +99,11 @@ def steps(
 ) -> pd.DataFrame:
     """Return a row for each step of a phase: of one episode, or number `start` up to `stop`.
 
-    Columns: step, episode, t, state, action (joint), next_state, `reward.AGENT`, terminated, truncated,
-    explored (bit i: agent i); in spaces that are not `Discrete` action and next_observation, a column for
-    each part of a `Dict`, with an array in a cell where a value is several numbers; `extra.NAME` for each
-    value that a loop recorded with its steps, NaN where a step has none. All steps of a long run take some
-    70 bytes of memory each.
+    Columns: step, episode, t, environment (where there are several), state, action (joint), next_state,
+    `reward.AGENT`, terminated, truncated, explored (bit i: agent i); in spaces that are not `Discrete` action
+    and next_observation, a column for each part of a `Dict`, with an array in a cell where a value is several
+    numbers; `extra.NAME` for each value that a loop recorded with its steps, NaN where a step has none. All
+    steps of a long run take some 70 bytes of memory each.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -206,7 +207,7 @@ def step_columns(
             "`recording.train.transitions()` reads them one by one."
         )
     if episode is None:
-        blocks = [block.copy() for block in steps.blocks(start, stop)]
+        blocks = [taken(block).copy() for block in steps.blocks(start, stop)]
         records = np.concatenate([np.empty(0, steps.row_dtype), *blocks])
     else:
         records = steps_of(recording, phase, episode)

@@ -19,7 +19,6 @@ from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
 from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
-from runner.recording.schema import RESET_ONLY
 from runner.recording.spaces import decode
 from runner.util.arrays import Array
 
@@ -184,17 +183,16 @@ def _steps(
             columns.setdefault(("reward", line), _Column("reward", line, "reward of a step", _number))
     else:
         notes.append("Rewards have no histogram, as no whole steps of training were recorded.")
-    for block in recording.train.steps.rows():
-        taken = block["t"] != RESET_ONLY
+    for block in recording.train.steps.taken():
         values: dict[tuple[str, str], Values] = {}
-        for part, own in _parts(recording, _uniform(recording, block["action"][taken]), notes).items():
+        for part, own in _parts(recording, _uniform(recording, block["action"]), notes).items():
             values["action", part] = own.astype(np.float64)
             if ("action", part) not in columns:
                 columns["action", part] = _Column("action", part, "action", _action_name(recording, part))
         if "rewards" in (block.dtype.names or ()):
             for i, line in enumerate(lines):
-                values["reward", line] = block["rewards"][taken][:, i].astype(np.float64)
-        yield places.at(block["episode"][taken], block["step"][taken] + 1), values
+                values["reward", line] = block["rewards"][:, i].astype(np.float64)
+        yield places.at(block["episode"], block["step"] + 1), values
 
 
 def _uniform(recording: Recording, actions: Array) -> Array:

@@ -73,6 +73,8 @@ FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
         "step",
         "episode",
         "t",
+        "environment",
+        "taken",
         "state",
         "action",
         "next_state",
@@ -87,6 +89,8 @@ FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
     ),
     schema.EPISODE: (
         "episode",
+        "environment",
+        "first_step",
         "last_step",
         "length",
         "penalties",
@@ -135,10 +139,10 @@ def may_be_null(column: str) -> bool:
 
 
 ENCODINGS: Final = {
-    **dict.fromkeys(("position", "step", "episode", "last_step"), "DELTA_BINARY_PACKED"),
+    **dict.fromkeys(("position", "step", "episode", "first_step", "last_step"), "DELTA_BINARY_PACKED"),
     **dict.fromkeys(("t", "state", "next_state", "action"), "BYTE_STREAM_SPLIT"),
     **dict.fromkeys(("explored", "terminated", "success"), "PLAIN"),
-    "truncated": "RLE",
+    **dict.fromkeys(("taken", "truncated"), "RLE"),
 }
 """The encodings of columns of steps and episodes; all others have a dictionary."""
 VALUES: Final = ("action_", "observation", "next_observation", EXTRA_PREFIX)

@@ -33,7 +33,7 @@ class Episode:
     def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
         require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._number = recording, at.phase, at.number_in(recording)
-        self._length = len(recording.phase(self._phase).episode_span(self._number))
+        self._length = len(recording.phase(self._phase).episode(self._number))
         self._title = title
 
     def steps(self) -> Iterator[dict[str, object]]:

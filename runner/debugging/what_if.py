@@ -145,9 +145,9 @@ class _Branches:
     def _read_episode(self) -> None:
         """Read the step, what came before it, and where the episode led."""
         recording, phase, episode, t = self._recording, self._at.phase, self._number, self._at.t
-        span = recording.phase(phase).episode_span(episode)
-        if t >= len(span):
-            raise self._at.no_step(recording, len(span), t)
+        length = len(recording.phase(phase).episode(episode))
+        if t >= length:
+            raise self._at.no_step(recording, length, t)
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
         returns = self._returns
         for block in episode_blocks(recording, phase, episode):
@@ -159,7 +159,7 @@ class _Branches:
                 self._step = block[t - done].copy()
             returns = _summed(returns, block)
             done += len(block)
-        self._recorded = Outcome(tuple(returns.tolist()), len(span), ending_of(recording, phase, episode))
+        self._recorded = Outcome(tuple(returns.tolist()), length, ending_of(recording, phase, episode))
 
     @property
     def _learns(self) -> bool:

@@ -197,10 +197,10 @@ def _step_at(recording: Recording, at: EpisodeRef | None) -> NDArray[np.void]:
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
         )
     phase = recording.phase(at.phase)
-    span = phase.episode_span(at.number_in(recording))
-    if at.t >= len(span):
-        raise at.no_step(recording, len(span), at.t)
-    (block,) = phase.steps.blocks(span[at.t], span[at.t] + 1)
+    steps = phase.episode(at.number_in(recording))
+    if at.t >= len(steps):
+        raise at.no_step(recording, len(steps), at.t)
+    (block,) = steps.rows(at.t, at.t + 1)
     check_steps(block, recording.mdp, str(recording.path), schema.PHASE_NAMES[at.phase])
     step: NDArray[np.void] = block[0]
     return step
@@ -210,10 +210,10 @@ def _steps_before(recording: Recording, at: EpisodeRef) -> int:
     """Return the training steps that the tables at a step have learned from."""
     if at.after is not None:
         return at.evaluation_in(recording).train_step
-    span = recording.train.episode_span(at.episode)
-    if at.t > len(span):
-        raise at.no_step(recording, len(span), at.t)
-    return span.start + at.t
+    steps = recording.train.episode(at.episode)
+    if at.t > len(steps):
+        raise at.no_step(recording, len(steps), at.t)
+    return steps.first + at.t
 
 
 def _by_reward(mdp: Mdp, weights: Weights, learner: int, learners: int) -> Iterator[RewardPart]:

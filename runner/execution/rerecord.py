@@ -27,6 +27,7 @@ from runner.recording.digest import combined_digest
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
+from runner.recording.turns import is_taken
 from runner.recording.writer import RecordingFile
 from runner.replay.engine import Replay
 from runner.replay.environment import stream_from_child
@@ -293,14 +294,15 @@ def _whole_steps(
 ) -> NDArray[np.void]:
     """Return the whole records of the steps of a piece; `states` are those after the last of each."""
     records, before, n = blank_steps(recording, piece.phase, piece.rows), states.copy(), len(states)
+    are_steps = is_taken(records)
     for environment in replay.environments:
         for steps in replay.steps(piece, environment, draws=False):
-            column = steps.environment % n
-            whole, states[column] = whole_records(recording, steps, states[column])
+            whole, state = whole_records(recording, steps, states[steps.environment])
+            states[steps.environment] = state
             records[steps.recorded["step"] - piece.first] = whole
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment
-        if row >= len(records) or records["t"][row] != schema.RESET_ONLY:
+        if row >= len(records) or are_steps[row]:
             continue
         if recording.has_states:
             records["state"][row] = records["next_state"][row - n] if row >= n else before[row]

@@ -147,8 +147,8 @@ def _rerun_sample(recording: Recording, found: Verification, sample: int, trust:
                 found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
         except CannotRedo as error:
             reason = str(error)
-            span = recording.phase(phase).episode_span(number)
-            found = replace(found, left_out=found.left_out + len(span))
+            steps_left_out = len(recording.phase(phase).episode(number))
+            found = replace(found, left_out=found.left_out + steps_left_out)
             continue
         found = replace(found, episodes=found.episodes + 1)
         if found.difference is not None:

@@ -5,6 +5,7 @@ Steps are read a block at a time; an episode is yielded when it has ended.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.export.values import acted, observed
-from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value, least_number
+from runner.recording.turns import turns_of
 from runner.util.arrays import Records
 from runner.util.values import Ranges
 
@@ -51,15 +52,18 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
 
     An episode of a loop is left out if a repair lost steps of it or the observation of its reset.
     """
+    starts: list[int] = []
     lengths: dict[int, int] = {}
     """The lengths of the episodes, by the number of their last step."""
     for start, stop in ranges:
         for block in recording.phase(phase).episodes.blocks(start, stop):
             lengths |= zip(block["last_step"].tolist(), block["length"].tolist(), strict=True)
+            starts += block["first_step"].tolist()
     if not lengths:
         return
+    numbers = range(max(min(starts), 0), max(lengths) + 1)
     resets = _Resets(recording, phase)
-    for environment, steps in _steps(recording, phase, lengths):
+    for environment, steps in _steps(recording, phase, numbers, lengths):
         seed, first = resets.before(environment, steps)
         resets.keep_last(environment, steps[-1])
         if first is not None and lengths.get(int(steps[-1]["step"])) == len(steps):
@@ -71,7 +75,6 @@ class _Resets:
 
     def __init__(self, recording: Recording, phase: str) -> None:
         self._recording = recording
-        self._environments = recording.environments
         self._remaining = recording.phase(phase).reset_values()
         self._next = next(self._remaining, None)
         self._read: dict[tuple[int, int], tuple[int | None, Value]] = {}
@@ -83,7 +86,7 @@ class _Resets:
         while self._next is not None and int(self._next["step"]) <= int(steps[0]["step"]):
             reset = self._next
             seed = int(reset["seed"]) if reset["seeded"] else None
-            key = int(reset["environment"]) % self._environments, int(reset["episode"])
+            key = int(reset["environment"]), int(reset["episode"])
             self._read[key] = seed, _copy(reset["observation"])
             self._next = next(self._remaining, None)
         key = environment, int(steps[0]["episode"])
@@ -102,26 +105,28 @@ def _copy(value: Value) -> Value:
     return value.copy() if isinstance(value, np.ndarray | np.void) else value
 
 
-def _steps(recording: Recording, phase: str, lengths: Mapping[int, int]) -> Iterator[tuple[int, Records]]:
+def _steps(
+    recording: Recording, phase: str, numbers: range, lengths: Mapping[int, int]
+) -> Iterator[tuple[int, Records]]:
     """Yield environment and steps of each episode; the last one of an environment may not have ended."""
-    table, n = recording.phase(phase).steps, recording.environments
-    first = max(min(last - (length - 1) * n for last, length in lengths.items()), 0)
-    open_parts: dict[int, list[Records]] = {environment: [] for environment in range(n)}
-    for block in table.numbered(range(first, max(lengths) + 1)):
+    open_parts: defaultdict[int, list[Records]] = defaultdict(list)
+    for block in recording.phase(phase).steps.numbered(numbers):
         ended: list[tuple[int, Records]] = []
-        for environment, parts in open_parts.items():
-            rows = block[(environment - int(block["step"][0])) % n :: n]
-            rows = rows[rows["t"] != schema.RESET_ONLY]
+        for environment, places in turns_of(block):
+            rows, parts = block[places], open_parts[environment]
             for part in np.split(rows, np.flatnonzero(np.diff(rows["episode"])) + 1):
-                ended += ((environment, steps) for steps in _extend(recording, parts, part))
+                is_last = int(part["step"][-1]) in lengths
+                ended += ((environment, steps) for steps in _extend(recording, parts, part, is_last))
         yield from sorted(ended, key=lambda found: int(found[1]["step"][-1]))
     yield from ((environment, np.concatenate(parts)) for environment, parts in open_parts.items() if parts)
 
 
-def _extend(recording: Recording, parts: list[Records], part: Records) -> Iterator[Records]:
-    """Add steps to the parts of the current episode; yield it if they belong to another one, or end it."""
-    if not len(part):
-        return
+def _extend(recording: Recording, parts: list[Records], part: Records, is_last: bool) -> Iterator[Records]:
+    """Add steps to the parts of the current episode; yield it if they belong to another one, or end it.
+
+    Args:
+        is_last: whether an episode is known to end with these steps.
+    """
     if parts and parts[-1]["episode"][-1] != part["episode"][0]:
         yield np.concatenate(parts)
         parts.clear()
@@ -131,7 +136,7 @@ def _extend(recording: Recording, parts: list[Records], part: Records) -> Iterat
             f"{recording.path}: episode {part['episode'][0]} has more than {MAX_EPISODE_BYTES:,} bytes, "
             "which Minari would hold at once; choose others by --episodes, or export parquet."
         )
-    if part["terminated"][-1] or part["truncated"][-1]:
+    if is_last or part["terminated"][-1] or part["truncated"][-1]:
         yield np.concatenate(parts)
         parts.clear()
 

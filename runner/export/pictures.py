@@ -39,7 +39,6 @@ from runner.recording.reader import Recording
 from runner.recording.spaces import Value
 from runner.replay.makers import why_not_rerun
 from runner.replay.steps import (
-    environment_of,
     environments_with_frames,
     frames_every,
 )
@@ -91,7 +90,7 @@ class Picture(Moment):
 
 def moments_of(recording: Recording, phase: str, episode: int) -> Iterator[Moment]:
     """Yield T + 1 moments of an episode of T steps: after the reset, and after each step."""
-    describe, steps = describer(recording, phase), len(recording.phase(phase).episode_span(episode))
+    describe, steps = describer(recording, phase), len(recording.phase(phase).episode(episode))
     returns = np.zeros(len(recording.agents))
     unpaid = tuple(returns.tolist())
     for t, (observation, step) in enumerate(observations_of(recording, phase, episode)):
@@ -133,7 +132,7 @@ class Pictures:
         require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
-        self.steps = len(recording.phase(phase).episode_span(episode))
+        self.steps = len(recording.phase(phase).episode(episode))
         self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust)
         self.note = ""
         self._pictures = self._generate()
@@ -184,7 +183,7 @@ def source_of_recorded(recording: Recording, phase: str, episode: int | None) ->
     if recording.tabular and svg.drawing_of(recording.mdp) is not None:
         return Source.SCENE
     framed = environments_with_frames(recording, phase)
-    if framed and (episode is None or environment_of(recording, phase, episode) in framed):
+    if framed and (episode is None or recording.phase(phase).episode(episode).place in framed):
         return Source.RECORDED
     has_image = Values(recording.spaces["observation"], "observation").image is not None
     return Source.OBSERVATION if has_image else Source.VALUES

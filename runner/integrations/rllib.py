@@ -290,8 +290,8 @@ def _described(make: str, env_runner: Any) -> tuple[Described, EnvironmentMaker]
     envs = outer.env
     mode = autoreset_mode_of(envs, None)
     with first_of(envs) as first:
-        described = described_vector(envs, first)
-        return replace(described, environments=1), vector_maker_of(envs, first, mode, make)
+        described = described_vector(envs, first, mode)
+        return replace(described, environments=1, has_turns=False), vector_maker_of(envs, first, mode, make)
 
 
 def _game(env_runner: Any, env: object) -> MultiAgent:

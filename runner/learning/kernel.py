@@ -49,7 +49,7 @@ class Ends(NamedTuple):
     """Room for the episodes that a call ends, of one type for all environments: a loop is compiled once."""
 
     counts: NDArray[np.int64]
-    """[n, 6 + E]: what `ENDS` names, and the steps by event."""
+    """[n, 7 + E]: what `ENDS` names, and the steps by event."""
     returns: NDArray[np.float64]
     """[n, L]."""
 
@@ -71,7 +71,7 @@ class Ends(NamedTuple):
 
 START_RANDOM, START_EACH = -1, -2
 
-ENDS = ("episode", "last_step", "length", "terminated", "truncated", "penalties")
+ENDS = ("episode", "first_step", "last_step", "length", "terminated", "truncated", "penalties")
 """The fields of an ended episode that are one number each."""
 PENALTIES = ENDS.index("penalties")
 
@@ -119,8 +119,8 @@ def _take_reward(model: Model, tally: Tally, record: np.record, kind: int) -> No
 def _end_episode(model: Model, tally: Tally, ends: Ends, row: int, last: np.record) -> None:
     """Fill a row of `ends` from the tally and the episode's last step, and clear the tally."""
     counts = ends.counts[Index(row)]
-    counts[0], counts[1], counts[2] = last.episode, last.step, last.t + 1
-    counts[3], counts[4] = last.terminated, last.truncated
+    counts[0], counts[1], counts[2], counts[3] = last.episode, last.step - last.t, last.step, last.t + 1
+    counts[4], counts[5] = last.terminated, last.truncated
     for column in range(PENALTIES, len(counts)):
         counts[column] = 0
     for i in range(len(tally.returns)):

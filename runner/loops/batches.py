@@ -73,7 +73,7 @@ class RecordedBatches(Recorded[BatchRows]):
     def _open(self, envs: AnyVectorEnv) -> None:
         """Begin the run, now that the environments and their spaces are known."""
         with first_of(envs) as first:
-            described = described_vector(envs, first)
+            described = described_vector(envs, first, self._mode)
             maker = vector_maker_of(envs, first, self._mode, self._make)
         if isinstance(envs, NamedEnvironments):
             maker = replace(maker, reason=self.why_not_made)

@@ -45,7 +45,10 @@ class CopiedRows(SingleRows):
         steps = recorder.dtype(self._topics.steps)
         self._fields = _FIELDS & set(steps.names or ())
         self._room = recorder.capacity(self._topics.steps)
-        self._copied = np.zeros(self._room, [(name, steps[name]) for name in (*sorted(self._fields), "t")])
+        kept = (*sorted(self._fields), "t", "environment")
+        self._copied = np.zeros(self._room, [(name, steps[name]) for name in kept])
+        self._environment = 0
+        """The environment that was reset last."""
         self._scratch = np.zeros(self._room, self._scratch.dtype)
 
     def reshape(self, described: Described) -> None:  # noqa: ARG002
@@ -62,7 +65,7 @@ class CopiedRows(SingleRows):
 
     def put_reset(self, reset: np.void, environment: int) -> None:
         """Copy a reset."""
-        self._resets["environment"][self._waiting] = environment
+        self._resets["environment"][self._waiting] = self._environment = environment
         self.reset(reset["observation"], int(reset["seed"]) if reset["seeded"] else None)
 
     def put(self, rows: NDArray[np.void]) -> None:
@@ -70,8 +73,10 @@ class CopiedRows(SingleRows):
         while len(rows):
             part, rows = np.split(rows, [self._room - self._filled])
             at, self._filled = self._filled, self._filled + len(part)
-            for name in self._copied.dtype.names or ():
-                self._copied[name][at : self._filled] = part[name]
+            copied = self._copied[at : self._filled]
+            copied["environment"] = self._environment
+            for name in (*self._fields, "t"):
+                copied[name] = part[name]
             scratch = self._scratch[at : self._filled]
             scratch["rewards"][:, 0] = part["rewards"]
             scratch["ends"][:, 0, 0], scratch["ends"][:, 1, 0] = part["terminated"], part["truncated"]
@@ -86,7 +91,7 @@ class CopiedRows(SingleRows):
         return was_reset | (self._copied["t"][: len(was_reset), np.newaxis] == 0), False, False
 
     def _values(self, rows: int, *_: object) -> Columns:
-        return {name: self._copied[name][:rows, np.newaxis] for name in self._fields}
+        return {name: self._copied[name][:rows, np.newaxis] for name in (*self._fields, "environment")}
 
 
 class CopiedExtras:

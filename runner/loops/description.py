@@ -35,6 +35,8 @@ class Described:
     agents: tuple[str, ...] = ("agent",)
     """The agents: one reward column each."""
     environments: int = 1
+    has_turns: bool = False
+    """Whether environments take turns: there are several, or a vector of one resets it in place of a step."""
     mdp: Mdp | None = None
     """The environment's arrays, if it is tabular."""
     wide_action: Space | None = None
@@ -67,7 +69,8 @@ class Described:
     def layout(self) -> Layout:
         """The messages of its recordings."""
         events = len(self.mdp.event_names) if self.mdp else 0
-        return layout_of(self.kind, len(self.agents), events, json.dumps(self.recorded_spaces))
+        spaces_of = json.dumps(self.recorded_spaces)
+        return layout_of(self.kind, len(self.agents), events, spaces_of, self.has_turns)
 
     @cached_property
     def common(self) -> str:

@@ -18,8 +18,8 @@ from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of
 from runner.recording.schema import Topic
 
-_NEW: Final = frozenset({"step", "episode", "t", "reset", "environment", "log_time", "publish_time"})
-"""The fields to which a fold gives new numbers."""
+_NEW: Final = frozenset({"step", "episode", "t", "environment", "taken", "reset", "log_time", "publish_time"})
+"""The fields to which a fold gives new numbers, and which only steps have that were taken."""
 _NOT_COPIED: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
 """What is of one process only, or written again; so are episodes, which follow from the steps."""
 

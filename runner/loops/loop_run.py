@@ -137,7 +137,10 @@ class LoopRun:
         described, mdp, run = self.described, self.described.mdp, self.run
         content = {key: value for key, value in self._config.items() if key not in NOT_CONTENT}
         job = json.dumps(content | {"seed": self._options.seed}, sort_keys=True)
-        return run_metadata(
+        facts = {"kind": described.kind, "spaces": json.dumps(described.recorded_spaces)}
+        if described.has_turns:
+            facts["environments"] = str(described.environments)
+        metadata = run_metadata(
             run.run_id,
             run.facts["name"],
             self._options.seed,
@@ -145,11 +148,8 @@ class LoopRun:
             created=run.facts["created"],
             agents=described.agents,
             events=len(mdp.event_names) if mdp else 0,
-        ) | {
-            "kind": described.kind,
-            "spaces": json.dumps(described.recorded_spaces),
-            "environments": str(described.environments),
-        }
+        )
+        return metadata | facts
 
     def describe(self) -> None:
         """Write what makes the recording self-contained, once; from then on dtypes are fixed."""

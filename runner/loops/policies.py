@@ -154,7 +154,7 @@ def values_along(
         ConfigError: the policy cannot be imported, or returns something else.
         RecordingError: there is no such episode, or the content of the checkpoint is not here.
     """
-    recording.phase(phase).episode_span(episode)  # with its message, if there is none
+    recording.phase(phase).episode(episode)  # with its message, if there is none
     steps_of_episode = next(episodes_in(recording, phase, ((episode, episode + 1),)), None)
     if steps_of_episode is None:
         raise RecordingError(

@@ -1,8 +1,7 @@
 """The steps of one phase of a loop: put down as they come, completed and recorded some thousands at a time.
 
-N environments step at once, and one alone is N = 1: record number n of a phase belongs to environment n
-modulo N. What follows from the order of steps (their numbers, the state before each, the lengths and returns
-of episodes) is computed for a whole block at once.
+N environments step at once, in turn, and one alone is N = 1. What follows from the order of steps (their
+numbers, the state before each, the lengths and returns of episodes) is computed for a whole block at once.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class Rows:
         self._topics = schema.topics_of(phase)
         self._mdp, self._n = described.mdp, described.environments
         learners = recorder.dtype(self._topics.episodes)["returns"].shape[0]
-        self._log = EpisodeLog(self._n, learners, self._mdp, zero=-0.0)
+        self._log = EpisodeLog(self._n, learners, self._mdp, described.layout.has_turns, zero=-0.0)
         observation = recorder.dtype(self._topics.resets)["observation"]
         self._are_bytes = observation.hasobject
         """Whether values vary in size."""
@@ -165,10 +164,15 @@ class Rows:
             columns |= {"rewards": rewards, "terminated": terminated, "truncated": truncated}
             ends = rewards, terminated, truncated
             counts = None if self._mdp is None else self._counts(self._mdp, columns)
-            episodes = self._log.take(Steps(first, *ends, begins, only_reset, is_over, counts))
+            environment = columns.get("environment")
+            steps = Steps(first, *ends, begins, only_reset, is_over, counts, environment)
+            episodes = self._log.take(steps)
             number = episodes.number
             columns["step"] = first + np.arange(rows * n).reshape(rows, n)
             columns |= {"episode": number, "t": episodes.t}
+            if "taken" in (self._recorder.dtype(self._topics.steps).names or ()):
+                columns.setdefault("environment", np.broadcast_to(np.arange(n), (rows, n)))
+                columns["taken"] = np.broadcast_to(np.logical_not(only_reset), (rows, n))
             flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
             self._recorder.put(self._topics.steps, flat, np.arange(before + 1, before + 1 + rows * n))
             self._put_ends(episodes.ended, first, before)

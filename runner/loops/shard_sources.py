@@ -23,6 +23,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.repair import can_be_repaired
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.topic_chunks import FOREVER, TopicChunks
+from runner.recording.turns import is_of_environment, is_taken
 from runner.runs.listing import run_in
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.shards import shard_folders
@@ -110,11 +111,9 @@ class Source:
         return number, last
 
     def _only_resets(self, phase: str) -> NDArray[np.int64]:
-        maker = self.recording.maker
-        if self.n == 1 and (maker is None or maker.kind != "vector"):
-            return np.empty(0, np.int64)
-        blocks = self.recording.phase(phase).steps.numbered(range(self.stops[phase]))
-        parts = [block["step"][block["t"] == schema.RESET_ONLY] for block in blocks]
+        steps = self.recording.phase(phase).steps
+        blocks = steps.numbered(range(self.stops[phase] if steps.have_turns else 0))
+        parts = [block["step"][~is_taken(block)] for block in blocks]
         return np.concatenate([np.empty(0, np.int64), *parts])
 
     def _units(self, phase: str) -> NDArray[np.void]:
@@ -161,9 +160,9 @@ class Source:
 
     def steps(self, phase: str, unit: np.void) -> Iterator[tuple[Records, Ints]]:
         """Yield the steps of a unit in pieces, with their numbers in the phase of its process."""
-        numbers = range(int(unit["first"]), int(unit["stop"]), self.n)
+        numbers = range(int(unit["first"]), int(unit["stop"]))
         for block in self.recording.phase(phase).steps.numbered(numbers):
-            rows = block[block["t"] != schema.RESET_ONLY]
+            rows = block[is_of_environment(block, int(unit["environment"]))]
             if len(rows):
                 yield rows, rows["step"].astype(np.int64)
 

@@ -235,7 +235,7 @@ def record_vector(
     check_phase(phase)
     mode = autoreset_mode_of(envs, autoreset_mode)
     with first_of(envs) as first:
-        described = described_vector(envs, first)
+        described = described_vector(envs, first, mode)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
         watch = VectorWatch(envs, first, mode, sparse=options.get("steps") == "actions")
     frames_every = options.get("frames_every", 0)
@@ -275,11 +275,12 @@ def autoreset_mode_of(envs: AnyVectorEnv | None, chosen: AutoresetMode | str | N
     return stated
 
 
-def described_vector(envs: AnyVectorEnv, first: object) -> Described:
+def described_vector(envs: AnyVectorEnv, first: object, mode: AutoresetMode) -> Described:
     """Return the description of a vector environment; `first` is its first environment."""
+    has_turns = envs.num_envs > 1 or mode == AutoresetMode.NEXT_STEP
     registered = first if getattr(envs, "spec", None) is None else envs
     described = describe(registered, *spaces_of_one(envs))
-    return replace(described, environments=envs.num_envs, mdp=None, agents=("agent",))
+    return replace(described, environments=envs.num_envs, has_turns=has_turns, mdp=None, agents=("agent",))
 
 
 @contextlib.contextmanager

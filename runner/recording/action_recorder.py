@@ -8,7 +8,8 @@ from runner.recording import schema
 from runner.recording.actions import EpisodeDigests, Rows, after_step, kept_dtype, packed
 from runner.recording.messages import encode
 from runner.recording.recorder import BLOCK_BYTES, Recorder
-from runner.recording.schema import RESET_ONLY, Topic
+from runner.recording.schema import Topic
+from runner.recording.turns import turns_of
 
 
 class ActionRecorder:
@@ -35,18 +36,11 @@ class ActionRecorder:
         for name in rows.dtype.names or ():
             if name != "digest":
                 rows[name] = records[name]
-        places = np.arange(len(rows))
-        for environment in range(self._n if len(rows) else 0):
-            own = slice((environment - int(rows["step"][0])) % self._n, None, self._n)
-            at, own_records = places[own], records[own]
-            taken = own_records["t"] != RESET_ONLY
-            if not taken.all():
-                at, own_records = at[taken], own_records[taken]
-            names = "t", after_step(own_records.dtype), "rewards", "terminated", "truncated"
-            for row, digest in self._digests[topic.phase].add(
-                environment, *map(own_records.__getitem__, names)
-            ):
-                rows["digest"][at[row]] = np.void(digest)
+        names = "t", after_step(records.dtype), "rewards", "terminated", "truncated"
+        for environment, places in turns_of(records) if len(rows) else ():
+            columns = (records[name][places] for name in names)
+            for row, digest in self._digests[topic.phase].add(environment, *columns):
+                rows["digest"][places[row]] = np.void(digest)
         self._rows.append(rows)
         is_large = sum(each.nbytes for each in self._rows) >= BLOCK_BYTES
         if is_large or sum(map(len, self._rows)) >= self._block_steps:

@@ -2,15 +2,15 @@
 
 A message has a block of consecutive steps in columns: the action, the place in the episode, the ends. The
 observations and rewards are represented by digests: one for each episode up to its last step in the block.
-Episodes and steps are numbered in each environment by itself, so numbers are stored as differences from the
-step before of the same environment; and every column byte by byte, as that compresses best.
+Numbers are stored as differences from what the step before of the same environment lets expect: mostly 0.
+Every column is stored byte by byte, as that compresses best.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from blake3 import blake3
@@ -19,22 +19,25 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message
+from runner.recording.turns import is_taken
 from runner.util.arrays import Array
 
 DIGEST_BYTES: Final = 16
 COLUMNS: Final = (
     "action",
-    "episode",
-    "t",
+    "environment",
+    "taken",
     "terminated",
     "truncated",
+    "episode",
+    "t",
     "acted",
     "agents_terminated",
     "agents_truncated",
     "log_time",
 )
 """The fields of a step that are kept, in the order of a message."""
-NUMBERS: Final = ("episode", "t", "log_time")
+NUMBERS: Final = ("environment", "episode", "t", "log_time")
 """Those that are stored as differences."""
 MARK: Final = np.dtype([("row", "<u4"), ("digest", f"V{DIGEST_BYTES}")])
 _MAX_BLOCK_BYTES: Final = 64 << 20
@@ -107,7 +110,7 @@ def packed(rows: Rows, n: int) -> dict[str, object]:
         if name in COLUMNS:
             values = np.ascontiguousarray(rows[name])
             if name in NUMBERS:
-                values[n:] -= values[:-n].copy()
+                values[n:] -= _following(rows, name, n)
             columns.append(values.view(np.uint8).reshape(len(rows), -1).T.tobytes())
     last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
     digests = rows["digest"].copy().view(np.uint8).reshape(len(rows), -1)
@@ -153,7 +156,7 @@ def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> R
         planes = np.frombuffer(data, np.uint8, count * size, at).reshape(size, count)
         values = np.ascontiguousarray(planes.T).view(dtype[name].base).reshape(count, *dtype[name].shape)
         if name in NUMBERS:
-            values = _summed(values, n)
+            values = _summed(values, rows, name, n)
         rows[name] = values
         at += count * size
     marks = np.frombuffer(fields["digests"], MARK)
@@ -163,12 +166,40 @@ def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> R
     return rows
 
 
-def _summed(values: Array, n: int) -> Array:
-    """Return the numbers whose differences from n rows before these are."""
-    n = min(n, len(values))
+def _following(rows: Rows, name: str, n: int) -> Array:
+    """Return the numbers to expect of the rows from number n on, by what their environments did before."""
+    now, later = rows[:-n], rows[n:]
+    if name == "episode":
+        return np.asarray(now["episode"] + _is_over(now))
+    if name == "t":
+        return np.where(now["episode"] == later["episode"], now["t"] + is_taken(now), 0)
+    return np.array(now[name])
+
+
+def _summed(values: Array, rows: Rows, name: str, n: int) -> Array:
+    """Return the numbers whose differences from `_following` these are; rows have the columns before them."""
+    n = min(n, len(rows))
+    turns, sums = _rounds(rows, n), _rounds(values, n)
+    begins = turns["episode"][1:] != turns["episode"][:-1]
+    if name == "episode":
+        sums[1:] += _is_over(turns[:-1])
+    if name == "t":
+        sums[1:] += is_taken(turns[:-1]) & ~begins
+    sums = sums.cumsum(axis=0, dtype=values.dtype)
+    if name == "t":  # as it only grows, what was summed before an episode is the largest of all before
+        sums[1:] -= np.maximum.accumulate(np.where(begins, sums[:-1], 0), axis=0)
+    return sums.reshape(-1)[: len(rows)]
+
+
+def _rounds(values: NDArray[Any], n: int) -> NDArray[Any]:
+    """Return values as [rounds, n], the last round filled with zeros."""
     padded = np.zeros(-(-len(values) // n) * n, values.dtype)
     padded[: len(values)] = values
-    return padded.reshape(-1, n).cumsum(axis=0, dtype=values.dtype).reshape(-1)[: len(values)]
+    return padded.reshape(-1, n)
+
+
+def _is_over(rows: Rows) -> NDArray[np.bool_]:
+    return np.asarray(rows["terminated"] | rows["truncated"])
 
 
 ACTION_TOPICS: Final = {"/train/step": schema.TRAIN_ACTIONS, "/eval/step": schema.EVAL_ACTIONS}

@@ -20,11 +20,11 @@ from runner.recording.description import environment_count
 from runner.recording.differences import first_differing_row
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.reader import Recording
-from runner.recording.schema import RESET_ONLY
 from runner.recording.spaces import least_number
 from runner.recording.steps import Steps as WholeSteps
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import TopicChunks
+from runner.recording.turns import is_taken
 from runner.util.arrays import Array, Ints
 
 _MAX_STEPS: Final = 2**62
@@ -140,7 +140,9 @@ class _PhaseCheck:
         self._recording, self._own, self._stop = recording, recording.phase(phase), stop
         self._n, self._learners = recording.environments, len(recording.agents)
         self._mdp = recording.mdp if recording.tabular else None
-        self._episodes = EpisodeLog(self._n, self._learners, self._mdp)
+        self._episodes = EpisodeLog(self._n, self._learners, self._mdp, recording.layout.has_turns)
+        self._environments = np.arange(self._n)
+        """The environments of the last round: those of shards follow one another."""
         self._over = np.zeros(self._n, np.bool_)
         """Whether the last step of each environment terminated or truncated its episode."""
         self._state = np.full(self._n, -1, np.int64)
@@ -177,16 +179,18 @@ class _PhaseCheck:
         """
         numbers, names = range(first, first + rows.size), rows.dtype.names or ()
         self._check_times(numbers, rows)
-        given, was_reset = self._given(numbers, rows.shape)
-        only_reset = rows["t"] == RESET_ONLY
+        given, was_reset, environment = self._given(numbers, rows.shape)
+        only_reset = ~is_taken(rows)
         if (wrong := np.flatnonzero(only_reset & ~was_reset)).size:
-            raise self._wrong("step", numbers[wrong[0]], "t", "that of a reset alone", "a reset before it")
+            raise self._wrong("step", numbers[wrong[0]], "taken", "no step", "a reset before it")
         ends = rows["terminated"], rows["truncated"]
         is_over, counts = self._is_over(numbers, rows), self._counts(first, rows)
         episodes = self._episodes.take(
-            Steps(first, rows["rewards"], *ends, was_reset, only_reset, is_over, counts)
+            Steps(first, rows["rewards"], *ends, was_reset, only_reset, is_over, counts, environment)
         )
         expected: Columns = {"t": episodes.t, "episode": episodes.number}
+        if "environment" in names:
+            expected["environment"] = environment
         if self._recording.has_states:
             expected |= self._states(rows, given, was_reset, only_reset)
         elif only_reset.any() and "next_observation" in names:
@@ -208,20 +212,25 @@ class _PhaseCheck:
         self._compare_episodes(episodes.ended)
         self._over = over[-1]
 
-    def _given(self, numbers: range, shape: tuple[int, ...]) -> tuple[Array, Flags]:
-        """Return what the last reset before each step observed, and whether there was one.
+    def _given(self, numbers: range, shape: tuple[int, ...]) -> tuple[Array, Flags, Ints]:
+        """Return what the last reset before each step observed, whether there was one, and the environment.
 
-        Both are [steps of each environment, environments].
+        They are [steps of each environment, environments].
         """
         first, resets = numbers.start, self._resets
         given, was_reset = np.zeros(shape, resets.left.dtype["observation"]), np.zeros(shape, np.bool_)
+        environment = np.broadcast_to(self._environments, shape).astype(np.int64)
         for block in resets.before(numbers.stop):
             step, is_unknown = block["step"], block["environment"] >= environment_count(self._recording)
             if (is_unknown | (step % self._n != 0) | (step < first)).any():
                 raise self._out_of_order()
             at = self._places(first, block)  # of several resets before a step the last counts
-            given[at], was_reset[at] = block["observation"], True
-        return given, was_reset
+            given[at], was_reset[at], environment[at] = block["observation"], True, block["environment"]
+        begins = np.where(was_reset, np.arange(len(given))[:, np.newaxis], 0)
+        begins = np.maximum.accumulate(begins, axis=0)
+        environment = np.take_along_axis(environment, begins, axis=0)
+        self._environments = environment[-1]
+        return given, was_reset, environment
 
     def _places(self, first: int, resets: NDArray[np.void]) -> tuple[Ints, Ints]:
         """Return the places of resets among the rows of a block that begins with step `first`."""

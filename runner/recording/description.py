@@ -233,7 +233,7 @@ class RunDescription:
 
     @property
     def environments(self) -> int:
-        """How many environments took turns: step number n was taken in number n modulo this."""
+        """How many environments step at once; 1 also for those of shards, whose steps follow one another."""
         return int(self.run.get("environments", "1"))
 
     @cached_property

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
-from runner.recording.schema import RESET_ONLY
 from runner.util.arrays import Array, Ints
 
 Flags = NDArray[np.bool_]
@@ -39,13 +38,15 @@ class Steps(NamedTuple):
     """Where a game is over though it is so for none of its agents."""
     counts: Ints | None = None
     """[rows, N, events + 1]: events and penalties, where the environment's arrays define them."""
+    environment: Array | None = None
+    """[rows, N]: the environments, where these follow one another; else they are in order."""
 
 
 class Episodes(NamedTuple):
     """What follows from a block of steps."""
 
     t: Ints
-    """[rows, N]: the steps before each in its episode; `RESET_ONLY` where none was taken."""
+    """[rows, N]: the steps before each in its episode; 0 where none was taken."""
     number: Ints
     """[rows, N]: the number of the step's episode, counted in its environment."""
     ended: Columns
@@ -56,11 +57,14 @@ class EpisodeLog:
     """The episodes of N environments in a phase, and what is carried from block to block.
 
     Args:
+        has_turns: whether environments take turns, so that the records of episodes name theirs.
         zero: what sums of rewards begin with: 0.0, or -0.0 where the sum of negative zeros is one.
     """
 
-    def __init__(self, n: int, agents: int, mdp: Mdp | None, zero: float = 0.0) -> None:
-        self._n, self._agents, self._mdp, self._zero = n, agents, mdp, zero
+    def __init__(self, n: int, agents: int, mdp: Mdp | None, has_turns: bool, zero: float = 0.0) -> None:
+        self._n, self._agents, self._mdp, self._has_turns, self._zero = n, agents, mdp, has_turns, zero
+        self._environments = np.arange(n)
+        """The environments of the last steps."""
         self.episode = np.zeros(n, np.int64)
         """The number of the episode in progress, or of the next one, in each environment."""
         self.length = np.zeros(n, np.int64)
@@ -94,7 +98,12 @@ class EpisodeLog:
         by_reset = np.arange(len(at)) >= np.count_nonzero(ends)
         order = np.lexsort([own, by_reset, at - by_reset])
         at, own, by_reset = at[order], own[order], by_reset[order]
+        environment = own
+        if steps.environment is not None:
+            environments = np.vstack([self._environments, steps.environment])
+            environment, self._environments = environments[at - by_reset + 1, own], environments[-1]
         ended = self._end(
+            environment,
             steps.first + (at - by_reset) * n + own,
             np.where(by_reset, left[at, own], length[at, own]),
             sums[place[at, own] - by_reset],
@@ -104,7 +113,7 @@ class EpisodeLog:
         self.episode = self.episode + total
         self.length = np.where(ends[-1], 0, length[-1])
         self._sums = sums[place[-1] + ends[-1]]
-        return Episodes(np.where(taken, before - began, RESET_ONLY), episode, ended)
+        return Episodes(np.where(taken, before - began, 0), episode, ended)
 
     def interrupt(self, steps: int, which: NDArray[np.integer]) -> Columns:
         """End the episodes in progress of some environments by a reset after `steps` of the phase.
@@ -114,7 +123,9 @@ class EpisodeLog:
         which = which[self.length[which] > 0]
         never = np.zeros(len(which), np.bool_)
         last = np.asarray(steps - self._n + which, np.int64)
-        ended = self._end(last, self.length[which], self._sums[which], never, never)
+        ended = self._end(
+            self._environments[which], last, self.length[which], self._sums[which], never, never
+        )
         self.episode[which] += 1
         self.length[which], self._sums[which] = 0, self._zero
         return ended
@@ -139,16 +150,27 @@ class EpisodeLog:
                 np.add.at(own, at, np.append(self._sums[:, k], values[..., k]))
         return sums.T, place
 
-    def _end(self, last: Ints, length: Ints, sums: Floats, terminated: Flags, truncated: Flags) -> Columns:
+    def _end(
+        self,
+        environment: NDArray[np.integer],
+        last: Ints,
+        length: Ints,
+        sums: Floats,
+        terminated: Flags,
+        truncated: Flags,
+    ) -> Columns:
         """Return the fields of the records of episodes that ended; `last` are their last steps."""
         ended: Columns = {
             "episode": self.ended + np.arange(len(last)),
+            "first_step": last - (length - 1) * self._n,
             "last_step": last,
             "length": length,
             "returns": sums[:, : self._agents],
             "terminated": terminated,
             "truncated": truncated,
         }
+        if self._has_turns:
+            ended["environment"] = environment
         if self._mdp is not None:
             counts = sums[:, self._agents :].astype(np.int64)
             success = [self._mdp.event_names.index(name) for name in self._mdp.success_events]

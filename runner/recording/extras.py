@@ -121,17 +121,17 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
 
     Args:
         parts: each layout, and the chunks of the phase that have it.
-        episode_span: returns the numbers of an episode's steps.
+        steps_of: returns the numbers of an episode's steps.
     """
 
     def __init__(
         self,
         parts: Sequence[tuple[ExtraLayout, TopicChunks]],
-        episode_span: Callable[[int], range],
+        steps_of: Callable[[int], NDArray[np.int64]],
         where: str,
     ) -> None:
         self._parts = parts
-        self._episode_span = episode_span
+        self._steps_of = steps_of
         self._where = where
         self._dtypes = {name: part.values[name] for part, _ in parts for name in part.names}
 
@@ -172,7 +172,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         Raises:
             RecordingError: there is no such episode, or it is too long for an array.
         """
-        return self.at(np.array(self._episode_span(episode)))
+        return self.at(self._steps_of(episode))
 
     def at(self, steps: NDArray[np.int64]) -> dict[str, MaskedArray]:
         """Return the extras of steps, given by their numbers, ascending; as `of_episode`.

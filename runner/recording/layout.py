@@ -44,6 +44,8 @@ class Layout:
     events: int
     spaces: str = ""
     """The descriptions of the `observation` and the `action` space as JSON; empty for a job."""
+    has_turns: bool = False
+    """Whether environments take turns, so that steps and episodes name theirs."""
 
     @property
     def topics(self) -> tuple[Topic, ...]:
@@ -86,6 +88,11 @@ class Layout:
                 if self.kind == "game":
                     more = types["step"].fields + schema.AGENT_FIELDS
                     types["step"] = replace(types["step"], fields=more)
+        if self.has_turns:
+            turns = schema.ENVIRONMENT_OF_STEP, *types["step"].fields, schema.TAKEN
+            episodes = *types["episode"].fields, schema.ENVIRONMENT_OF_EPISODE
+            types["step"] = replace(types["step"], fields=turns)
+            types["episode"] = replace(types["episode"], fields=episodes)
         sizes = {"rewards": self.learners, "returns": self.learners, "events": self.events}
         types = {name: sized(message, sizes) for name, message in types.items()}
         values = {
@@ -99,9 +106,9 @@ class Layout:
 
 
 @lru_cache(64)
-def layout_of(kind: str, learners: int, events: int, spaces: str = "") -> Layout:
+def layout_of(kind: str, learners: int, events: int, spaces: str = "", has_turns: bool = False) -> Layout:
     """Return a layout, the same one each time: what follows from it is computed once."""
-    return Layout(kind, learners, events, spaces)
+    return Layout(kind, learners, events, spaces, has_turns)
 
 
 def over_states(spaces: Mapping[str, Any]) -> bool:

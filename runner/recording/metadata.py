@@ -177,7 +177,8 @@ def layout_of_run(run: Mapping[str, str], path: str) -> Layout:
     check_run(run, path)
     if kind_of(run) != "job":
         spaces_of(run, path)
-    return layout_of(kind_of(run), int(run["learners"]), int(run["events"]), run.get("spaces", ""))
+    learners, events = int(run["learners"]), int(run["events"])
+    return layout_of(kind_of(run), learners, events, run.get("spaces", ""), "environments" in run)
 
 
 def json_object(text: str | bytes | None, what: str) -> dict[str, object]:

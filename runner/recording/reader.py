@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from runner.environments.naming import action_names, actions_in_words
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
-from runner.recording.description import RunDescription
+from runner.recording.description import RunDescription, environment_count
 from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
 from runner.recording.liveness import is_owned
@@ -47,8 +47,9 @@ from runner.recording.reset_states import ResetState, decode_reset_state
 from runner.recording.run_file import RecentTraining, run_title
 from runner.recording.schema import Topic, topics_of
 from runner.recording.spaces import decode as decode_value
-from runner.recording.steps import Steps
+from runner.recording.steps import EpisodeSteps, Steps
 from runner.recording.topic_chunks import FOREVER, ChunkFile, TopicChunks, chunks_by_topic
+from runner.recording.turns import taken
 
 MAX_METRICS: Final = 1 << 17
 """The most that `Phase.all_metrics` returns as one list."""
@@ -260,16 +261,15 @@ class Phase:
         end = None if stop is None else self.steps.first_from("episode", stop)
         return self.steps.blocks(self.steps.first_from("episode", start), end)
 
-    def episode_span(self, episode: int) -> range:
-        """Return the numbers of the steps of one episode, also of one that never ended.
+    def episode(self, number: int) -> EpisodeSteps:
+        """Return the steps of an episode, which are read later; also of one that never ended.
 
-        Where several environments take turns, episodes are numbered as they ended, and only ended ones have
-        a span; its step is the number of environments.
+        Where several environments take turns, episodes are numbered as they ended, and only ended ones are
+        found.
 
         Raises:
             RecordingError: the recording has no such episode, or no steps.
         """
-        stride = self._recording.environments
         total, ended = self.steps.total(), self.episodes.count()
         if not total:
             recording = self._recording
@@ -277,52 +277,53 @@ class Phase:
             if recording.leaves_out_steps:
                 advice = f"; `dualtaxi rerecord {recording.run_id}` records them"
             raise RecordingError(f"{recording.path}: has no {self.title} steps{advice}.")
-        start = 0
-        stop = 0
-        if 0 <= episode < ended and len(records := self.episodes.array(episode, episode + 1)):
-            stop = int(records[0]["last_step"]) + 1
-            start = stop - (int(records[0]["length"]) - 1) * stride - 1
-        elif episode == ended and stride == 1:
-            last = self.episodes.array(ended - 1, ended)
-            start, stop = int(last[0]["last_step"]) + 1 if len(last) else 0, total
-            for first in self.steps.numbered(range(start, start + 1)):
-                # A vector of one environment may have only reset it at first.
-                start += int(np.count_nonzero(first["t"] == schema.RESET_ONLY))
-        if not 0 <= start < stop <= total:
+        first, last, length, environment = 0, -1, 0, 0
+        if 0 <= number < ended and len(records := self.episodes.array(number, number + 1)):
+            first, last = int(records[0]["first_step"]), int(records[0]["last_step"])
+            length = last + 1 - first
+            if self.steps.have_turns:
+                length, environment = int(records[0]["length"]), int(records[0]["environment"])
+        elif number == ended and environment_count(self._recording) == 1:
+            before = self.episodes.array(ended - 1, ended)
+            first, last = int(before[0]["last_step"]) + 1 if len(before) else 0, total - 1
+            for rows in self.steps.numbered(range(first, first + 1)):
+                first += len(rows) - len(taken(rows))  # a vector of one may have only reset it at first
+            length = last + 1 - first
+        if not (0 <= first <= last < total and 0 < length <= last + 1 - first):
             raise NotInRecording(
-                f"{self._recording.path}: has no {self.title} episode {episode:,}; "
+                f"{self._recording.path}: has no {self.title} episode {number:,}; "
                 f"there are {ended:,}, from 0."
             )
-        return range(start, stop, stride)
+        return EpisodeSteps(self.steps, first, last, length, environment)
 
     def episode_steps(self, episode: int) -> NDArray[np.void]:
-        """Return the steps of one episode, as `episode_span` finds them.
+        """Return the steps of one episode as an array.
 
         Raises:
             RecordingError: the recording has no such episode or steps, or they are too large for an array.
         """
-        span, path = self.episode_span(episode), self._recording.path
-        if (span.stop - span.start) * self.steps.row_dtype.itemsize > MAX_EPISODE_BYTES:
+        steps, path = self.episode(episode), self._recording.path
+        if len(steps) * self.steps.row_dtype.itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
-                f"{path}: {self.title} episode {episode} has {span.stop - span.start:,} steps, too many "
-                f"for an array; read them in blocks, from {span.start}."
+                f"{path}: {self.title} episode {episode} has {len(steps):,} steps, too many for an array; "
+                f"read them in blocks, from {steps.first}."
             )
-        steps = self.steps.array(span.start, span.stop)
-        if not len(steps):
+        if not (blocks := list(steps.rows())):
             raise RecordingError(f"{path}: the steps of {self.title} episode {episode} were lost.")
-        return steps[:: span.step]
+        return np.concatenate(blocks)
 
-    def transitions(self) -> Iterator[Any]:
-        """Yield the steps of a loop one by one, with `action` and `next_observation` as values.
+    def transitions(self, episode: int | None = None) -> Iterator[Any]:
+        """Yield the steps of a loop, or of one episode, with `action` and `next_observation` as values.
 
         Those of the kind `step` have `state`, `action` and `next_state`, counted from 0. They are NumPy
         records where values have one size (`steps.blocks` yields many at once), else dictionaries.
         """
-        return self._values(self.steps, action="action", next_observation="observation")
+        blocks = self.steps.taken() if episode is None else self.episode(episode).rows()
+        return self._values(self.steps, blocks, action="action", next_observation="observation")
 
     def reset_values(self) -> Iterator[Any]:
         """Yield the resets one by one, as `transitions` yields steps."""
-        return self._values(self.resets, observation="observation")
+        return self._values(self.resets, self.resets.rows(), observation="observation")
 
     def reset_options(self, times: range | None = None) -> Iterator[ResetOptions]:
         """Yield what resets of a loop were called with, besides their seeds, in the order of the resets.
@@ -347,14 +348,14 @@ class Phase:
         states = self._recording.table(self.topics.reset_states)
         return (state for _, state in states.parsed(decode_reset_state, times=times))
 
-    def _values(self, table: TopicChunks, **spaces: str) -> Iterator[Any]:
-        """Yield messages one by one; `spaces` names the space of each field that is a value."""
+    def _values(self, table: TopicChunks, blocks: Iterator[NDArray[np.void]], **spaces: str) -> Iterator[Any]:
+        """Yield messages in blocks one by one; `spaces` names the space of each field that is a value."""
         if table.dtype is not None:
-            for block in table.blocks():
+            for block in blocks:
                 yield from block
             return
         names = ["log_time", *(field.name for field in table.message.fields)]
-        for block in table.rows():
+        for block in blocks:
             for row in block:
                 where = f"{self._recording.path}: {table.topic.name} at {row['log_time']} ns"
                 fields = {name: row[name] for name in names}
@@ -368,7 +369,7 @@ class Phase:
         In a recording that was cut off these are the steps up to the first end of an episode after its last
         reset: what comes later may lack its reset, since topics are written one after the other.
         """
-        n, total = self._recording.environments, self.steps.total()
+        total = self.steps.total()
         if "content_digest" in self._recording.result:
             return total
         if (last := self.resets.last()) is None:
@@ -376,8 +377,9 @@ class Phase:
         for block in self.steps.rows(range(int(last["log_time"]), FOREVER)):
             over = (block["terminated"] | block["truncated"]) & (block["step"] >= last["step"])
             if over.any():
-                return min(int(block["step"][np.argmax(over)]) // n * n + n, total // n * n)
-        return total // n * n
+                total = min(self.steps.round_of(int(block["step"][np.argmax(over)])).stop, total)
+                break
+        return self.steps.round_of(total).start
 
     @cached_property
     def extras(self) -> Extras:
@@ -399,7 +401,7 @@ class Phase:
             for k, layout in enumerate(layouts)
             if (chosen == k).any()
         ]
-        return Extras(parts, self.episode_span, where)
+        return Extras(parts, lambda episode: self.episode(episode).numbers(), where)
 
     @property
     def has_metrics(self) -> bool:

@@ -98,10 +98,14 @@ AGENT_FIELDS: Final = (
     Field(13, "agents_truncated", _FIXED32),
 )
 """More fields of a step in a game of several agents: bit i is agent i."""
+ENVIRONMENT_OF_STEP: Final = Field(14, "environment", _FIXED32)
+TAKEN: Final = Field(15, "taken", _BOOL)
+"""The first and the last field of a step where environments take turns."""
 EPISODE = MessageType(
     "Episode",
     (
         Field(1, "episode", _SFIXED64),
+        Field(10, "first_step", _SFIXED64),
         Field(2, "last_step", _SFIXED64),
         Field(3, "length", _FIXED32),
         Field(4, "penalties", _FIXED32),
@@ -112,6 +116,8 @@ EPISODE = MessageType(
         Field(9, "truncated", _BOOL),
     ),
 )
+ENVIRONMENT_OF_EPISODE: Final = Field(11, "environment", _FIXED32)
+"""One more field of an episode where environments take turns."""
 _TRAINING_SIDE = (
     Field(1, "step", _SFIXED64),
     Field(2, "episode", _SFIXED64),
@@ -449,5 +455,3 @@ def topics_of(phase: str) -> PhaseTopics:
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", RESET: "reset"}
 """The field that numbers the messages of a fixed-width topic, from 0."""
-RESET_ONLY: Final = 2**32 - 1
-"""The `t` of a step at which a vector environment only reset one of its environments."""

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.topic_chunks import FOREVER, TopicChunks
+from runner.recording.turns import is_of_environment, taken
 
 
 @dataclass(eq=False, kw_only=True)
 class Steps(TopicChunks):
-    """The steps of a phase: numbered from 0, in a vector over all its environments."""
+    """The steps of a phase: numbered from 0, over all environments."""
 
     actions: TopicChunks
     """The messages of steps of which only the actions were recorded."""
@@ -30,6 +31,20 @@ class Steps(TopicChunks):
     def are_known(self) -> bool:
         """Whether any step was recorded, whole or by its action."""
         return bool(self or self.actions)
+
+    @property
+    def have_turns(self) -> bool:
+        """Whether environments take turns, so that a row has `environment` and `taken`."""
+        return "taken" in (self.row_dtype.names or ())
+
+    def round_of(self, number: int) -> range:
+        """Return the numbers of the rows in the round of a row: environments of a vector step at once."""
+        start = number - number % self.file.environments
+        return range(start, start + self.file.environments)
+
+    def taken(self) -> Iterator[NDArray[np.void]]:
+        """Yield the steps in blocks, as `rows`, without turns at which an environment was only reset."""
+        return map(taken, self.rows())
 
     def total(self) -> int:
         """Return how many steps were recorded, whole or by their actions alone."""
@@ -84,6 +99,63 @@ class Steps(TopicChunks):
                 "them, `total` counts them, and `dualtaxi rerecord` brings the whole steps back."
             )
         return super()._numbers
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeSteps:
+    """The steps of one episode, read when they are asked for."""
+
+    table: Steps
+    first: int
+    """The number of its first step in the phase."""
+    last: int
+    """The number of its last step."""
+    length: int
+    environment: int = 0
+
+    def __len__(self) -> int:
+        return self.length
+
+    @property
+    def place(self) -> int:
+        """The place of its environment in a round: 0 where environments follow one another."""
+        return self.first - self.table.round_of(self.first).start
+
+    def rows(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
+        """Yield the steps from t = `start` to before `stop` in blocks, as `Steps.rows` does.
+
+        Lost steps are left out.
+        """
+        stop = self.length if stop is None else min(stop, self.length)
+        if not self.table.have_turns:
+            yield from self.table.numbered(range(self.first + start, self.first + stop))
+            return
+        # An environment takes at most one step a row, so t = start is not before this row.
+        for block in self.table.numbered(range(self.first + start, self.last + 1 if start < stop else 0)):
+            rows = block[is_of_environment(block, self.environment)]
+            inside = rows[(rows["t"] >= start) & (rows["t"] < stop)]
+            if len(inside):
+                yield inside
+            if len(rows) and rows["t"][-1] >= stop - 1:
+                return
+
+    def one(self, t: int) -> np.void:
+        """Return the step at t.
+
+        Raises:
+            RecordingError: it was lost.
+        """
+        for rows in self.rows(t, t + 1):
+            row: np.void = rows[0]
+            return row
+        table = self.table
+        raise RecordingError(f"{table.file.path}: {table.topic.name}: t {t:,} of an episode was lost.")
+
+    def numbers(self) -> NDArray[np.int64]:
+        """Return the numbers of the steps in the phase."""
+        if not self.table.have_turns:
+            return np.arange(self.first, self.last + 1)
+        return np.concatenate([np.empty(0, np.int64), *(rows["step"] for rows in self.rows())])
 
 
 def aligned(

@@ -162,8 +162,7 @@ class TopicChunks:
             first = int(block[self._number][0])
             if first >= numbers.stop:
                 return
-            begin = numbers.start - first
-            rows = block[max(begin, begin % numbers.step) : numbers.stop - first : numbers.step]
+            rows = block[max(numbers.start - first, 0) : numbers.stop - first]
             if len(rows):
                 yield rows
 

@@ -18,6 +18,7 @@ from runner.recording.description import environment_count
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.topic_chunks import FOREVER
+from runner.recording.turns import is_of_environment
 from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned, Start
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
@@ -96,7 +97,7 @@ class Replay:
     def all(self) -> Iterator[RerunSteps]:
         """Yield all steps of both phases in the order of time, up to the first difference."""
         for piece in pieces(self._recording, schema.PHASES):
-            for environment in self.environments if piece.environment is None else [piece.environment]:
+            for environment in self.environments:
                 for steps in self.steps(piece, environment, draws=self.render):
                     yield steps
                     if steps.difference is not None:
@@ -161,9 +162,7 @@ class Replay:
         resets = [reset for reset in resets if reset.time <= self._last_step_time]
         if environment == ALL:
             return rows, [((reset.step - first) // n, reset) for reset in resets]
-        if piece.environment not in (None, environment):
-            return rows[:0], []
-        index, places = _of_environment(rows, [reset.step - first for reset in resets], environment, n)
+        index, places = _of_environment(rows, [reset.step - first for reset in resets], environment)
         return rows if len(index) == len(rows) else rows[index], list(zip(places, resets, strict=True))
 
     def _part(self, whole: Returned, environment: int) -> Returned:
@@ -171,7 +170,7 @@ class Replay:
         n = self._recording.environments
         resets = [placed for placed in whole.resets if placed[1].environment == environment]
         starts = [start for start in whole.starts if start.reset.environment == environment]
-        index, places = _of_environment(whole.rows, [n * step for step, _ in resets], environment, n)
+        index, places = _of_environment(whole.rows, [n * step for step, _ in resets], environment)
         done = int(np.searchsorted(index, whole.done))
         pictures = index[:done].tolist() if environment == self.drawn and whole.frames else ()
         return Returned(
@@ -267,14 +266,12 @@ def _are_separate(recording: Recording) -> bool:
 
 
 def _of_environment(
-    rows: NDArray[np.void], places: Sequence[int], environment: int, n: int
+    rows: NDArray[np.void], places: Sequence[int], environment: int
 ) -> tuple[Ints, list[int]]:
     """Return which of the rows of all environments are steps that one took, and places among these.
 
     Args:
         places: numbers of rows.
-        n: how many environments take turns.
     """
-    index = np.arange(environment % n, len(rows), n)
-    index = index[rows["t"][index] != schema.RESET_ONLY]
+    index = np.flatnonzero(is_of_environment(rows, environment))
     return index, np.searchsorted(index, places).tolist()

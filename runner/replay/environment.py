@@ -83,8 +83,9 @@ def rerun(
     for episode in episodes:
         own = phase or "train"
         if draw_from:
-            span = recording.phase(own).episode_span(episode)
-            first = span[draw_from - 1] if draw_from <= len(span) else span.stop
+            recorded = recording.phase(own).episode(episode)
+            is_inside = draw_from <= len(recorded)
+            first = int(recorded.one(draw_from - 1)["step"]) if is_inside else recorded.last + 1
             begin = partial(begin, draw_from=first)
         for steps in rerun_episode(recording, own, episode, begin):
             yield steps

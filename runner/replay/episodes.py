@@ -12,6 +12,7 @@ from runner.errors import CannotRedo, NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.steps import Steps
 from runner.replay.comparison import RerunSteps
 from runner.replay.engine import ALL, Replay
 from runner.replay.recorded import Piece, RecordedReset, part, pieces, reset_of, resets_back
@@ -74,15 +75,16 @@ def episode_at(
     Raises:
         CannotRedo: the environment differs from the recording, or cannot be brought there.
     """
-    span, n = recording.phase(phase).episode_span(number), recording.environments
-    if not 0 <= t < len(span):
+    recorded = recording.phase(phase).episode(number)
+    if not 0 <= t < len(recorded):
         raise NotInRecording(
             f"{recording.path}: found no step {t:,} of {schema.PHASE_NAMES[phase]} episode {number}; it has "
-            f"{len(span):,}, from 0."
+            f"{len(recorded):,}, from 0."
         )
     target = _target(recording, phase, number)
     environment = target.reset.environment
-    time = _step_time(recording, phase, span[t] // n * n) - STEP_NANOSECONDS
+    turns = recorded.table.round_of(int(recorded.one(t)["step"]))
+    time = _step_time(recorded.table, turns.start) - STEP_NANOSECONDS
     until = replace(target, stop_time=max(time, target.reset.time) + 1)
     start = _right_start(recording, target, make)
     with closing(make()) as replay:
@@ -118,17 +120,17 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
     Raises:
         RecordingError: there is no such episode, or it has no reset.
     """
-    own, n = recording.phase(phase), recording.environments
-    span, ended = own.episode_span(number), own.episodes.array(number, number + 1)
+    steps = recording.phase(phase).episode(number)
+    ended = recording.phase(phase).episodes.array(number, number + 1)
     if (reset := reset_of(recording, phase, number)) is None:
         raise RecordingError(f"{recording.path}: {phase} episode {number} has no reset before it.")
-    stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(recording, phase, span[-1])
-    others = n - 1 - reset.environment % n  # their steps follow at once
+    stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(steps.table, steps.last)
+    others = steps.table.round_of(steps.last)[-1] - steps.last  # their steps follow at once
     return _Target(number, reset, stop_time + others * STEP_NANOSECONDS)
 
 
-def _step_time(recording: Recording, phase: str, step: int) -> int:
-    return int(recording.phase(phase).steps.one(step)["log_time"])
+def _step_time(steps: Steps, number: int) -> int:
+    return int(steps.one(number)["log_time"])
 
 
 def _starts(
@@ -203,8 +205,8 @@ def _approach(
             # The environments of a vector that are reset with the same step stay together.
             at = [other.step for other in piece.resets].index(reset.step)
             at, rows = at if is_whole else numbers.index(reset.number), reset.step - piece.first
-            yield part(piece, 0, rows, piece.resets[:at], piece.environment), False
-            yield part(piece, rows, len(piece.rows), piece.resets[at:], piece.environment), True
+            yield part(piece, 0, rows, piece.resets[:at]), False
+            yield part(piece, rows, len(piece.rows), piece.resets[at:]), True
             is_reached = True
         elif is_of_phase or not is_reached:  # what the other phase does meanwhile is not part of the episode
             yield piece, is_reached

@@ -81,8 +81,6 @@ class Piece:
     """In order; those of a piece with steps come before one of them."""
     time: int
     """Nanoseconds before its first step, or at its resets."""
-    environment: int | None = None
-    """The environment of all of it, in a recording with shards."""
 
 
 def pieces(
@@ -95,8 +93,6 @@ def pieces(
         stop_time: the last `log_time` of steps; resets after that step are left out. By default all.
     """
     streams = [_pieces_of(recording, phase, start_time, stop_time) for phase in phases]
-    if recording.shards:
-        streams = [_by_environment(stream) for stream in streams]
     last_phase = ""
     resets: list[Piece] = []
     for piece in heapq.merge(*streams, key=lambda piece: (piece.time, len(piece.rows) > 0)):
@@ -162,10 +158,10 @@ def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | 
     Raises:
         RecordingError: there is no such episode, or its first step was lost.
     """
-    span, n = recording.phase(phase).episode_span(episode), recording.environments
-    time = int(recording.phase(phase).steps.one(span.start)["log_time"])
+    steps = recording.phase(phase).episode(episode)
+    time = int(steps.table.one(steps.first)["log_time"])
     for reset in resets_back(recording, phase, time):
-        if reset.environment % n == span.start % n and reset.step <= span.start:
+        if reset.environment == steps.environment and reset.step <= steps.first:
             return reset
     return None
 
@@ -188,15 +184,15 @@ def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
 
 def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Piece]:
     """Yield the pieces of one phase; one ends where steps of the other phase come between its own."""
-    n, known = recording.environments, environment_count(recording)
+    table, known = recording.phase(phase).steps, environment_count(recording)
     resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
-    blocks = aligned(_blocks(recording, phase, start_time, stop_time), n)
+    blocks = aligned(_blocks(recording, phase, start_time, stop_time), recording.environments)
     rows = (block for block, _ in blocks if len(block))
     if "content_digest" not in recording.result:
         stop = recording.phase(phase).whole_steps()
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
-    nothing = np.empty(0, recording.phase(phase).steps.row_dtype)
+    nothing = np.empty(0, table.row_dtype)
     for block in rows:
         first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
         early = []
@@ -206,7 +202,8 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
         yield from _without_steps(phase, early, nothing)
         here = []
         while waiting is not None and waiting.step < first + len(block):
-            if waiting.step < first or (waiting.step - first) % n or waiting.environment >= known:
+            is_within = waiting.step > table.round_of(waiting.step).start  # a round
+            if waiting.step < first or is_within or waiting.environment >= known:
                 raise RecordingError(
                     f"{recording.path}: /{phase}/reset {waiting.number}: out of order, or of no environment."
                 )
@@ -216,28 +213,10 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     yield from _without_steps(phase, resets if waiting is None else [waiting, *resets], nothing)
 
 
-def _by_environment(pieces: Iterator[Piece]) -> Iterator[Piece]:
-    """Yield pieces of a recording with shards, cut where a reset is of another environment than the last."""
-    environment: int | None = None
-    for piece in pieces:
-        begin, own = 0, list[RecordedReset]()
-        for reset in piece.resets:
-            if reset.environment != environment:
-                end = reset.step - piece.first if len(piece.rows) else 0
-                if end > begin or own:
-                    yield part(piece, begin, end, own, environment)
-                begin, own, environment = end, [], reset.environment
-            own.append(reset)
-        if begin < len(piece.rows) or own:
-            yield part(piece, begin, len(piece.rows), own, environment)
-
-
-def part(
-    piece: Piece, begin: int, end: int, resets: Sequence[RecordedReset], environment: int | None
-) -> Piece:
+def part(piece: Piece, begin: int, end: int, resets: Sequence[RecordedReset]) -> Piece:
     """Return the rows from `begin` to `end` of a piece, with their resets."""
     first, time = piece.first + begin, piece.time + begin * STEP_NANOSECONDS
-    return Piece(piece.phase, first, piece.rows[begin:end], resets, time, environment)
+    return Piece(piece.phase, first, piece.rows[begin:end], resets, time)
 
 
 def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: NDArray[np.void]) -> Iterator[Piece]:
@@ -263,9 +242,9 @@ def _blocks(
 
 
 def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
-    """Return the number of the episode that a step of an environment belongs to; None if it never ended."""
+    """Return the number of the episode of a step in one of several environments; None if it never ended."""
     for block in recording.phase(phase).episodes.blocks():
-        own = (block["last_step"] >= step) & (block["last_step"] % recording.environments == environment)
+        own = (block["last_step"] >= step) & (block["environment"] == environment)
         if own.any():
             return int(block["episode"][np.argmax(own)])
     return None

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo
-from runner.recording import schema
 from runner.recording.gym_values import element_of, filler, leaves_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
+from runner.recording.turns import is_taken
 from runner.replay.comparison import Returned, Start
 from runner.replay.recorded import RecordedReset, calls
 from runner.replay.stepping import Fill, Stepper, batched, values_in
@@ -52,7 +52,7 @@ class VectorStepper(Stepper):
         self._last = self._buffer[0].copy()
 
     def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
-        t, explicit, automatic = returned.rows["t"][step * self.n :], [], []
+        are_steps, explicit, automatic = is_taken(returned.rows[step * self.n :][: self.n]), [], []
 
         def add(reset: RecordedReset) -> None:
             frame = self.draw() if self.draws and reset.environment == self._drawn else None
@@ -60,7 +60,7 @@ class VectorStepper(Stepper):
 
         for reset in resets:
             environment = reset.environment
-            if len(t) and t[environment] == schema.RESET_ONLY:
+            if len(are_steps) and not are_steps[environment]:
                 automatic.append(reset)  # the step does it
             elif self._autoreset == "SameStep" and self._over[environment]:
                 self._over[environment] = False  # the step before did it

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import islice
 from typing import Any, Final
 
 import numpy as np
@@ -47,8 +46,7 @@ def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[A
         for block in episode_blocks(recording, phase, episode):
             yield from block
         return
-    numbers = own.episode_span(episode)
-    yield from islice(own.transitions(), numbers.start, numbers.stop, numbers.step)
+    yield from own.transitions(episode)
 
 
 def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
@@ -61,13 +59,13 @@ def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[N
     if own.steps.are_actions:
         yield whole_steps(recording, phase, episode)
         return
-    numbers, count = own.episode_span(episode), 0
-    for steps in own.steps.numbered(numbers):
-        count += len(steps)
-        yield steps
-    if count != len(numbers):
+    steps, count = own.episode(episode), 0
+    for rows in steps.rows():
+        count += len(rows)
+        yield rows
+    if count != len(steps):
         raise RecordingError(
-            f"{recording.path}: {len(numbers) - count:,} of the {len(numbers):,} steps of "
+            f"{recording.path}: {len(steps) - count:,} of the {len(steps):,} steps of "
             f"{own.title} episode {episode} were lost."
         )
 
@@ -91,20 +89,21 @@ def recorded_frames(recording: Recording, phase: str, episode: int, start: int =
     Raises:
         RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
     """
-    span, n = recording.phase(phase).episode_span(episode), recording.environments
+    steps = recording.phase(phase).episode(episode)
     first = max(0, start - frames_every(recording))
     times = log_times_of(recording, phase, episode)
-    # The frames of a vector come after the step of its last environment.
-    later = (n - 1 - span.start % n) * schema.STEP_NANOSECONDS
+    # The frames of a vector come at the end of a round.
+    turns = steps.table.round_of(steps.first)
+    later = (turns[-1] - steps.first) * schema.STEP_NANOSECONDS
     reset = reset_of(recording, phase, episode) if first == 0 else None
-    begin = times[max(0, first - 1)] - n * schema.STEP_NANOSECONDS if reset is None else reset.time
+    begin = times[max(0, first - 1)] - len(turns) * schema.STEP_NANOSECONDS if reset is None else reset.time
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
         for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))
-        if frame_place(frame)[0] == span.start % n
+        if frame_place(frame)[0] == steps.place
     )
     shown, following = None, next(frames, None)
-    for t in range(first, len(span) + 1):
+    for t in range(first, len(steps) + 1):
         # After the reset there may be several, of which the last one shows the state; after a step one.
         time = times[t - 1] + later if t else times[0]
         while following is not None and following[0] < time:
@@ -136,11 +135,6 @@ def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
     frames = recording.config.get("frames")
     chosen = frames.get("environments") if isinstance(frames, Mapping) else None
     return chosen if isinstance(chosen, list) else range(recording.environments)
-
-
-def environment_of(recording: Recording, phase: str, episode: int) -> int:
-    """Return the environment of an episode, among those of a vector."""
-    return recording.phase(phase).episode_span(episode).start % recording.environments
 
 
 def last_step(recording: Recording) -> int:

@@ -26,10 +26,10 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
         CannotRedo: the environment cannot be made, or is another one.
         RecordingError: actions of the episode were lost, or it is too long for an array.
     """
-    span, topic = recording.phase(phase).episode_span(episode), recording.phase(phase).steps.topic
-    if len(span) * recording.layout.rows(topic).itemsize > MAX_EPISODE_BYTES:
+    steps = recording.phase(phase).episode(episode)
+    if len(steps) * recording.layout.rows(steps.table.topic).itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
-            f"{recording.path}: {phase} episode {episode} has {len(span):,} steps, too many to rerun for "
+            f"{recording.path}: {phase} episode {episode} has {len(steps):,} steps, too many to rerun for "
             f"an array; `dualtaxi rerecord {recording.run_id}` records them."
         )
     return _whole_steps(recording.path, recording.file.size, phase, episode)
@@ -40,9 +40,8 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
     from runner.replay.environment import rerun_in_child  # loads Gymnasium
 
     with open_recording(path) as recording:
-        span = recording.phase(phase).episode_span(episode)
-        own = list(recording.phase(phase).steps.numbered(span))
-        if not own or not np.array_equal(np.concatenate([part["step"] for part in own]), span):
+        recorded = recording.phase(phase).episode(episode)
+        if sum(map(len, recorded.rows())) != len(recorded):
             raise RecordingError(f"{path}: steps of {PHASE_NAMES[phase]} episode {episode:,} were lost.")
         parts, state = [np.empty(0, recording.layout.rows(recording.phase(phase).steps.topic))], 0
         for steps in rerun_in_child(path, phase, [episode]):

@@ -86,8 +86,8 @@ def _tables(recording: Recording) -> Iterator[tuple[str, Table]]:
 def _phase_tables(recording: Recording, phase: str) -> Iterator[tuple[str, Table]]:
     resets = _resets(recording, phase)
     yield "resets", resets
-    yield "steps", _steps(recording, phase, resets)
-    yield "episodes", _episodes(recording, phase, resets)
+    yield "steps", _steps(recording, phase)
+    yield "episodes", _episodes(recording, phase)
     if recording.eval.has_metrics:
         yield "metrics", _of_messages(recording.phase(phase).metrics.decoded())
         return
@@ -157,20 +157,22 @@ def _environment(recording: Recording) -> Table:
     )
 
 
-def _steps(recording: Recording, phase: str, resets: Table) -> Table:
+def _steps(recording: Recording, phase: str) -> Table:
     if recording.phase(phase).steps.are_actions:
         blocks = list(recording.phase(phase).steps.rows())
         columns = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0].dtype.names}
         columns = {name: values for name, values in columns.items() if name in ("step", *KEPT_COLUMNS)}
     else:
-        columns = _values(recording, recording.phase(phase).transitions())
+        steps = recording.phase(phase).steps
+        spaces = {"action": "action", "next_observation": "observation"}
+        columns = _values(recording, recording.phase(phase)._values(steps, steps.rows(), **spaces))
     if not columns:
         return {}
     if recording.has_states:
         columns["action"] = columns["action"].astype(np.int64)
-    only_reset = columns["t"] == schema.RESET_ONLY
-    columns |= {"taken": ~only_reset, "t": np.where(only_reset, -1, columns["t"].astype(np.int64))}
-    columns["environment"] = _environments(recording, columns["step"].astype(np.int64), resets)
+    taken = columns.setdefault("taken", np.full(len(columns["t"]), True))
+    columns["t"] = np.where(taken, columns["t"].astype(np.int64), -1)
+    columns.setdefault("environment", np.zeros(len(taken), np.int64))
     if recording.can_train_again:
         return _of_columns(_positioned(columns))
     columns.pop("explored", None)
@@ -186,20 +188,14 @@ def _resets(recording: Recording, phase: str) -> Table:
     return _of_columns(_positioned(_values(recording, recording.phase(phase).reset_values())))
 
 
-def _episodes(recording: Recording, phase: str, resets: Table) -> Table:
+def _episodes(recording: Recording, phase: str) -> Table:
     episodes = recording.phase(phase).episodes.array()
     if not len(episodes):
         return {}
     columns = {name: episodes[name] for name in episodes.dtype.names or () if _is_content(name)}
-    columns["environment"] = _environments(recording, columns["last_step"], resets)
+    columns.setdefault("environment", np.zeros(len(episodes), np.int64))
+    del columns["first_step"]
     return _of_columns(_positioned(columns))
-
-
-def _environments(recording: Recording, steps: NDArray[np.int64], resets: Table) -> NDArray[np.int64]:
-    """Return the environment of each step."""
-    if not recording.shards:
-        return steps % recording.environments
-    return resets["environment"][np.searchsorted(resets["step"], steps, "right") - 1]
 
 
 def _values(recording: Recording, rows: Iterable[Any]) -> dict[str, Column | list[Any]]:

@@ -44,6 +44,7 @@ from runner.recording.messages import decode
 from runner.recording.metadata import layout_of_run
 from runner.recording.records import MetadataRecord, ReadChunk
 from runner.recording.repair import DamagedFile
+from runner.recording.turns import taken
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
 from runner.util.files import open_regular
@@ -234,8 +235,7 @@ def values_of(chunk: ReadChunk, layout: Layout) -> list[bytes]:
     """Return what the steps of a chunk hold that no fold may change; none of a reset in place of a step."""
     dtype, message = layout.dtype(chunk.topic), layout.message(chunk.topic)
     if dtype is not None:
-        rows = rows_of(message, np.frombuffer(chunk.records, dtype))
-        rows = rows[rows["t"] != schema.RESET_ONLY]
+        rows = taken(rows_of(message, np.frombuffer(chunk.records, dtype)))
         names = [name for name in _VALUES if name in rows.dtype.names]
         return [b"".join(row[name].tobytes() for name in names) for row in rows]
     decoded = (decode(message, record[HEADER_BYTES:]) for record in chunk.messages)

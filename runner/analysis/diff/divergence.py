@@ -202,7 +202,7 @@ def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Bloc
     ends = recording.eval.episodes.array(first, first + trials)
     if not trials or len(ends) < trials:
         return None
-    start, stop = int(ends[0]["last_step"]) + 1 - int(ends[0]["length"]), int(ends[-1]["last_step"]) + 1
+    start, stop = int(ends[0]["first_step"]), int(ends[-1]["last_step"]) + 1
     lost = recording.lost.get(schema.EVAL_STEP.name, [])
     if stop > recording.eval.steps.count() or any(a < stop and b > start for a, b in lost):
         return None
@@ -277,7 +277,7 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
 def _compared(a: Recording, b: Recording, phase: str) -> tuple[str, ...]:
     """Return the fields in which steps are compared: those that both recordings have."""
     ours, theirs = (set(one.phase(phase).steps.row_dtype.names or ()) for one in (a, b))
-    fields = FIELDS if a.has_states else _VALUE_FIELDS
+    fields = ("taken", *(FIELDS if a.has_states else _VALUE_FIELDS))
     return tuple(name for name in fields if name in ours & theirs)
 
 

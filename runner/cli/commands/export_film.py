@@ -110,7 +110,7 @@ def command(
                 opened.append(Pictures(recording, one.phase, one.number_in(recording), trust))
                 yield film.Shot(f"{run.title}: {one.title}", opened[-1])
 
-        lengths = [len(recording.phase(one.phase).episode_span(one.number_in(recording))) for one in shown]
+        lengths = [len(recording.phase(one.phase).episode(one.number_in(recording))) for one in shown]
         longest = (
             max(lengths) if whole or not grid else min(max(lengths), int(GRID_LENGTHS * median(lengths)))
         )

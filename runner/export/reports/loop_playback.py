@@ -35,7 +35,7 @@ from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
 from runner.replay.recorded import reset_of
 from runner.replay.whole_steps import whole_steps
-from runner.util.arrays import Array, Records
+from runner.util.arrays import Array, Ints, Records
 
 MAX_SERIES: Final = 32
 _LEAST_SERIES: Final = 20
@@ -77,42 +77,43 @@ class _ShownPart:
 def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     phase, number = recording.phase(at.phase), at.number_in(recording)
-    span = phase.episode_span(number)
-    if not 0 <= first < len(span):
-        raise at.no_step(recording, len(span), max(first, at.t))
-    part = span[first : first + limit]
+    length, environment = len(phase.episode(number)), phase.episode(number).environment
+    if not 0 <= first < length:
+        raise at.no_step(recording, length, max(first, at.t))
     parts, notes = _shown_parts(recording)
     in_words = step_actions_in_words(recording, at.phase)
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     before = np.zeros(len(recording.agents))
     rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
+    numbers = [np.empty(0, np.int64)]
     actions: list[dict[str, str]] = []
     observations = [_observations_before(recording, at.phase, number, first, parts)]
-    for steps in _steps(recording, at.phase, number, range(span.start, part[-1] + 1, span.step)):
+    for steps in _steps(recording, at.phase, number, 0, first + limit):
         paid = steps["rewards"].astype(np.float64)
-        earlier = int(np.searchsorted(steps["step"], part.start))
+        earlier = int(np.searchsorted(steps["t"], first))
         before += paid[:earlier].sum(axis=0)
         if earlier < len(steps):
             shown = steps[earlier:]
             rewards.append(paid[earlier:])
             log_times.append(shown["log_time"].astype(np.int64))
+            numbers.append(shown["step"])
             actions += map(in_words, shown)
             observations.append(_observations(recording, shown, parts))
     reward, time = np.concatenate(rewards), np.concatenate(log_times)
-    if len(reward) != len(part):
+    if len(reward) != min(limit, length - first):
         raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
     frames = frame_times(time // schema.STEP_NANOSECONDS)
     ended = ending_of(recording, at.phase, number)
     total = None
     if ended != "cut off":
         total = float(phase.episodes.array(number, number + 1)["returns"].sum())
-    elif first + limit >= len(span):
+    elif first + limit >= length:
         total = float(before.sum() + reward.sum())
     texts, series = _frames(parts, observations)
     return Playback(
-        title=at.heading + ("" if span.step == 1 else f", in environment {span.start % span.step}"),
-        description=outcome_in_words(len(span), ended, total),
-        length=len(span),
+        title=at.heading + (f", in environment {environment}" if recording.environments > 1 else ""),
+        description=outcome_in_words(length, ended, total),
+        length=length,
         first=first,
         end=ENDINGS[ended],
         agents=[spoken(agent) for agent in recording.agents],
@@ -124,20 +125,18 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
         ],
         texts=texts,
         time=frames,
-        series=[*series, *_extras(recording, at.phase, part, notes)],
+        series=[*series, *_extras(recording, at.phase, np.concatenate(numbers), notes)],
         notes=notes,
         logged=logged_near(recording, at.phase, frames),
     )
 
 
-def _steps(recording: Recording, phase: str, episode: int, numbers: range) -> Iterator[Records]:
-    """Yield the steps of an episode with these numbers, some at a time."""
-    recorded = recording.phase(phase).steps
-    if not recorded.are_actions:
-        yield from recorded.numbered(numbers)
+def _steps(recording: Recording, phase: str, episode: int, first: int, stop: int) -> Iterator[Records]:
+    """Yield the steps of an episode from t = `first` to before `stop`, some at a time."""
+    if not recording.phase(phase).steps.are_actions:
+        yield from recording.phase(phase).episode(episode).rows(first, stop)
         return
-    steps = whole_steps(recording, phase, episode)
-    yield steps[(steps["step"] >= numbers.start) & (steps["step"] < numbers.stop)]
+    yield whole_steps(recording, phase, episode)[first:stop]
 
 
 def _observations_before(
@@ -145,8 +144,7 @@ def _observations_before(
 ) -> list[Column]:
     """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
     if first:
-        span = recording.phase(phase).episode_span(episode)
-        steps = next(_steps(recording, phase, episode, span[first - 1 : first]), None)
+        steps = next(_steps(recording, phase, episode, first - 1, first), None)
         return [] if steps is None else _observations(recording, steps, parts)
     reset = reset_of(recording, phase, episode)
     if reset is None:
@@ -163,16 +161,16 @@ def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPa
     return [part.column(after) for part in parts]
 
 
-def _extras(recording: Recording, phase: str, part: range, notes: list[str]) -> list[Series]:
+def _extras(recording: Recording, phase: str, steps: Ints, notes: list[str]) -> list[Series]:
     """Return the values that the loop recorded with these steps, each at the frame before its step."""
     series = []
     agents = recording.agents if len(recording.agents) > 1 else ()
     extras = recording.phase(phase).extras
-    by_name = extras.at(np.arange(part.start, part.stop, part.step)) if extras else {}
+    by_name = extras.at(steps) if extras else {}
     for name, values in by_name.items():
         agent = next((one for one in agents if name.startswith(f"{one}/")), "")
         shape = values.shape[1:]
-        columns = values.reshape(len(part), -1)
+        columns = values.reshape(len(steps), -1)
         if columns.shape[1] > MAX_SERIES:
             notes.append(f"{name}: {_sizes(shape)} numbers with each step")
             continue

@@ -46,12 +46,12 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
             evaluations, where = evaluations_with_steps(recording, train, evals), str(recording.path)
             number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
             added = {"evaluations": (*request.evaluations, step.after), "trials": (number,)}
-        steps = recording.phase(step.phase).episode_span(number)
+        steps = recording.phase(step.phase).episode(number)
         if step.t >= len(steps):
             raise NotInRecording(
                 f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
             )
-        time = time_of(recording, step.phase, steps[step.t])
+        time = int(steps.one(step.t)["log_time"]) // schema.STEP_NANOSECONDS
     if not request.everything:
         request = dataclasses.replace(request, with_default=request.is_default, **added)
     return Location(time, request)
@@ -77,7 +77,8 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[EpisodeRef | None, str]:
         words = f"They diverge {where_in_words(both[0])}."
         if a.environments == 1:
             return both[0].reference, words
-        number = ended_episode(a, both[0].phase, both[0].step % a.environments, both[0].step)
+        row = a.phase(both[0].phase).steps.one(both[0].step)
+        number = ended_episode(a, both[0].phase, int(row["environment"]), both[0].step)
     return None if number is None or both[0].after is not None else EpisodeRef(number, both[0].t), words
 
 

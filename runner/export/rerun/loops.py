@@ -44,7 +44,8 @@ from runner.recording import schema
 from runner.recording.messages import frame_place, media_type
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
-from runner.replay.steps import check_steps, environment_of, frames_every, log_times_of
+from runner.recording.turns import taken
+from runner.replay.steps import check_steps, frames_every, log_times_of
 from runner.util.arrays import Array, MaskedArray, Records
 from runner.util.extras import require
 
@@ -87,6 +88,8 @@ class LoopReader:
         self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._is_game, n = len(recording.agents) > 1, recording.environments
         self._environments = [f"env_{i}" if n > 1 else "" for i in range(n)]
+        self._alone = n == 1
+        """Whether environments take no turns, or follow one another."""
         if self._is_game:
             agents = enumerate(recording.agents)
             self._members = [Member(i, entity_name(a), i, _parts(recording, a), a) for i, a in agents]
@@ -164,8 +167,7 @@ class LoopReader:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
         for block in self._recording.phase(phase).episodes.blocks():
             for member in self._members:
-                is_own = block["last_step"] % len(self._environments) == member.number
-                own = block if self._is_game else block[is_own]
+                own = block if self._alone else block[block["environment"] == member.number]
                 if len(own):
                     times = self._times(own)
                     yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
@@ -178,9 +180,11 @@ class LoopReader:
         recording = self._recording
         extras = recording.phase(phase).extras.at(steps["step"])
         for member in self._members:
-            is_own = steps["step"] % len(self._environments) == member.number
+            is_own = np.full(len(steps), True)
             if self._is_game:
                 is_own = (steps["acted"] >> member.number & 1).astype(np.bool_)
+            elif not self._alone:
+                is_own = steps["environment"] == member.number
             if not is_own.any():
                 continue
             own = steps[is_own]
@@ -271,7 +275,7 @@ class LoopReader:
             for number, t, pixels in redrawn(recording, phase, chosen, self._trust) if chosen else ():
                 if t == 0:
                     times = [_step(time) for time in log_times_of(recording, phase, number)]
-                    environment = environment_of(recording, phase, number)
+                    environment = recording.phase(phase).episode(number).place
                     self._stage(f"drawing {phase} episode {chosen.index(number) + 1:,} of {len(chosen):,}")
                 step = times[t - 1] if t else times[0] - 1
                 if self._is_later(phase, environment, step):
@@ -312,14 +316,13 @@ class LoopReader:
         recording, table = self._recording, self._recording.phase(phase).steps
         if table.dtype is None:
             for span in spans:
-                yield from table.numbered(span)
+                yield from map(taken, table.numbered(span))
             return
         limit = max(1, min(MAX_ROWS * len(self._environments), _BATCH_BYTES // table.dtype.itemsize))
         for span in spans:
             for start in range(span.start, span.stop, limit):
                 blocks = table.blocks(start, min(start + limit, span.stop))
-                steps = np.concatenate([np.empty(0, table.row_dtype), *blocks])
-                steps = steps[steps["t"] != schema.RESET_ONLY]
+                steps = taken(np.concatenate([np.empty(0, table.row_dtype), *blocks]))
                 if len(steps):
                     if self._scene:
                         check_steps(steps, recording.mdp, str(recording.path), "recorded")

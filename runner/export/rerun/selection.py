@@ -169,13 +169,14 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
     """Return the episodes of a phase that have steps."""
     own, n = recording.phase(phase), recording.environments
     total, records = own.steps.count() if own.steps else 0, own.episodes.array()
-    last, length = (records[name].astype(np.int64) for name in ("last_step", "length"))
-    if n > 1:
-        return Episodes((last - (length - 1) * n) // n * n, (last // n + 1) * n, len(records))
+    begin, last = (records[name].astype(np.int64) for name in ("first_step", "last_step"))
+    if n > 1:  # from the beginning of a round to the end of one
+        place = records["environment"].astype(np.int64)
+        return Episodes(begin - place, last - place + n, len(records))
     first = np.full(own.episodes.count() + 1, -1, np.int64)
     first[0], number = 0, records["episode"].astype(np.int64)
     is_counted = number < len(first) - 1
-    first[number[is_counted]] = (last + 1 - length)[is_counted]
+    first[number[is_counted]] = begin[is_counted]
     first[number[is_counted] + 1] = (last + 1)[is_counted]
     # Steps of episodes that were lost in a repair count as those of the first episode after them.
     first = np.maximum.accumulate(first)
@@ -315,7 +316,7 @@ def _select_drawn(
         for environment in range(shown) if request.is_default else ():
             own = np.arange(len(lengths))
             if n > 1:
-                own = np.flatnonzero(recording.phase(phase).episodes.array()["last_step"] % n == environment)
+                own = np.flatnonzero(recording.phase(phase).episodes.array()["environment"] == environment)
             numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)

@@ -112,6 +112,6 @@ class _PicturedEpisode(NamedTuple):
 def _pictured_episode(run: Run, at: EpisodeRef) -> _PicturedEpisode:
     with open_recording(run.recording) as recording:
         number = at.number_in(recording)
-        length = len(recording.phase(at.phase).episode_span(number))
+        length = len(recording.phase(at.phase).episode(number))
     make = partial(encoded_pictures, run.recording, at.phase, number)
     return _PicturedEpisode((recording_state(run), at.phase, number), make, length)

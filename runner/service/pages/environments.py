@@ -10,6 +10,7 @@ from fastapi import APIRouter, Depends, Request, Response
 
 from runner.analysis.episodes import EpisodeRef
 from runner.recording.reader import Recording, open_recording
+from runner.recording.steps import EpisodeSteps
 from runner.runs.run import Run
 from runner.service.dependencies import EPISODES, RecordedRun
 from runner.service.pages.frame import run_page
@@ -43,12 +44,13 @@ def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
         shown = at.number_in(recording)
-        span = recording.phase(at.phase).episode_span(shown)
+        steps = recording.phase(at.phase).episode(shown)
+        turns = steps.table.round_of(steps.first)
         # Trials are numbered within their evaluation, whose first one this is.
         first = shown - at.episode
         panels = []
-        for environment, number in _episodes_at(recording, at.phase, shown, span)[:MAX_PANELS]:
-            own = recording.phase(at.phase).episode_span(number)
+        for environment, number in _episodes_at(recording, at.phase, steps, shown)[:MAX_PANELS]:
+            begun = steps.table.round_of(recording.phase(at.phase).episode(number).first)
             path = replace(at, episode=number - first, t=0).episode_path
             name = "trial" if at.after is not None else "episode"
             panel = panel_of(
@@ -56,7 +58,7 @@ def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
                 at.phase,
                 f"/api/v1{base}/{path}",
                 f"Environment {environment}: {name} {number - first:,}",
-                offset=own.start // own.step - span.start // span.step,
+                offset=(begun.start - turns.start) // len(turns),
                 address=f"{base}/{path}",
             )
             panels.append(panel)
@@ -64,21 +66,23 @@ def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
             "title": at.heading,
             "alone": f"{base}/{at.episode_path}",  # the replay of the episode alone
             "shown": panels,
-            "length": len(span),
-            "t": min(at.t, len(span)),
+            "length": len(steps),
+            "t": min(at.t, len(steps)),
             "left_out": max(0, recording.environments - len(panels)),
         }
 
 
-def _episodes_at(recording: Recording, phase: str, episode: int, span: range) -> list[tuple[int, int]]:
+def _episodes_at(
+    recording: Recording, phase: str, steps: EpisodeSteps, episode: int
+) -> list[tuple[int, int]]:
     """Return each environment and the number of its episode at the first step of another one, if it ended."""
-    episodes, n = recording.phase(phase).episodes, span.step
-    begin = span.start // n * n
-    by_environment = {span.start % n: episode}
+    episodes, begin = recording.phase(phase).episodes, steps.table.round_of(steps.first).start
+    by_environment = {steps.environment: episode}
+    names = ("environment", "episode", "last_step")
     for block in episodes.blocks(episodes.first_from("last_step", begin)):
-        for last, number in zip(block["last_step"].tolist(), block["episode"].tolist(), strict=True):
+        for environment, number, last in zip(*(block[name].tolist() for name in names), strict=True):
             if last >= begin:
-                by_environment.setdefault(last % n, number)
-        if len(by_environment) == n:
+                by_environment.setdefault(environment, number)
+        if len(by_environment) == recording.environments:
             break
     return sorted(by_environment.items())

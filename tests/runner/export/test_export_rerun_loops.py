@@ -26,6 +26,7 @@ from runner.export.rerun.writing import export, export_runs
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
 from runner.recording.reader import open_recording
+from runner.recording.turns import taken
 from tests.runner.export.making import made_otherwise
 from tests.runner.export.rerun_views import shown_ranges
 from tests.runner.loops.making import Leaving, Rooms, parallel, play, record_counting
@@ -91,8 +92,7 @@ class Exported:
 
 
 def steps_of(recording, phase="train"):
-    steps = recording.phase(phase).steps.array()
-    return steps[steps["t"] != schema.RESET_ONLY]
+    return taken(recording.phase(phase).steps.array())
 
 
 @pytest.mark.parametrize(
@@ -147,9 +147,9 @@ def test_every_agent_of_a_game_is_sent_where_it_acted(tmp_path):
 def test_episodes_of_a_vector_are_selected_and_located(tmp_path):
     run = record_poles(tmp_path)
     with open_recording(run.recording) as recording:
-        span = recording.train.episode_span(4)
+        span = recording.train.episode(4).numbers()
         (chosen,) = select(recording, Request(episodes=((4, 5),))).train
-        assert chosen.start <= span.start < span[-1] < chosen.stop
+        assert chosen.start <= span[0] < span[-1] < chosen.stop
         assert chosen.start % N == chosen.stop % N == 0
         assert chosen.stop - chosen.start < len(span) * N + N
         time = steps_of(recording)["log_time"][steps_of(recording)["step"] == span[2]]
@@ -187,15 +187,15 @@ def test_pictures_of_selected_episodes_of_a_vector_are_drawn(tmp_path):
         assert any("pictures of 3 of" in text for text in exported.selection.exported)
         steps = steps_of(recording)
         for number in (2, 3, 4):
-            span = recording.train.episode_span(number)
-            own = steps[np.isin(steps["step"], list(span))]["log_time"] // schema.STEP_NANOSECONDS
-            shown = dict(picture_rows(exported, f"/train/env_{span.start % N}/frame"))
+            episode = recording.train.episode(number)
+            own = steps[np.isin(steps["step"], episode.numbers())]["log_time"] // schema.STEP_NANOSECONDS
+            shown = dict(picture_rows(exported, f"/train/env_{episode.environment}/frame"))
             with contextlib.closing(Pictures(recording, "train", number)) as expected:
                 assert expected.source is PictureSource.REDRAWN
                 first, *others = [encoded_picture(picture.pixels) for picture in expected]
             assert shown[own[0] - 1] == first
             assert [shown[time] for time in own] == others
-            cleared = exported.rows(f"/train/env_{span.start % N}/frame", "Clear:is_recursive")
+            cleared = exported.rows(f"/train/env_{episode.environment}/frame", "Clear:is_recursive")
             assert own[-1] + N in [step for step, flag in cleared if flag]
 
 
@@ -210,7 +210,7 @@ def test_views_of_steps_show_the_time_of_the_chosen_episodes(tmp_path, is_vector
     with open_recording(run.recording) as recording:
         Exported(recording, tmp_path / "chosen.rrd", episodes=((2, 3),), with_default=True)
         Exported(recording, tmp_path / "whole.rrd")
-        span = recording.train.episode_span(2)
+        span = recording.train.episode(2).numbers()
         steps = steps_of(recording)
     times = steps["log_time"] // schema.STEP_NANOSECONDS
     first, last = (int(times[steps["step"] == step][0]) for step in (span[0], span[-1]))
@@ -222,7 +222,7 @@ def test_views_of_steps_show_the_time_of_the_chosen_episodes(tmp_path, is_vector
 def test_each_environment_of_a_vector_has_pictures_by_default(tmp_path):
     with open_recording(record_poles(tmp_path, steps=60).recording) as recording:
         drawn = select(recording, Request(frames=True)).drawn["train"]
-        assert {recording.train.episode_span(number).start % N for number in drawn} == set(range(N))
+        assert {recording.train.episode(number).environment for number in drawn} == set(range(N))
         assert not select(recording, Request()).drawn
 
 
@@ -287,7 +287,7 @@ def test_evaluations_of_a_loop_are_selected_by_number(tmp_path, monkeypatch):
             with env.phase(phase):
                 play_episode(env)
     with open_recording(env.run.recording) as recording:
-        spans = [recording.eval.episode_span(number) for number in range(3)]
+        spans = [recording.eval.episode(number).numbers() for number in range(3)]
         chosen = select(recording, Request(evaluations=(1,)))
         assert set(spans[1]) <= {step for _, steps in chosen.evaluations for step in steps}
         assert not set(spans[0]) & {step for _, steps in chosen.evaluations for step in steps}

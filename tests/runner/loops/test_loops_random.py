@@ -178,7 +178,7 @@ def test_a_loop_over_a_vector_is_recorded_as_it_was_seen(seed, mode, length):
                 rewards += reward.tolist()
                 ends += over.tolist()
         with open_recording(rec.run.recording) as recording:
-            rows = list(recording.train.transitions())
+            rows = [row for block in recording.train.steps.rows() for row in block]
             assert [row["action"].tolist() for row in rows] == actions
             assert [row["next_observation"].tolist() for row in rows] == after
             assert [row["rewards"][0] for row in rows] == rewards

@@ -5,7 +5,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from runner.recording.episode_log import EpisodeLog, Steps
-from runner.recording.schema import RESET_ONLY
 
 AGENTS = 2
 
@@ -40,28 +39,30 @@ def test_blocks_of_steps_have_the_episodes_of_single_steps(phase):
     def end(i, row, by_reset):
         flags = (False, False) if by_reset else (terminated[row, i], truncated[row, i])
         last = row - by_reset
-        ended.append(((last, by_reset, i), last * n + i, length[i], *returns[i], *flags))
+        first = last * n + i - (length[i] - 1) * n
+        ended.append(((last, by_reset, i), i, first, last * n + i, length[i], *returns[i], *flags))
         episode[i], length[i], returns[i] = episode[i] + 1, 0, np.zeros(AGENTS)
 
     for row in range(rows):
         for i in range(n):
             if reset[row, i] and length[i]:
                 end(i, row, by_reset=True)
-            places.append((RESET_ONLY if only_reset[row, i] else length[i], episode[i]))
+            places.append((0 if only_reset[row, i] else length[i], episode[i]))
             if not only_reset[row, i]:
                 length[i] += 1
                 returns[i] = returns[i] + rewards[row, i]
             if terminated[row, i] or truncated[row, i] or over[row, i]:
                 end(i, row, by_reset=False)
 
-    log, found_places, found_ended = EpisodeLog(n, AGENTS, None), [], []
+    log, found_places, found_ended = EpisodeLog(n, AGENTS, None, has_turns=True), [], []
     for begin, stop in zip([0, *cuts], cuts, strict=False):
         columns = (each[begin:stop] for each in (rewards, terminated, truncated, reset, only_reset, over))
         block = log.take(Steps(begin * n, *columns))
         found_places += zip(block.t.ravel(), block.number.ravel(), strict=True)
-        fields = [block.ended[name] for name in ("last_step", "length", "returns", "terminated", "truncated")]
+        names = ("environment", "first_step", "last_step", "length", "returns", "terminated", "truncated")
+        fields = [block.ended[name] for name in names]
         found_ended += [
-            (last, size, *sums, ends, cut) for last, size, sums, ends, cut in zip(*fields, strict=True)
+            (*place, size, *sums, ends, cut) for *place, size, sums, ends, cut in zip(*fields, strict=True)
         ]
     assert found_places == places
     assert found_ended == [tuple(fields) for _, *fields in sorted(ended, key=lambda one: one[0])]

@@ -46,7 +46,9 @@ MESSAGES = tables("| no. | field | type | meaning |")
 def message_of(title: str) -> schema.MessageType:
     """Return the message that a section is about."""
     if title.endswith("over values"):
-        return layout_of("game", 2, 0, SPACES).message(schema.TRAIN_STEP)
+        return layout_of("game", 2, 0, SPACES, has_turns=True).message(schema.TRAIN_STEP)
+    if title == "dualtaxi.Episode":
+        return layout_of("game", 2, 0, SPACES, has_turns=True).message(schema.TRAIN_EPISODE)
     name = title.removeprefix("dualtaxi.")
     return next(topic.message for topic in schema.ALL_TOPICS if topic.message.name == name)
 

@@ -26,9 +26,9 @@ SHORT = (
     "snapshots.every=20",
 )
 GOLDEN = {
-    "quick": "173332b641308c759f84f827eadcd5436723d3040d3150664d18d9ffff7f14f8",
-    "tutorial_cooperative": "883f96a7481559fdc831c8bae091d6f2a586667e2e3ab51daedb2a399d79fcbc",
-    "tutorial_competitive": "4c32436f6b150a7e9625619125d2354f35185bfc625142646a00ca6e97d8e6de",
+    "quick": "312018be0c83505c4f198df8de3abbf9862b1e4b70eab6c67de11191e47ea1d2",
+    "tutorial_cooperative": "84351b27ae9b50a6f8a977491f74932ee442d5afcd7fa13475166f5a1f504f2f",
+    "tutorial_competitive": "a534ec5203d1c198e894b841db3f21a3831f5b41a06fd8ea688032fd6eccc2f0",
 }
 """Content digest by configuration, of seed 0; the tutorial's are shortened by SHORT."""
 

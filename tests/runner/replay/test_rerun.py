@@ -67,7 +67,7 @@ def test_an_environment_comes_out_again(name, seeding, tmp_path):
     assert rerun_steps(path, trust=own is not None) == (steps, None)
     with open_recording(path) as recording:
         last = recording.train.episodes.count() - 1
-        length = len(recording.train.episode_span(max(last, 0)))
+        length = len(recording.train.episode(max(last, 0)))
     for episode in {max(last, 0), 0}:
         found = rerun_steps(path, "train", [episode], trust=own is not None)
         assert found[1] is None
@@ -123,11 +123,10 @@ def check_vector(envs, seeding, folder):
                     recorded.reset(options={"reset_mask": over})
     path = recorded.run.recording
     with open_recording(path) as recording:
-        steps = [block["t"] for block in recording.train.steps.blocks()]
-        resets_alone = int(np.count_nonzero(np.concatenate(steps) == 2**32 - 1))
+        resets_alone = recording.train.steps.count() - sum(map(len, recording.train.steps.taken()))
         ended = recording.train.episodes.count()
         numbers = sorted({0, 5 % ended, min(12, ended - 1)})
-        spans = [recording.train.episode_span(k) for k in numbers]
+        spans = [recording.train.episode(k) for k in numbers]
     assert rerun_steps(path) == (250 * recorded.num_envs - resets_alone, None)
     for number, span in zip(numbers, spans, strict=True):
         assert rerun_steps(path, "train", [number]) == (len(span), None)
@@ -262,9 +261,9 @@ def test_a_vector_that_cannot_be_taken_apart_draws_its_episodes(kind, tmp_path):
         [envs.step(action), envs.render()[1].copy()][1] for action in actions
     ]
     with open_recording(recorded.run.recording) as recording:
-        own = (k for k in range(12) if recording.train.episode_span(k).start % 3 == 1)
+        own = (k for k in range(12) if recording.train.episode(k).environment == 1)
         first, second = next(own), next(own)
-        spans = [recording.train.episode_span(k) for k in (first, second)]
+        spans = [recording.train.episode(k) for k in (first, second)]
     for number, span in ((first, spans[0]), (second, spans[1])):
         blocks = list(rerun_in_child(recorded.run.recording, "train", [number], render=True))
         assert all(block.difference is None for block in blocks)
@@ -272,7 +271,7 @@ def test_a_vector_that_cannot_be_taken_apart_draws_its_episodes(kind, tmp_path):
         frames += [frame for block in blocks for frame in block.frames]
         assert len(frames) == len(span) + 1
         for k, frame in enumerate(frames):
-            assert (frame == shown[span.start // 3 + k]).all(), k
+            assert (frame == shown[span.first // 3 + k]).all(), k
 
 
 def test_large_pictures_come_one_by_one(tmp_path):

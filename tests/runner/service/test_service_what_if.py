@@ -89,7 +89,7 @@ def test_the_replay_leads_to_every_action_and_each_to_its_episode(page):
 
 def test_the_last_frame_of_a_replay_asks_for_the_last_step(page, recorded):
     with open_recording(find_run("first", recorded).recording) as recording:
-        length = len(recording.train.episode_span(0))
+        length = len(recording.train.episode(0))
     browser = page(f"/runs/first/replay/train/0?t={length}")
     link = browser.find_element(By.PARTIAL_LINK_TEXT, "What if")
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".choice p"))

@@ -1,0 +1,48 @@
+"""Rows of steps as turns of environments.
+
+A vector steps its environments in rounds, each in its turn. At some turns it only resets an environment: the
+row is no step then, and its `taken` is false. A recording of a single environment has no such columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runner.util.arrays import Ints
+
+
+def is_taken(rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Return which rows are steps, and not only resets."""
+    if "taken" not in (rows.dtype.names or ()):
+        return np.ones(rows.shape, np.bool_)
+    return np.asarray(rows["taken"].view(np.uint8) > 0)  # a damaged file may hold any byte
+
+
+def taken(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """Return the rows that are steps."""
+    are_steps = is_taken(rows)
+    return rows if are_steps.all() else rows[are_steps]
+
+
+def is_of_environment(rows: NDArray[np.void], environment: int) -> NDArray[np.bool_]:
+    """Return which rows are steps that an environment took: all where only one was recorded."""
+    if "environment" not in (rows.dtype.names or ()):
+        return is_taken(rows)
+    return np.asarray(is_taken(rows) & (rows["environment"] == environment))
+
+
+def turns_of(rows: NDArray[np.void]) -> Iterator[tuple[int, Ints]]:
+    """Yield each environment that took steps, and the places of these among the rows."""
+    places = np.flatnonzero(is_taken(rows))
+    if "environment" not in (rows.dtype.names or ()):
+        yield 0, places
+        return
+    environment = rows["environment"][places]
+    order = np.argsort(environment, kind="stable")
+    edges = np.flatnonzero(np.diff(environment[order])) + 1
+    for own in np.split(places[order], edges):
+        if len(own):
+            yield int(rows["environment"][own[0]]), own
