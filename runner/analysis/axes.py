@@ -22,8 +22,7 @@ from runner.recording.run_file import has_environment
 from runner.recording.schema import STEP_NANOSECONDS
 
 Values = NDArray[np.float64]
-Place = TypeVar("Place", int, float)
-"""A position on an axis."""
+Position = TypeVar("Position", int, float)
 
 UPDATE_NAMES: Final = ("updates", "n_updates")
 """Names, or last parts of names such as `train/n_updates`, under which a loop logs its number of updates."""
@@ -89,15 +88,15 @@ class Positions:
         """Return the positions of moments by the training episodes and training steps before them."""
         if self.axis is EPISODES:
             return np.asarray(episodes, np.float64)
-        own = np.asarray(steps, np.float64)
-        if self.axis.name == STEPS.name:
-            return own
+        taken = np.asarray(steps, np.float64)
+        if self.axis.name == STEPS.name:  # also of LOGGED_STEPS
+            return taken
         if self.axis is TIME:
-            return np.interp(own, self.steps, self.values)
+            return np.interp(taken, self.steps, self.values)
         # a logged value holds until the next one
-        return np.concatenate([[0.0], self.values])[np.searchsorted(self.steps, own, side="right")]
+        return np.concatenate([[0.0], self.values])[np.searchsorted(self.steps, taken, side="right")]
 
-    def one(self, episodes: int, steps: int) -> float:
+    def of_moment(self, episodes: int, steps: int) -> float:
         """Return the position of one moment, an integer where the axis has whole numbers."""
         if self.axis is EPISODES:
             return episodes
@@ -134,22 +133,27 @@ def axes_of(recording: Recording) -> list[Axis]:
     axes: dict[Axis, None] = {}
     for axis in AXES.values():
         with contextlib.suppress(RecordingError):
-            own = positions(recording, axis).axis
-            axes[own if own is LOGGED_STEPS else axis] = None
+            is_logged = positions(recording, axis).axis is LOGGED_STEPS
+            axes[LOGGED_STEPS if is_logged else axis] = None
     return list(axes)
 
 
 def edges_of(axis: Axis, last: float, parts: int) -> Values:
     """Return the edges of at most `parts` stretches of 1, 2, 5, 10, ... that reach from 0 to `last`.
 
-    Those of runs of about the same length agree. Only an axis without whole numbers has shorter stretches.
-    `last` is finite and not negative.
+    Runs of about the same length have the same edges. Only an axis without whole numbers has stretches
+    shorter than 1. `last` is finite and not negative.
     """
     width = max(last / parts, 1.0 if axis.whole else 0.0) or 1.0
     power = math.floor(math.log10(width))
     scale = next(factor for factor in (1, 2, 5, 10, 20) if factor * 10.0**power >= width * (1 - 1e-12))
     width = scale * 10.0**power
     return np.arange(max(math.ceil(last / width * (1 - 1e-12)), 1) + 1, dtype=np.float64) * width
+
+
+def stretches_at(edges: Values, at: Values) -> NDArray[np.intp]:
+    """Return the number of the stretch that has each position; a position at an edge ends a stretch."""
+    return (np.searchsorted(edges, at) - 1).clip(0, len(edges) - 2)
 
 
 def _times(recording: Recording) -> tuple[Values, Values]:
@@ -189,30 +193,27 @@ def _logged(recording: Recording, axis: Axis) -> tuple[Values, Values]:
     """
     steps: list[int] = []
     values: list[float] = []
-    name, every, count = "", 1, 0
-    logged = (
-        (series[number][0], step, value)
-        for series, rows in recording.scalars()
-        for counting in ([phase == "train" and axis.counts(own) for own, phase in series],)
-        if any(counting)
-        for number, _, step, _, value in rows[np.array(counting)[rows["series"]]].tolist()
-    )
-    for own, step, value in logged:
-        if own != (name := name or own):
-            continue
-        is_later = step >= (steps[-1] if steps else 0) and value >= (values[-1] if values else 0)
-        if not (is_later and math.isfinite(value)):
-            raise RecordingError(
-                f"{recording.path}: found {value:g} logged as {name!r} at training step "
-                f"{step:,}, expected numbers that do not decrease: it has no axis of "
-                f"{axis.title}."
-            )
-        count += 1
-        if count % every == 0:
-            steps.append(step)
-            values.append(value)
-        if len(steps) > _MAX_KNOWN:
-            steps, values, every = steps[1::2], values[1::2], 2 * every
+    first, every, count = "", 1, 0
+    for series, rows in recording.scalars():
+        is_position = np.array([phase == "train" and axis.counts(name) for name, phase in series])
+        for number, _, step, _, value in rows[is_position[rows["series"]]].tolist():
+            name = series[number][0]
+            first = first or name
+            if name != first:  # another name that counts updates
+                continue
+            is_later = step >= (steps[-1] if steps else 0) and value >= (values[-1] if values else 0)
+            if not (is_later and math.isfinite(value)):
+                raise RecordingError(
+                    f"{recording.path}: found {value:g} logged as {name!r} at training step "
+                    f"{step:,}, expected numbers that do not decrease: it has no axis of "
+                    f"{axis.title}."
+                )
+            count += 1
+            if count % every == 0:
+                steps.append(step)
+                values.append(value)
+            if len(steps) > _MAX_KNOWN:
+                steps, values, every = steps[1::2], values[1::2], 2 * every
     if not steps and axis is UPDATES:
         raise RecordingError(
             f"{recording.path}: has no axis of updates: nothing was logged as {' or '.join(UPDATE_NAMES)}; "
@@ -226,17 +227,15 @@ def _logged(recording: Recording, axis: Axis) -> tuple[Values, Values]:
     return np.array(steps, np.float64), np.array(values, np.float64)
 
 
-def first_crossing(points: Mapping[Place, float], level: float) -> Place | None:
+def first_crossing(points: Mapping[Position, float], level: float) -> Position | None:
     """Return the first position at which a curve is at a level, or on the other side than where it began."""
-    below = points[min(points)] < level
-    for place in sorted(points):
-        if points[place] >= level if below else points[place] <= level:
-            return place
-    return None
+    begins_below = points[min(points)] < level
+    reached = (at for at in sorted(points) if (points[at] >= level if begins_below else points[at] <= level))
+    return next(reached, None)
 
 
-def mean_height(places: Sequence[float], values: Sequence[float]) -> float:
+def mean_height(at: Sequence[float], values: Sequence[float]) -> float:
     """Return the area under a curve, by the trapezoid rule, over its span; nan for fewer than two points."""
-    if len(places) < 2:
+    if len(at) < 2:
         return math.nan
-    return float(np.trapezoid(values, places)) / (places[-1] - places[0])
+    return float(np.trapezoid(values, at)) / (at[-1] - at[0])

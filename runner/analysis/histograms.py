@@ -6,16 +6,17 @@ Memory is bounded, however long the run is.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
+from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions, stretches_at
+from runner.analysis.series import lines_of
 from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
@@ -23,7 +24,16 @@ from runner.recording.spaces import decode
 from runner.util.arrays import Array
 
 Values = NDArray[np.float64]
+Quantity = Literal["return", "length", "action", "reward"]
+Block = tuple[Values, Mapping[tuple[Quantity, str], Array]]
+"""The positions of a block of records, and its values by quantity and line."""
 
+_UNITS: Final[Mapping[Quantity, str]] = {
+    "return": "summed reward",
+    "length": "steps",
+    "action": "action",
+    "reward": "reward of a step",
+}
 STRETCHES: Final = 60
 """The most stretches of training."""
 _FEWEST: Final = 10
@@ -40,7 +50,7 @@ _MAX_PARTS: Final = 6
 class Histogram:
     """The counts of a quantity over an axis."""
 
-    quantity: Literal["return", "length", "action", "reward"]
+    quantity: Quantity
     line: str
     """An agent, or a part of an action; empty if there is one."""
     unit: str
@@ -62,10 +72,6 @@ class Histogram:
 class _Column:
     """A quantity whose values are being counted."""
 
-    quantity: Literal["return", "length", "action", "reward"]
-    line: str
-    unit: str
-    name_of: Callable[[float], str]
     low: float = np.inf
     high: float = -np.inf
     distinct: set[float] = field(default_factory=set)
@@ -97,27 +103,14 @@ class _Column:
         )
         self.counts = np.zeros((stretches, len(self.levels) - (not self.is_distinct)), np.int64)
 
-    def count(self, stretch: NDArray[np.intp], values: Values) -> None:
+    def count(self, stretches: NDArray[np.intp], values: Values) -> None:
         """Count the values of a block, each in its stretch."""
         usable = is_usable(values)
         side = "left" if self.is_distinct else "right"
         level = np.searchsorted(self.levels, values[usable], side) - (not self.is_distinct)  # type: ignore[call-overload]
         width = self.counts.shape[1]
-        flat = stretch[usable] * width + level.clip(0, width - 1)
+        flat = stretches[usable] * width + level.clip(0, width - 1)
         self.counts += np.bincount(flat, minlength=self.counts.size).reshape(self.counts.shape)
-
-    def histogram(self, axis: Axis, edges: Values) -> Histogram:
-        return Histogram(
-            quantity=self.quantity,
-            line=self.line,
-            unit=self.unit,
-            axis=axis.name,
-            edges=edges.tolist(),
-            values=self.levels.tolist(),
-            names=[self.name_of(value) for value in self.levels.tolist()] if self.is_distinct else [],
-            counts=self.counts.tolist(),
-            left_out=self.left_out,
-        )
 
 
 def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histogram], list[str]]:
@@ -125,94 +118,83 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
 
     Returns and lengths are at the ends of episodes, actions and rewards at their steps.
     """
-    places = positions(recording, axis)
+    moments = positions(recording, axis)
     done = recording.done()
-    last = float(places.at(done["episodes"], done["train_steps"]))
+    last = float(moments.at(done["episodes"], done["train_steps"]))
     result: list[Histogram] = []
     notes: list[str] = []
     for read in (_episodes, _steps):
         few = min(STRETCHES, max(_FEWEST, done["episodes"] // _EPISODES_EACH))
         edges = edges_of(axis, last, few if read is _episodes else STRETCHES)
-        columns: dict[tuple[str, str], _Column] = {}
-        for _, block in read(recording, places, columns, notes):
+        columns: defaultdict[tuple[Quantity, str], _Column] = defaultdict(_Column)
+        for _, block in read(recording, moments, notes):
             for key, values in block.items():
-                columns[key].scan(values)
+                columns[key].scan(values.astype(np.float64))
         in_use = {key: column for key, column in columns.items() if column.distinct}
         for column in in_use.values():
             column.begin(len(edges) - 1)
-        for at, block in read(recording, places, columns, []):
-            stretch = (np.searchsorted(edges, at) - 1).clip(0, len(edges) - 2)
+        for at, block in read(recording, moments, []):
+            stretches = stretches_at(edges, at)
             for key, values in block.items():
                 if key in in_use:
-                    in_use[key].count(stretch, values)
-        result += [column.histogram(axis, edges) for column in in_use.values()]
-    for each in result:
-        if each.left_out:
-            whose = f" of {spoken(each.line)}" if each.line else ""
+                    in_use[key].count(stretches, values.astype(np.float64))
+        for (quantity, line), column in in_use.items():
+            levels = column.levels.tolist()
+            names = _action_names(recording, line) if quantity == "action" else {}
+            result.append(
+                Histogram(
+                    quantity=quantity,
+                    line=line,
+                    unit=_UNITS[quantity],
+                    axis=axis.name,
+                    edges=edges.tolist(),
+                    values=levels,
+                    names=[names.get(level, f"{level:,.6g}") for level in levels if column.is_distinct],
+                    counts=column.counts.tolist(),
+                    left_out=column.left_out,
+                )
+            )
+    for histogram in result:
+        if histogram.left_out:
+            part = f" of {spoken(histogram.line)}" if histogram.line else ""
             notes.append(
-                f"{each.left_out:,} values of {each.quantity}{whose} are left out, as they are infinite, not "
-                "a number or too large."
+                f"{histogram.left_out:,} values of {histogram.quantity}{part} are left out, as they are "
+                "infinite, not a number or too large."
             )
     return result, list(dict.fromkeys(notes))
 
 
-Block = tuple[Values, Mapping[tuple[str, str], Values]]
-"""The positions of a block, and the values of its columns."""
-
-
-def _episodes(
-    recording: Recording, places: Positions, columns: dict[tuple[str, str], _Column], _notes: list[str]
-) -> Iterator[Block]:
-    agents = recording.agents[:_MAX_PARTS]
-    lines = agents if len(recording.agents) > 1 else [""]
-    columns.setdefault(("length", ""), _Column("length", "", "steps", _number))
-    for line in lines:
-        columns.setdefault(("return", line), _Column("return", line, "summed reward", _number))
+def _episodes(recording: Recording, moments: Positions, _notes: list[str]) -> Iterator[Block]:
     for block in recording.train.episodes.blocks():
-        own = {("return", line): block["returns"][:, i].astype(np.float64) for i, line in enumerate(lines)}
-        at = places.at(block["episode"] + 1, block["last_step"] + 1)
-        yield at, {("length", ""): block["length"].astype(np.float64), **own}
+        values: dict[tuple[Quantity, str], Array] = {("length", ""): block["length"]}
+        for i, line in enumerate(lines_of(recording.agents)[:_MAX_PARTS]):
+            values["return", line] = block["returns"][:, i]
+        yield moments.at(block["episode"] + 1, block["last_step"] + 1), values
 
 
-def _steps(
-    recording: Recording, places: Positions, columns: dict[tuple[str, str], _Column], notes: list[str]
-) -> Iterator[Block]:
-    lines = recording.agents[:_MAX_PARTS] if len(recording.agents) > 1 else [""]
-    if recording.train.steps:
-        for line in lines:
-            columns.setdefault(("reward", line), _Column("reward", line, "reward of a step", _number))
-    else:
+def _steps(recording: Recording, moments: Positions, notes: list[str]) -> Iterator[Block]:
+    if not recording.train.steps:
         notes.append("Rewards have no histogram, as no whole steps of training were recorded.")
     for block in recording.train.steps.taken():
-        values: dict[tuple[str, str], Values] = {}
-        for part, own in _parts(recording, _uniform(recording, block["action"]), notes).items():
-            values["action", part] = own.astype(np.float64)
-            if ("action", part) not in columns:
-                columns["action", part] = _Column("action", part, "action", _action_name(recording, part))
+        values: dict[tuple[Quantity, str], Array] = {}
         if "rewards" in (block.dtype.names or ()):
-            for i, line in enumerate(lines):
-                values["reward", line] = block["rewards"][:, i].astype(np.float64)
-        yield places.at(block["episode"], block["step"] + 1), values
-
-
-def _uniform(recording: Recording, actions: Array) -> Array:
-    """Return actions as one array; an array of objects where they are no arrays of one shape."""
-    if not actions.dtype.hasobject:
-        return actions
-    values = [decode(recording.spaces["action"], each, str(recording.path)) for each in actions]
-    if all(isinstance(each, (np.ndarray, np.generic)) for each in values):
-        with contextlib.suppress(ValueError):
-            return np.array(values)
-    return np.array([None] * len(values))
+            for i, line in enumerate(lines_of(recording.agents)[:_MAX_PARTS]):
+                values["reward", line] = block["rewards"][:, i]
+        for part, numbers in _parts(recording, block["action"], notes).items():
+            values["action", part] = numbers
+        yield moments.at(block["episode"], block["step"] + 1), values
 
 
 def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, Array]:
     """Return the numbers of actions by part: an agent, a field or an index; empty for a single number."""
     if recording.can_train_again:
-        own = recording.mdp.own_actions[actions]
-        agents = recording.mdp.agents
-        return {agent if len(agents) > 1 else "": own[:, i] for i, agent in enumerate(agents)}
-    parts = {part: own for part, own in _numbers("", actions) if own.dtype.kind in "biuf"}
+        numbers = recording.mdp.own_actions[actions]
+        return {agent: numbers[:, i] for i, agent in enumerate(lines_of(recording.mdp.agents))}
+    if actions.dtype.hasobject:  # as observations or actions vary in size
+        values = [decode(recording.spaces["action"], action, str(recording.path)) for action in actions]
+        are_arrays = all(isinstance(value, np.ndarray | np.generic) for value in values)
+        actions = np.array(values if are_arrays else [None] * len(values))
+    parts = {part: column for part, column in _numbers("", actions) if column.dtype.kind in "biuf"}
     if not parts:
         notes.append("Actions have no histogram, as they are not numbers of one shape.")
     if len(parts) > _MAX_PARTS:
@@ -232,8 +214,8 @@ def _numbers(path: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any
             yield path if flat.shape[1] == 1 else f"{path}[{i}]", flat[:, i]
 
 
-def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
-    """Return a function that names the discrete actions of a part."""
+def _action_names(recording: Recording, part: str) -> dict[float, str]:
+    """Return the names of the discrete actions of a part, by number."""
     start = 0
     if recording.can_train_again:
         agents = recording.mdp.agents
@@ -241,11 +223,5 @@ def _action_name(recording: Recording, part: str) -> Callable[[float], str]:
     else:
         agent = part if part in recording.agents else ""
         names = recording.train.action_names(agent) if agent or not part else ()
-        space = recording.spaces["action"]
-        start = int(space.get("start", 0)) if not recording.has_states else 0
-    names_by_number = {float(start + i): spoken(name) for i, name in enumerate(names)}
-    return lambda value: names_by_number.get(value, _number(value))
-
-
-def _number(value: float) -> str:
-    return f"{value:,.6g}"
+        start = 0 if recording.has_states else int(recording.spaces["action"].get("start", 0))
+    return {float(start + i): spoken(name) for i, name in enumerate(names)}

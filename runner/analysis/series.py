@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions
+from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions, stretches_at
 from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
@@ -32,7 +32,7 @@ Readings = dict[str, dict[str, float]]
 """Metric -> line (an agent, a reward, or "") -> value."""
 
 FURTHER_NAMES: Final = ""
-"""Among the values left out: those under further names than are read."""
+"""Key of `RunSeries.not_finite` that counts the values under names beyond the first 64."""
 LOGGED: Final = "training.logged."
 """Prefix of the names under which a loop logged values."""
 _MAX_TITLE: Final = 40
@@ -188,35 +188,45 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         RecordingError: the recording is damaged, or does not have the axis.
     """
     not_finite: Counter[str] = Counter()
-    places = positions(recording, axis)
-    axis = axis if recording.eval.has_metrics else places.axis
-    averaged = ""
-    names = dict.fromkeys(each.removeprefix(LOGGED) for each in metrics if each.startswith(LOGGED))
-    room = 0 if metrics else _MAX_NAMES
-    evaluations = evaluation_records(recording)
-    config = recording.config
+    moments = positions(recording, axis)
+    config, evaluations = recording.config, evaluation_records(recording)
+    readings = [evaluation_readings(record) for record in evaluations]
+    averaged, names = "", dict[str, None]()
     recent: Readings = {}
     recent_episodes, is_unended = 0, False
     if recording.eval.has_metrics:
-        agents = recording.agents
         exact = {
-            each["evaluation"]: exact_readings(each, agents)
-            for each in recording.table(schema.OPTIMALITY_TOPIC).decoded()
+            measures["evaluation"]: exact_readings(measures, recording.agents)
+            for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
         }
-        readings = [evaluation_readings(each) | exact.get(each.number, {}) for each in evaluations]
-        reports = [*training_records(recording), *(each.training for each in evaluations if each.training)]
-        training = [(places.one(each.episode, each.step), training_readings(each)) for each in reports]
+        for record, values in zip(evaluations, readings, strict=True):
+            values.update(exact.get(record.number, {}))
+        reports = [
+            *training_records(recording),
+            *(record.training for record in evaluations if record.training),
+        ]
+        training = [
+            (moments.of_moment(report.episode, report.step), training_readings(report)) for report in reports
+        ]
     else:
-        readings = [_single_agent_unnamed(evaluation_readings(each)) for each in evaluations]
-        training, averaged = _loop_training(recording, places, names, room, not_finite)
+        axis = moments.axis
+        readings = [_single_agent_unnamed(values) for values in readings]
+        wanted = [name.removeprefix(LOGGED) for name in metrics if name.startswith(LOGGED)]
+        names = dict.fromkeys(wanted)
+        training, averaged = _loop_training(
+            recording, moments, names, 0 if metrics else _MAX_NAMES, not_finite
+        )
         is_unended = not recording.train.episodes.count()
-        if recording.status == "finished":
-            recent, recent_episodes = _recent_training(recording)
-        if left_out := sum(each.not_finite for each in evaluations):
+        if recording.status == "finished" and len(last := recording.train.recent_episodes()):
+            recent = _episode_readings(
+                recording, float(last["length"].mean()), map(finite_mean, last["returns"].T)
+            )
+            recent_episodes = len(last)
+        if left_out := sum(record.not_finite for record in evaluations):
             not_finite["mean_return"] = left_out
-        own = config.get("config")
-        if isinstance(own, Mapping) and own.get("seed") == recording.seed:  # as in vars(args)
-            config = {**config, "config": {key: value for key, value in own.items() if key != "seed"}}
+        loop = config.get("config")
+        if isinstance(loop, Mapping) and loop.get("seed") == recording.seed:  # as in vars(args)
+            config = {**config, "config": {key: value for key, value in loop.items() if key != "seed"}}
     return RunSeries(
         run_id=recording.run_id,
         name=recording.name,
@@ -224,8 +234,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         status=recording.status,
         config=config,
         evaluation=[
-            (places.one(each.episode, each.step), own)
-            for each, own in zip(evaluations, readings, strict=True)
+            (moments.of_moment(record.episode, record.step), values)
+            for record, values in zip(evaluations, readings, strict=True)
         ],
         training=sorted(training, key=lambda entry: entry[0]),
         content_digest=recording.result.content_digest or "",
@@ -305,30 +315,34 @@ def _single_agent_unnamed(readings: Readings) -> Readings:
 
 
 def _loop_training(
-    recording: Recording, places: Positions, names: dict[str, None], room: int, not_finite: Counter[str]
+    recording: Recording,
+    moments: Positions,
+    names: dict[str, None],
+    max_further: int,
+    not_finite: Counter[str],
 ) -> tuple[list[tuple[float, Readings]], str]:
-    """Return the means over stretches of training, by the end of the stretch, and a sentence on these.
+    """Return means over stretches of training by the end of the stretch, and a sentence on the stretches.
 
-    All names under which values were logged are added to `names`. Those that are in it are read, and `room`
-    further ones.
+    Logged values are read under `names`, and under the first `max_further` other names. All names that were
+    logged are added to `names`.
     """
-    edges, averaged = _edges(recording, places)
-    training = _mean_episodes(recording, places, edges, not_finite)
-    means, has_several = _mean_scalars(recording, places, edges, names, room, not_finite)
+    edges, averaged = _edges(recording, moments)
+    training = _mean_episodes(recording, moments, edges, not_finite)
+    means, has_several = _mean_scalars(recording, moments, edges, names, max_further, not_finite)
     for name, values in means.items():
         for k in np.flatnonzero(~np.isnan(values)).tolist():
             training.setdefault(k, {})[f"{LOGGED}{name}"] = {"": float(values[k])}
-    ends = (edges.astype(np.int64) if places.axis.whole else edges).tolist()
+    ends = (edges.astype(np.int64) if moments.axis.whole else edges).tolist()
     if has_several:
         averaged = averaged or "Values at the same position are averaged."
     return [(ends[k + 1], readings) for k, readings in training.items()], averaged
 
 
-def _edges(recording: Recording, places: Positions) -> tuple[NDArray[np.float64], str]:
+def _edges(recording: Recording, moments: Positions) -> tuple[NDArray[np.float64], str]:
     """Return the edges of stretches, and a sentence on them if not each position has one of its own."""
     if has_environment(recording.config):
         done = recording.done()
-        last = float(places.at(done["episodes"], done["train_steps"]))
+        last = float(moments.at(done["episodes"], done["train_steps"]))
         first = 0.0
     else:
         steps = np.empty(0, np.int64)
@@ -338,132 +352,115 @@ def _edges(recording: Recording, places: Positions) -> tuple[NDArray[np.float64]
             if len(steps) <= _MAX_EXACT:
                 steps = np.union1d(steps, rows["step"])
         if len(steps) <= _MAX_EXACT:
-            ends = np.unique(places.at(0, steps))
+            ends = np.unique(moments.at(0, steps))
             return np.concatenate([ends[:1] - 1, ends]) if len(ends) else np.arange(2.0), ""
-        last = float(places.at(0, last_step))
-        first = -1.0 if places.axis.whole else 0.0  # so that a stretch is steps 0 to 99, not 1 to 100
-    edges = edges_of(places.axis, last - first, _MAX_POINTS) + first
-    return edges, f"Means over stretches of {places.axis.length(float(edges[1] - edges[0]))}."
+        last = float(moments.at(0, last_step))
+        first = -1.0 if moments.axis.whole else 0.0  # so that a stretch is steps 0 to 99, not 1 to 100
+    edges = edges_of(moments.axis, last - first, _MAX_POINTS) + first
+    return edges, f"Means over stretches of {moments.axis.length(float(edges[1] - edges[0]))}."
+
+
+def lines_of(agents: Sequence[str]) -> Sequence[str]:
+    """Return the lines of a value of each agent: their names, and none for a single agent."""
+    return agents if len(agents) > 1 else [""]
+
+
+def _episode_readings(recording: Recording, length: float, returns: Iterable[float | None]) -> Readings:
+    """Return mean length and returns of training episodes as readings, without returns that are unknown."""
+    means = zip(lines_of(recording.agents), returns, strict=True)
+    return {
+        "training.mean_length": {"": length},
+        "training.mean_return": {
+            line: mean for line, mean in means if mean is not None and np.isfinite(mean)
+        },
+    }
 
 
 def _mean_episodes(
-    recording: Recording, places: Positions, edges: NDArray[np.float64], not_finite: Counter[str]
+    recording: Recording, moments: Positions, edges: NDArray[np.float64], not_finite: Counter[str]
 ) -> dict[int, Readings]:
     """Return mean length and return of the training episodes that end in each stretch, by its number."""
-    agents, bins = recording.agents, len(edges) - 1
+    agents, bins = len(recording.agents), len(edges) - 1
     count, length = np.zeros(bins), np.zeros(bins)
-    returns, usable_returns = np.zeros((bins, len(agents))), np.zeros((bins, len(agents)))
+    totals, usable_returns = np.zeros((bins, agents)), np.zeros((bins, agents))
     for block in recording.train.episodes.blocks():
-        ends = places.at(block["episode"] + 1, block["last_step"] + 1)
-        at = (np.searchsorted(edges, ends) - 1).clip(0, bins - 1)
+        at = stretches_at(edges, moments.at(block["episode"] + 1, block["last_step"] + 1))
         count += np.bincount(at, minlength=bins)
         length += np.bincount(at, block["length"], minlength=bins)
         usable = is_usable(block["returns"])
         if not usable.all():
             not_finite["training.mean_return"] += int((~usable).sum())
-        for i in range(len(agents)):
-            own = usable[:, i]
-            usable_returns[:, i] += np.bincount(at[own], minlength=bins)
-            returns[:, i] += np.bincount(at[own], block["returns"][own, i], minlength=bins)
-    by_stretch: dict[int, Readings] = {}
-    for k in np.flatnonzero(count).tolist():
-        readings = by_stretch.setdefault(k, {})
-        readings["training.mean_length"] = {"": float(length[k] / count[k])}
-        means = {
-            agent if len(agents) > 1 else "": float(returns[k, i] / usable_returns[k, i])
-            for i, agent in enumerate(agents)
-            if usable_returns[k, i]
-        }
-        if means:
-            readings["training.mean_return"] = means
-    if not by_stretch and (unfinished := _unfinished_episodes(recording)):
-        by_stretch[bins - 1] = unfinished
+        for i in range(agents):
+            ends = at[usable[:, i]]
+            usable_returns[:, i] += np.bincount(ends, minlength=bins)
+            totals[:, i] += np.bincount(ends, block["returns"][usable[:, i], i], minlength=bins)
+    with np.errstate(invalid="ignore"):
+        lengths, returns = length / count, totals / usable_returns
+    by_stretch = {
+        k: _episode_readings(recording, float(lengths[k]), returns[k].tolist())
+        for k in np.flatnonzero(count).tolist()
+    }
+    if not by_stretch and recording.train.steps:  # no episode ended: the unfinished ones
+        steps, total = 0, np.zeros(1)
+        for block in recording.train.steps.rows():
+            steps += len(block)
+            total = total + block["rewards"].sum(axis=0, dtype=np.float64)
+        means = np.broadcast_to(total, agents) / recording.environments
+        if np.isfinite(means).all():
+            unfinished = _episode_readings(recording, steps / recording.environments, means.tolist())
+            by_stretch[bins - 1] = unfinished
     return by_stretch
-
-
-def _unfinished_episodes(recording: Recording) -> Readings:
-    """Return mean length and return of training episodes of which none ended; nothing without rewards."""
-    if not recording.train.steps:
-        return {}
-    agents, steps, total = recording.agents, 0, 0.0
-    for block in recording.train.steps.rows():
-        steps += len(block)
-        total = total + block["rewards"].sum(axis=0, dtype=np.float64)
-    returns = np.broadcast_to(total, len(agents)) / recording.environments
-    if not np.isfinite(returns).all():
-        return {}
-    lines = agents if len(agents) > 1 else [""]
-    return {
-        "training.mean_length": {"": steps / recording.environments},
-        "training.mean_return": dict(zip(lines, returns.tolist(), strict=True)),
-    }
-
-
-def _recent_training(recording: Recording) -> tuple[Readings, int]:
-    """Return mean length and return of the last training episodes of a loop, and how many these are."""
-    episodes, agents = recording.train.recent_episodes(), recording.agents
-    if not len(episodes):
-        return {}, 0
-    lines = agents if len(agents) > 1 else [""]
-    means = {"training.mean_length": {"": finite_mean(episodes["length"])}}
-    means["training.mean_return"] = dict(zip(lines, map(finite_mean, episodes["returns"].T), strict=True))
-    recent = {
-        metric: {line: value for line, value in own.items() if value is not None}
-        for metric, own in means.items()
-    }
-    return recent, len(episodes)
 
 
 def _mean_scalars(
     recording: Recording,
-    places: Positions,
+    moments: Positions,
     edges: NDArray[np.float64],
     names: dict[str, None],
-    room: int,
+    max_further: int,
     not_finite: Counter[str],
 ) -> tuple[dict[str, NDArray[np.float64]], bool]:
     """Return the means of the values logged under each name in each stretch; NaN where there are none.
 
     Also whether any is the mean of several values.
     """
-    ends = edges[1:]
-    wanted = set(names)
+    wanted, bins = set(names), len(edges) - 1
     sums: dict[str, NDArray[np.float64]] = {}
     counts: dict[str, NDArray[np.float64]] = {}
     for series, rows in recording.scalars():
         steps, episodes = rows["step"].copy(), rows["episode"].copy()
-        evaluated = np.array([phase != "train" for _, phase in series])[rows["series"]]
-        if evaluated.any():
-            own = rows[evaluated]
-            steps[evaluated] = (own["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64) - own["step"]
-            moments, at = np.unique(steps[evaluated], return_inverse=True)
-            ended = [recording.train.episodes.first_from("last_step", k) for k in moments.tolist()]
-            episodes[evaluated] = np.array(ended)[at]
-        reached = places.at(episodes + 1, steps)
-        stretches = np.searchsorted(ends, np.trunc(reached) if places.axis.whole else reached)
-        stretches = stretches.clip(max=len(ends) - 1)
+        in_evaluation = np.array([phase != "train" for _, phase in series])[rows["series"]]
+        if in_evaluation.any():  # its step counts evaluation steps; see `training_steps_before`
+            evaluated = rows[in_evaluation]
+            training_steps = (evaluated["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64)
+            steps[in_evaluation] = training_steps - evaluated["step"]
+            distinct, at = np.unique(steps[in_evaluation], return_inverse=True)
+            ended = [recording.train.episodes.first_from("last_step", step) for step in distinct.tolist()]
+            episodes[in_evaluation] = np.array(ended)[at]
+        reached = moments.at(episodes + 1, steps)
+        stretches = stretches_at(edges, np.trunc(reached) if moments.axis.whole else reached)
         usable = is_usable(rows["value"])
         for k, (logged, phase) in enumerate(series):
             name = logged if phase == "train" else f"{logged} ({phase})"
             names[name] = None
             of_series = rows["series"] == k
             if name not in sums:
-                if name not in wanted and len(sums) >= room:
-                    if room:
+                if name not in wanted and len(sums) >= max_further:
+                    if max_further:
                         not_finite[FURTHER_NAMES] += int(of_series.sum())
                     continue
-                sums[name], counts[name] = np.zeros(len(ends)), np.zeros(len(ends))
+                sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
             if left_out := int((of_series & ~usable).sum()):
                 not_finite[f"{LOGGED}{name}"] += left_out
             of_series &= usable
             np.add.at(sums[name], stretches[of_series], rows["value"][of_series])  # in their order
-            counts[name] += np.bincount(stretches[of_series], minlength=len(ends))
+            counts[name] += np.bincount(stretches[of_series], minlength=bins)
     with np.errstate(invalid="ignore"):
         means = {name: sums[name] / counts[name] for name in sums}
-    return means, any((own > 1).any() for own in counts.values())
+    return means, any((count > 1).any() for count in counts.values())
 
 
-def training_step(scalar: Message) -> int:
+def training_steps_before(scalar: Message) -> int:
     """Return the training steps before a logged value; one logged in evaluation has steps of its own."""
     step = int(scalar["step"])
     return step if scalar["phase"] == "train" else scalar["log_time"] // schema.STEP_NANOSECONDS - step

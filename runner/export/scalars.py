@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.series import training_step
+from runner.analysis.series import training_steps_before
 from runner.recording import schema
 from runner.recording.clock import read_clock
 from runner.recording.messages import Message
@@ -81,7 +81,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
         yield _measures("eval", row, _named(row, exact_values, agents))
     for scalar in recording.table(SCALAR_TOPIC).decoded():
         if math.isfinite(scalar["value"]):
-            position, step = scalar["log_time"] // STEP_NANOSECONDS, training_step(scalar)
+            position, step = scalar["log_time"] // STEP_NANOSECONDS, training_steps_before(scalar)
             values = {f"logged/{scalar['name']}": scalar["value"]}
             yield Measures(scalar["phase"], position, step, scalar["episode"], values)
 
