@@ -98,22 +98,25 @@ def diff(
     The first crossing of each target, metric to level, is reported. `first` compares only settings, and where
     and in what training first diverges, not the tables.
     """
-    jobs = a.has_tables and b.has_tables
     digests = [recording.result.content_digest for recording in (a, b)]
-    same = digests[0] is not None and digests[0] == digests[1]
-    changes, alike = _values_by_path(a, b, ("config",) if first and jobs else _BY_PATH)
+    are_jobs = _are_jobs(a, b)
+    by_path: dict[str, list[Mapping[str, object]]] = {"config": [_settings(run) for run in (a, b)]}
+    if not (first and are_jobs):
+        by_path["provenance"] = [run.provenance for run in (a, b)]
+        by_path["costs"] = [_costs(run) | ({} if are_jobs else loop_means(run)) for run in (a, b)]
+    changes = {name: changes_in(*values) for name, values in by_path.items()}
     difference = RunDiff(
         a=_identity(a),
         b=_identity(b),
-        same_content=same,
-        environment=environment_diff(a.mdp, b.mdp) if jobs else loop_environment_diff(a, b),
-        code=[] if first and jobs else code_changes(a, b),
+        same_content=digests[0] is not None and digests[0] == digests[1],
+        environment=environment_diff(a.mdp, b.mdp) if are_jobs else loop_environment_diff(a, b),
+        code=[] if first and are_jobs else code_changes(a, b),
         config=changes["config"],
-        provenance=changes["provenance"],
-        costs=changes["costs"],
-        alike=alike,
+        provenance=changes.get("provenance", []),
+        costs=changes.get("costs", []),
+        alike={name: equal_values(*values) for name, values in by_path.items()},
     )
-    if jobs:
+    if are_jobs:
         return _diff_jobs(difference, a, b, targets or {}, first)
     for branch, parent, names in ((b, a, "B is a branch of A"), (a, b, "A is a branch of B")):
         origin = origin_in(branch.config)
@@ -174,33 +177,28 @@ def _diff_branch(
 
 def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
     """Add to the difference of two runs, of which one is a loop, where they diverge."""
-    notes: list[str] = []
-    train = None
-    evaluation = None
     if not have_same_spaces(a, b):
-        notes.append("the environments have other spaces: no steps are compared")
-    elif not difference.same_content:
-        notes += [_left_out(name, one) for name, one in (("A", a), ("B", b)) if one.leaves_out_steps]
-        notes += _differing_checkpoints(a, b)
-        train, evaluation = (loop_divergence(a, b, phase) for phase in ("train", "eval"))
-        digests = [recording.result.topic_digests for recording in (a, b)]
-        if train is evaluation is None and all(digests):
-            names = sorted(digests[0].keys() | digests[1].keys())
-            differing = [name for name in names if digests[0].get(name) != digests[1].get(name)]
-            if differing and not any(one.leaves_out_steps for one in (a, b)):
-                notes.append(f"all steps are the same; what differs is in {', '.join(differing)}")
-            elif differing and all(one.has_actions for one in (a, b)):
-                notes.append(f"all actions are the same; what differs is in {', '.join(differing)}")
-        explained = difference.code or any(
-            change.path.split(".")[0] not in NOT_CONTENT for change in difference.config
-        )
-        if (train or evaluation) and not explained:
+        return replace(difference, notes=["the environments have other spaces: no steps are compared"])
+    if difference.same_content:
+        return difference
+    runs = {"A": a, "B": b}
+    notes = [_left_out(name, run) for name, run in runs.items() if run.leaves_out_steps]
+    notes += _differing_checkpoints(a, b)
+    train, evaluation = (loop_divergence(a, b, phase) for phase in schema.PHASES)
+    if train or evaluation:
+        settings = [change for change in difference.config if change.path.split(".")[0] not in NOT_CONTENT]
+        if not (difference.code or settings):
             notes.append("how a loop learns is not recorded, so only where they diverge is known, not why")
+    elif (ours := a.result.topic_digests) and (theirs := b.result.topic_digests):
+        topics = [name for name in sorted(ours.keys() | theirs.keys()) if ours.get(name) != theirs.get(name)]
+        compared = "actions" if any(run.leaves_out_steps for run in runs.values()) else "steps"
+        if topics and (compared == "steps" or (a.has_actions and b.has_actions)):
+            notes.append(f"all {compared} are the same; what differs is in {', '.join(topics)}")
     return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
 
 
 def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:
-    """Return which checkpoint of both runs is the first whose content differs, as a note; none if none is."""
+    """Return a note on the checkpoints of both runs that differ, and the first of them; none if all agree."""
     ours, theirs = [
         {
             (checkpoint.phase, checkpoint.reference): checkpoint.digest
@@ -241,17 +239,18 @@ def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool
     def is_ignored(path: str) -> bool:
         return any(fnmatch.fnmatchcase(path, pattern) for pattern in ignore)
 
-    changes: dict[str, list[Change]] = {name: getattr(difference, name) for name in _BY_PATH}
-    facts: dict[str, Any] = {
-        name: [change for change in some if not is_ignored(change.path)] for name, some in changes.items()
+    by_field: dict[str, list[Change]] = {name: getattr(difference, name) for name in _BY_PATH}
+    left: dict[str, Any] = {
+        name: [change for change in changes if not is_ignored(change.path)]
+        for name, changes in by_field.items()
     }
-    facts["alike"] = {
+    alike = {
         name: {path: value for path, value in values.items() if not is_ignored(path)}
         for name, values in difference.alike.items()
         if everything
     }
-    ignored = [change.path for some in changes.values() for change in some if is_ignored(change.path)]
-    return replace(difference, **facts, ignored=ignored)
+    paths = [change.path for changes in by_field.values() for change in changes]
+    return replace(difference, **left, alike=alike, ignored=[path for path in paths if is_ignored(path)])
 
 
 def as_json(difference: RunDiff) -> dict[str, object]:
@@ -265,20 +264,25 @@ def as_json(difference: RunDiff) -> dict[str, object]:
 
 def can_compare_steps(a: Recording, b: Recording) -> bool:
     """Return whether two runs have recorded training steps of the same states and actions, or spaces."""
-    are_alike = _same_sizes(a, b) if a.has_tables and b.has_tables else have_same_spaces(a, b)
-    return are_alike and all(recording.train.steps for recording in (a, b))
+    are_alike = _same_sizes(a, b) if _are_jobs(a, b) else have_same_spaces(a, b)
+    return are_alike and bool(a.train.steps and b.train.steps)
 
 
 def divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
     """Yield the first steps of training and of evaluation at which two runs diverge, if they do.
 
-    Of training there is also one where a run has no more steps; it has no step of that run then.
+    Runs diverge in training, too, where one has no more steps; the divergence has no step of that run then.
     """
-    if a.has_tables and b.has_tables:
+    if _are_jobs(a, b):
         both = [training_divergence(a, b), next(evaluation_divergences(a, b), None)]
     else:
         both = [loop_divergence(a, b, phase) for phase in schema.PHASES]
     yield from filter(None, both)
+
+
+def _are_jobs(a: Recording, b: Recording) -> bool:
+    """Return whether tables of both runs can be replayed, so that a cause of a divergence can be found."""
+    return a.has_tables and b.has_tables
 
 
 def _same_sizes(a: Recording, b: Recording) -> bool:
@@ -292,20 +296,6 @@ def _identity(recording: Recording) -> Identity:
         "seed": recording.seed,
         "status": recording.status,
     }
-
-
-def _values_by_path(
-    a: Recording, b: Recording, names: Sequence[str]
-) -> tuple[dict[str, list[Change]], dict[str, dict[str, object]]]:
-    """Return what differs in these fields of a `RunDiff`, nothing for the others, and what is alike."""
-    jobs = a.has_tables and b.has_tables
-    values: dict[str, list[Mapping[str, object]]] = {
-        "config": [_settings(one) for one in (a, b)],
-        "provenance": [one.provenance for one in (a, b)],
-        "costs": [_costs(one) | ({} if jobs else loop_means(one)) for one in (a, b)],
-    }
-    changes = {name: changes_in(*values[name]) if name in names else [] for name in _BY_PATH}
-    return changes, {name: equal_values(*values[name]) for name in names}
 
 
 def _settings(recording: Recording) -> dict[str, object]:

@@ -77,7 +77,9 @@ def branch_relation(a: Recording, b: Recording) -> BranchRelation | None:
     else:
         return None
     step = min(origin.step for origin in (*ours, *theirs))
-    return BranchRelation(step, any(one.actions for one in (*ours, *theirs) if one.step == step), text)
+    return BranchRelation(
+        step, any(origin.actions for origin in (*ours, *theirs) if origin.step == step), text
+    )
 
 
 def with_branch(cause: Cause, divergence: Divergence, relation: BranchRelation | None) -> Cause:
@@ -150,11 +152,10 @@ def find_kind(divergence: Divergence, a: Recording, b: Recording) -> Cause:
         return Cause("transition", f"an episode ended in one of them: {_outcome_text(divergence, a, b)}")
     if divergence.t == 0 and left.step["state"] != right.step["state"]:
         return Cause("start", f"other start state: {left.state} in A, {right.state} in B")
-    if len(a.agents) == len(b.agents):
-        explored_alike = left.explorers == right.explorers
-    else:
-        explored_alike = any(left.explorers) == any(right.explorers)
-    if not explored_alike:
+    explorers: list[object] = [left.explorers, right.explorers]
+    if len(a.agents) != len(b.agents):
+        explorers = [any(left.explorers), any(right.explorers)]
+    if explorers[0] != explorers[1]:
         return Cause("exploration", _exploration_text(left, right))
     return _action_or_outcome(divergence, left, right)
 
@@ -176,14 +177,16 @@ def _action_or_outcome(divergence: Divergence, left: _Side, right: _Side) -> Cau
 
 def _exploration_text(left: _Side, right: _Side) -> str:
     """Return who explored in either run: `A explored there, B took its greedy action`."""
-    words = [exploration_in_words(int(step["explored"]), one.agents) for one, step in (left, right)]
+    words = [exploration_in_words(int(step["explored"]), run.agents) for run, step in (left, right)]
     if len(left.recording.agents) == len(right.recording.agents) == 1:
         explorer, other = ("A", "B") if words[0] else ("B", "A")
         draws = _draws_actions(left.recording, right.recording)
         acted = "an action of its learned policy" if draws else "its greedy action"
         return f"{explorer} explored there, {other} took {acted}"
-    shown = ["all learners explored" if text == "explored" else text or "none explored" for text in words]
-    return f"other learners explored: {shown[0]} in A, {shown[1]} in B"
+    in_a, in_b = (
+        "all learners explored" if text == "explored" else text or "none explored" for text in words
+    )
+    return f"other learners explored: {in_a} in A, {in_b} in B"
 
 
 def _draws_actions(a: Recording, b: Recording) -> bool:
@@ -196,8 +199,8 @@ def _differ_by_exploration(left: _Side, right: _Side) -> bool:
     explorers = left.explorers
     if len(explorers) != len(right.explorers) or len(explorers) != len(left.recording.mdp.agents):
         return bool(left.step["explored"])
-    own = [agent_actions(recording.mdp, int(step["action"])) for recording, step in (left, right)]
-    return all(explored for explored, ours, theirs in zip(explorers, *own, strict=True) if ours != theirs)
+    actions = [agent_actions(run.mdp, int(step["action"])) for run, step in (left, right)]
+    return all(explored for explored, ours, theirs in zip(explorers, *actions, strict=True) if ours != theirs)
 
 
 def _outcome_text(divergence: Divergence, a: Recording, b: Recording) -> str:
@@ -205,7 +208,7 @@ def _outcome_text(divergence: Divergence, a: Recording, b: Recording) -> str:
     name = divergence.field.replace("_", " ")
     values: list[Any] = [divergence.a, divergence.b]
     if divergence.field in ("state", "next_state"):
-        values = [states_in_words(one.mdp)[state] for one, state in zip((a, b), values, strict=True)]
+        values = [states_in_words(run.mdp)[state] for run, state in zip((a, b), values, strict=True)]
     elif divergence.field == "rewards":
         name, values = "reward", [" and ".join(f"{reward:g}" for reward in rewards) for rewards in values]
     return f"{name} {values[0]} in A, {values[1]} in B"

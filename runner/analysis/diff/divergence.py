@@ -53,10 +53,10 @@ _VALUE_FIELDS: Final = (
     "agents_terminated",
     "agents_truncated",
 )
-"""The same of a step in spaces that are not both `Discrete`."""
+"""The fields that are compared of a step in spaces that are not both `Discrete`."""
 _EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run
 _MAX_LETTERS: Final = 300
-"""Of a value of varying size as text."""
+"""The longest text of a value of varying size."""
 _MAX_NUMBERS: Final = 16
 """Where a value has more numbers, the first that differs is reported."""
 
@@ -102,26 +102,24 @@ class Divergence:
 
 def first_difference(
     a: Iterator[Block], b: Iterator[Block], fields: tuple[str, ...] = FIELDS
-) -> tuple[int, Block | None, Block | None] | None:
-    """Return the first position at which two streams of records differ, and both records there.
+) -> tuple[Block | None, Block | None]:
+    """Return the first records, a block of one each, in which two streams of records differ.
 
-    A stream that ends before the other differs there, with None for its record; None if they are the same.
+    A stream that ends before the other has None in place of its record; None twice if both are the same.
     """
-    position = 0
     left: Block | None = None
     right: Block | None = None
     while True:
         left = left if left is not None and len(left) else next(a, None)
         right = right if right is not None and len(right) else next(b, None)
         if left is None or right is None:
-            ends = [None if block is None else block[:1] for block in (left, right)]
-            return None if left is right else (position, ends[0], ends[1])
+            return None if left is None else left[:1], None if right is None else right[:1]
         n = min(len(left), len(right))
         differs = differing_rows(left[:n], right[:n], fields)
         if differs.any():
             k = int(np.argmax(differs))
-            return position + k, left[k : k + 1], right[k : k + 1]
-        left, right, position = left[n:], right[n:], position + n
+            return left[k : k + 1], right[k : k + 1]
+        left, right = left[n:], right[n:]
 
 
 def differing_rows(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
@@ -166,17 +164,16 @@ def training_divergence(a: Recording, b: Recording) -> Divergence | None:
 
 def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
     """Yield where evaluations diverge that both jobs made after as many training episodes."""
-    others = {one.after: one for one in evaluations_of(b)}
+    others = {evaluation.after: evaluation for evaluation in evaluations_of(b)}
     for left in evaluations_of(a):
         right = others.get(left.after)
         if right is None:
             continue
         trials = min(left.stop - left.start, right.stop - right.start)
-        steps = [_trial_steps(one, first, trials) for one, first in ((a, left.start), (b, right.start))]
-        if steps[0] is None or steps[1] is None:
+        ours, theirs = _trial_steps(a, left.start, trials), _trial_steps(b, right.start, trials)
+        if ours is None or theirs is None:
             continue
-        divergence = _divergence("eval", steps[0], steps[1], _EVALUATION_FIELDS)
-        if divergence is not None:
+        if (divergence := _divergence("eval", ours, theirs, _EVALUATION_FIELDS)) is not None:
             start = right.start if divergence.a_step is None else left.start
             yield replace(
                 divergence,
@@ -213,16 +210,15 @@ def _divergence(
     phase: str, a_steps: Iterator[Block], b_steps: Iterator[Block], fields: tuple[str, ...] = FIELDS
 ) -> Divergence | None:
     """Return where two streams of steps differ."""
-    if (found := first_difference(a_steps, b_steps, fields)) is None:
+    left, right = first_difference(a_steps, b_steps, fields)
+    ours, theirs = (None if block is None else block[0] for block in (left, right))
+    step = theirs if ours is None else ours
+    if step is None:
         return None
-    _, left, right = found
-    name, a, b = "step", "none" if left is None else "one more", "none" if right is None else "one more"
+    name, a, b = "step", "none" if ours is None else "one more", "none" if theirs is None else "one more"
     if left is not None and right is not None:
         name = next(name for name in fields if _differs(left, right, name)[0])
         name, a, b = _differing_part(name, left[name][0], right[name][0])
-    ours, theirs = (None if block is None else block[0] for block in (left, right))
-    step = theirs if ours is None else ours
-    assert step is not None
     return Divergence(
         phase, int(step["step"]), int(step["episode"]), int(step["t"]), name, a, b, ours, theirs
     )
@@ -238,8 +234,8 @@ def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
     if a.size <= _MAX_NUMBERS:
         return name, a.tolist(), b.tolist()
     differs = _bits(a.reshape(-1)) != _bits(b.reshape(-1))
-    place = np.unravel_index(int(differs.argmax()), a.shape)
-    return f"{name}[{', '.join(map(str, place))}]", a[place].tolist(), b[place].tolist()
+    index = np.unravel_index(int(differs.argmax()), a.shape)
+    return f"{name}[{', '.join(map(str, index))}]", a[index].tolist(), b[index].tolist()
 
 
 # --- loops --------------------------------------------------------------------------------------------
@@ -258,39 +254,42 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
     both have them; None if a recording left its steps out. If they diverge in what a reset observed, it is
     the step after it, and the field is `reset.observation`.
     """
-    if any(one.leaves_out_steps and not one.has_actions for one in (a, b)):
+    if any(recording.leaves_out_steps and not recording.has_actions for recording in (a, b)):
         return None
     divergence = _first_in_phase(a, b, phase)
     if divergence is None or phase == "train":
         return divergence
-    for recording in (a, b):
-        for one in evaluations_of(recording):
-            if one.start <= divergence.episode < one.stop:
-                return replace(
-                    divergence, episode=divergence.episode - one.start, evaluation=one.number, after=one.after
-                )
-    after = a.train.episodes.count()  # the trial was not finished in either run, so it is after all
-    start = next((one.start for one in evaluations_of(a) if one.after == after), a.eval.episodes.count())
-    return replace(divergence, episode=divergence.episode - start, after=after)
+    number, evaluations = divergence.episode, evaluations_of(a)
+    for evaluation in (*evaluations, *evaluations_of(b)):
+        if evaluation.start <= number < evaluation.stop:
+            return replace(
+                divergence,
+                episode=number - evaluation.start,
+                evaluation=evaluation.number,
+                after=evaluation.after,
+            )
+    # Neither run finished the trial, so it follows all training.
+    after = a.train.episodes.count()
+    starts = (evaluation.start for evaluation in evaluations if evaluation.after == after)
+    return replace(divergence, episode=number - next(starts, a.eval.episodes.count()), after=after)
 
 
 def _compared(a: Recording, b: Recording, phase: str) -> tuple[str, ...]:
     """Return the fields in which steps are compared: those that both recordings have."""
-    ours, theirs = (set(one.phase(phase).steps.row_dtype.names or ()) for one in (a, b))
+    ours, theirs = (recording.phase(phase).steps.row_dtype.names or () for recording in (a, b))
     fields = ("taken", *(FIELDS if a.has_states else _VALUE_FIELDS))
-    return tuple(name for name in fields if name in ours & theirs)
+    return tuple(name for name in fields if name in ours and name in theirs)
 
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:
-    """Return the same; the number of a trial is that among all evaluations."""
-    (ours, theirs), is_tabular = (one.phase(phase).steps for one in (a, b)), a.has_states
-    alone = [one.phase(phase).steps.are_actions for one in (a, b)]
+    """Return where a phase diverges, see `loop_divergence`; a trial is counted over all evaluations."""
+    ours, theirs = (recording.phase(phase).steps for recording in (a, b))
+    alone = [steps.are_actions for steps in (ours, theirs)]
     fields = (*_compared(a, b, phase), *(("digest",) if all(alone) else ()))
     divergence = _divergence(phase, ours.rows(), theirs.rows(), fields)
-    if not is_tabular:  # else a step has the state before it
-        divergence = (
-            _reset_divergence(a, b, phase, math.inf if divergence is None else divergence.step) or divergence
-        )
+    if not a.has_states:  # where it has, a step has the state before it
+        last = math.inf if divergence is None else divergence.step
+        divergence = _reset_divergence(a, b, phase, last) or divergence
     if divergence is None:
         return None
     if isinstance(divergence.a, bytes):
@@ -313,15 +312,16 @@ def _legible(recording: Recording, field: str, value: bytes) -> str:
 
 
 def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Divergence | None:
-    """Return where a branched episode of a loop and its branch diverge; its place is that in the parent.
+    """Return where a branched episode of a loop and its branch diverge, as the parent numbers it.
 
     Either is given first; they have the same spaces, and their steps one size.
     """
-    blocks = [
-        episode_blocks(one, origin.phase, origin.episode if one.run_id == origin.run else 0) for one in (a, b)
-    ]
+    ours, theirs = (
+        episode_blocks(recording, origin.phase, origin.episode if recording.run_id == origin.run else 0)
+        for recording in (a, b)
+    )
     fields = tuple(name for name in _compared(a, b, origin.phase) if name != "episode")
-    divergence = _divergence(origin.phase, blocks[0], blocks[1], fields)
+    divergence = _divergence(origin.phase, ours, theirs, fields)
     if divergence is None:
         return None
     at = EpisodeRef.parse(origin.at)
@@ -330,11 +330,11 @@ def branch_divergence(a: Recording, b: Recording, origin: BranchOrigin) -> Diver
 
 def _reset_divergence(a: Recording, b: Recording, phase: str, last: float) -> Divergence | None:
     """Return where what a reset observed differs, if that is before the end of the step `last`."""
-    streams = [
-        itertools.takewhile(lambda block: block["step"][0] <= last, one.phase(phase).resets.rows())
-        for one in (a, b)
-    ]
-    _, left, right = first_difference(streams[0], streams[1], ("observation",)) or (0, None, None)
+    ours, theirs = (
+        itertools.takewhile(lambda block: block["step"][0] <= last, recording.phase(phase).resets.rows())
+        for recording in (a, b)
+    )
+    left, right = first_difference(ours, theirs, ("observation",))
     if left is None or right is None or left["step"][0] > last:
         return None
     part = _differing_part("reset.observation", left["observation"][0], right["observation"][0])

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
 from runner.analysis.axes import first_crossing, mean_height
+from runner.analysis.evaluations import evaluation_records
+from runner.analysis.series import evaluation_readings, training_readings
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRIC_OF, METRICS
 from runner.recording.reader import Recording
@@ -44,41 +45,46 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
     Raises:
         RunnerError: they have no metric of that name.
     """
-    values = [_values(recording) for recording in (a, b)]
-    names = [name for name in values[0] if name in values[1]]
+    curves_a, curves_b = _curves(a), _curves(b)
+    names = [name for name in curves_a if name in curves_b]
     for name in targets:
         if names and name not in names:
             listed = ", ".join(names)
             raise RunnerError(f"target: found {name!r}, expected one of {listed}.{nearest(name, names)}")
     diffs = []
     for name in names:
-        left, right = values[0][name], values[1][name]
+        left, right = curves_a[name], curves_b[name]
         episodes = sorted(left.keys() & right.keys())
-        ours, theirs = [left[e] for e in episodes], [right[e] for e in episodes]
-        area = mean_height(episodes, [y - x for x, y in zip(ours, theirs, strict=True)])
-        level = targets.get(name)
-        crossings = (
-            {}
-            if level is None
-            else {f"{level:g}": (first_crossing(left, level), first_crossing(right, level))}
+        crossings = {}
+        if (level := targets.get(name)) is not None:
+            crossings[f"{level:g}"] = first_crossing(left, level), first_crossing(right, level)
+        diffs.append(
+            MetricDiff(
+                name=name,
+                episodes=episodes,
+                a=[left[episode] for episode in episodes],
+                b=[right[episode] for episode in episodes],
+                end_a=left[max(left)],
+                end_b=right[max(right)],
+                area=mean_height(episodes, [right[episode] - left[episode] for episode in episodes]),
+                crossings=crossings,
+            )
         )
-        ends = left[max(left)], right[max(right)]
-        diffs.append(MetricDiff(name, episodes, ours, theirs, *ends, area, crossings))
     return diffs
 
 
-def _values(recording: Recording) -> dict[str, dict[int, float]]:
-    """Return metric to episode to value; what is unknown (nan) is left out."""
-    agents = recording.agents
-    table: dict[str, dict[int, float]] = {}
-    for metrics in recording.eval.metrics.decoded():
+def _curves(recording: Recording) -> dict[str, dict[int, float]]:
+    """Return metric to episode to value, without values that are unknown."""
+    curves: dict[str, dict[int, float]] = {}
+    for record in evaluation_records(recording):
+        readings = evaluation_readings(record)
+        if record.training is not None:
+            readings |= training_readings(record.training)
         for metric in _COMPARED:
-            value = metrics[metric.field]
-            lines = [f"{metric.name}.{agent}" for agent in agents] if metric.per_agent else [metric.name]
-            for line, own in zip(lines, value if metric.per_agent else [value], strict=False):
-                if not math.isnan(own):
-                    table.setdefault(line, {})[int(metrics["episode"])] = float(own)
-    return table
+            for line, value in readings.get(metric.name, {}).items():
+                name = f"{metric.name}.{line}" if line else metric.name
+                curves.setdefault(name, {})[record.episode] = value
+    return curves
 
 
 def loop_means(recording: Recording) -> dict[str, float]:
