@@ -11,7 +11,7 @@ Without a scene the names are `state 17` and `action 3`.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -131,6 +131,11 @@ def exploration_in_words(mask: int, learners: Sequence[str]) -> str:
     if not explorers or len(explorers) == len(learners):
         return "explored" if explorers else ""
     return f"{' and '.join(explorers)} explored"
+
+
+def rewards_in_words(rewards: Iterable[float]) -> str:
+    """Return the rewards of all learners in a step: `-1 and 20`."""
+    return " and ".join(f"{reward:g}" for reward in rewards)
 
 
 def event_in_words(name: str) -> str:

@@ -15,7 +15,13 @@ import numpy as np
 
 from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.tables import own_actions_in_words
-from runner.environments.naming import actions_in_words, agent_actions, exploration_in_words, states_in_words
+from runner.environments.naming import (
+    actions_in_words,
+    agent_actions,
+    exploration_in_words,
+    rewards_in_words,
+    states_in_words,
+)
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
@@ -210,7 +216,7 @@ def _outcome_text(divergence: Divergence, a: Recording, b: Recording) -> str:
     if divergence.field in ("state", "next_state"):
         values = [states_in_words(run.mdp)[state] for run, state in zip((a, b), values, strict=True)]
     elif divergence.field == "rewards":
-        name, values = "reward", [" and ".join(f"{reward:g}" for reward in rewards) for rewards in values]
+        name, values = "reward", list(map(rewards_in_words, values))
     return f"{name} {values[0]} in A, {values[1]} in B"
 
 

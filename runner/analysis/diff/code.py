@@ -52,7 +52,7 @@ def code_changes(a: Recording, b: Recording) -> list[FileChange]:
     ours, theirs = a.code, b.code
     if not (ours.files or ours.patch) or not (theirs.files or theirs.patch):
         return []
-    commits = [one.provenance.get("git", "").removesuffix("-dirty") for one in (a, b)]
+    commits = [run.provenance.get("git", "").removesuffix("-dirty") for run in (a, b)]
     parts = patch_parts(ours.patch), patch_parts(theirs.patch)
     changes: list[FileChange] = []
     for path in sorted({*ours.files, *theirs.files, *parts[0], *parts[1]}):

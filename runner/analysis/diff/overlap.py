@@ -68,10 +68,7 @@ class VisitsDiff:
 def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Lengths, Lengths]]:
     """Return how far the training of two runs is the same, and the visits to each state, [S], of either."""
     left, right = _Steps(a), _Steps(b)
-    episodes = 0
-    equal_episodes = 0
-    equal_steps = 0
-    compared = 0
+    episodes = equal_episodes = equal_steps = compared = 0
     total = np.zeros(2, np.int64)
     for ours, theirs in _common_lengths(a, b):
         agree = _agreement(left, right, ours, theirs)
@@ -106,15 +103,15 @@ def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Lengths, Lengt
     An episode longer than that comes alone.
     """
     lengths = [unbroken(recording) for recording in (a, b)]
-    episodes = min(count for _, count in lengths)
-    for first in range(0, episodes, _BATCH_EPISODES):
-        last = min(first + _BATCH_EPISODES, episodes)
+    common = min(count for _, count in lengths)
+    for first in range(0, common, _BATCH_EPISODES):
+        last = min(first + _BATCH_EPISODES, common)
         records = [recording.train.episodes.array(first, last) for recording in (a, b)]
         whole = min(
-            int(np.searchsorted(one["last_step"], steps))
-            for one, (steps, _) in zip(records, lengths, strict=True)
+            int(np.searchsorted(episodes["last_step"], steps))
+            for episodes, (steps, _) in zip(records, lengths, strict=True)
         )
-        ours, theirs = (one["length"][:whole].astype(np.int64) for one in records)
+        ours, theirs = (episodes["length"][:whole].astype(np.int64) for episodes in records)
         longer = np.maximum(ours, theirs)
         apart = np.diff(np.cumsum(longer) // _BATCH_STEPS) > 0
         apart |= (longer[:-1] > _BATCH_STEPS) | (longer[1:] > _BATCH_STEPS)
@@ -163,9 +160,9 @@ class _Steps:
         if block is None:
             return False
         states = len(self._visits)
-        if (found := int(block["state"].max(initial=0))) >= states:
+        if (highest := int(block["state"].max(initial=0))) >= states:
             raise RecordingError(
-                f"{self._path}: found state {found} in training step {block['step'][0]} or soon after, "
+                f"{self._path}: found state {highest} in training step {block['step'][0]} or soon after, "
                 f"expected less than {states}; `dualtaxi verify` names the step."
             )
         self._visits += np.bincount(block["state"], minlength=states)
@@ -196,10 +193,10 @@ def _agreeing_pairs(left: Block, right: Block, ours: Lengths, theirs: Lengths) -
     if len(left) == len(right) == len(ours):
         return np.flatnonzero(~differing_rows(left, right, _ALIGNED))
     agree = np.flatnonzero(left["state"][ours] == right["state"][theirs])  # most that differ do so there
-    chosen = [
+    pairs = [
         _without_fields(steps)[at[agree]].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
     ]
-    return agree[~differing_rows(chosen[0], chosen[1], _ALIGNED)]
+    return agree[~differing_rows(pairs[0], pairs[1], _ALIGNED)]
 
 
 def _without_fields(steps: Block) -> NDArray[np.void]:

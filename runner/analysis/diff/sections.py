@@ -35,12 +35,12 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
         _code(difference.code),
         _values("Provenance", difference, "provenance"),
     ]
-    filled = [section for section in all_sections if section.sentences or section.grids]
     if everything:
         return [
-            section if section in filled else Section(section.title, ["the same"]) for section in all_sections
+            section if section.sentences or section.grids else Section(section.title, ["the same"])
+            for section in all_sections
         ]
-    return filled
+    return [section for section in all_sections if section.sentences or section.grids]
 
 
 def _runs(difference: RunDiff) -> Section:
@@ -126,7 +126,7 @@ def made_sections(a: Recording, b: Recording) -> tuple[str, Section, Section]:
     """Return how differently two runs were made: in a sentence, the code, and all of the provenance."""
     files, changes = code_changes(a, b), changes_in(a.provenance, b.provenance)
     provenance = Section("Provenance", [] if changes else ["the same"], _changes_grid(changes))
-    missing = [f"{name} has no recorded code." for name, one in (("A", a), ("B", b)) if not one.code.files]
+    missing = [f"{name} has no recorded code." for name, run in (("A", a), ("B", b)) if not run.code.files]
     code = _code(files)
     if not code.sentences:
         code = Section("Code", missing or ["the same, as far as it is recorded"])
@@ -163,18 +163,13 @@ def _environment(difference: RunDiff) -> Section:
 
 
 def _training(difference: RunDiff) -> Section:
-    overlap, divergence, cause = difference.overlap, difference.divergence, difference.cause
-    sentences, grids = [], []
-    if divergence is not None:
-        sentences.append(divergence_in_words(divergence, cause))
-        sentences += updates_in_words(cause)
-        grids += _q_rows(cause)
-    elif overlap is not None:
-        sentences.append("Training is the same, step by step.")
-    if divergence is not None:
-        sentences += overlap_in_words(difference)
-        grids += visits_grids(difference)
-    return Section("Training", sentences, grids)
+    divergence, cause = difference.divergence, difference.cause
+    if divergence is None:
+        same = [] if difference.overlap is None else ["Training is the same, step by step."]
+        return Section("Training", same)
+    where = divergence_in_words(divergence, cause)
+    sentences = [where, *updates_in_words(cause), *overlap_in_words(difference)]
+    return Section("Training", sentences, [*_q_rows(cause), *visits_grids(difference)])
 
 
 def overlap_in_words(difference: RunDiff) -> list[str]:
@@ -200,7 +195,7 @@ def visits_grids(difference: RunDiff) -> list[Grid]:
     visits = difference.visits
     if visits is None or not visits.most_apart:
         return []
-    rows = [(one.state, f"{one.a:,}", f"{one.b:,}") for one in visits.most_apart]
+    rows = [(state.state, f"{state.a:,}", f"{state.b:,}") for state in visits.most_apart]
     return [Grid(("training steps in a state, where the shares differ most", "A", "B"), rows)]
 
 
@@ -304,12 +299,9 @@ def _tables(difference: RunDiff) -> Section:
     ]
     headings = ("episode", "agent", "largest", "mean", "other greedy action", "weighted by visits")
     last = differing[-1]
+    heading = f"largest differences of {spoken(last.agent)} after {counted(last.episode, 'episode')}"
     cells = [(f"{cell.state}: {cell.action}", f"{cell.a:.6g}", f"{cell.b:.6g}") for cell in last.cells]
-    where = Grid(
-        (f"largest differences of {spoken(last.agent)} after {counted(last.episode, 'episode')}", "A", "B"),
-        cells,
-    )
-    return Section("Q-tables", grids=[Grid(headings, rows), where])
+    return Section("Q-tables", grids=[Grid(headings, rows), Grid((heading, "A", "B"), cells)])
 
 
 def _metrics(difference: RunDiff, everything: bool) -> Section:

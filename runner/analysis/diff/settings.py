@@ -101,7 +101,7 @@ def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
 
 def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
     """Return how the descriptions of two environments and their spaces differ."""
-    described = [{"spaces": one.spaces, **one.environment} for one in (a, b)]
+    described = [{"spaces": recording.spaces, **recording.environment} for recording in (a, b)]
     return EnvironmentDiff(changes_in(*described))
 
 

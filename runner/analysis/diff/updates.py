@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.analysis.diff.tables import own_actions_in_words
 from runner.config import from_mapping
-from runner.environments.naming import states_in_words
+from runner.environments.naming import rewards_in_words, states_in_words
 from runner.learning.learner import NamedTables
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.recording.reader import Recording
@@ -43,10 +43,10 @@ def replay_to(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay],
     replays = [TableReplay(recording, start) for recording in (a, b)]
     update = None
     if _are_equal(replays):
-        for step in range(start, stop, _BATCH_STEPS):
-            place = _first_other_update(replays, step, min(step + _BATCH_STEPS, stop))
-            if place is not None:
-                update = _describe_update(a, b, place, replays)
+        for first in range(start, stop, _BATCH_STEPS):
+            step = _first_other_update(replays, first, min(first + _BATCH_STEPS, stop))
+            if step is not None:
+                update = _describe_update(a, b, step, replays)
                 break
     for replay in replays:
         replay.advance(stop)
@@ -95,7 +95,7 @@ def _first_other_update(replays: Sequence[TableReplay], start: int, stop: int) -
 
 def _copy(replay: TableReplay) -> list[NamedTables]:
     """Return a copy of all that the learners hold now."""
-    return [{name: array.copy() for name, array in one.items()} for one in replay.named_tables]
+    return [{name: array.copy() for name, array in tables.items()} for tables in replay.named_tables]
 
 
 def _are_equal(replays: Sequence[TableReplay]) -> bool:
@@ -132,9 +132,8 @@ def _reasons(a: Recording, b: Recording, records: Sequence[np.void]) -> list[str
     reasons = []
     rewards = [record["rewards"].tolist() for record in records]
     if rewards[0] != rewards[1]:
-        reasons.append(
-            f"the reward was {_rewards_in_words(rewards[0])} in A, {_rewards_in_words(rewards[1])} in B"
-        )
+        in_a, in_b = map(rewards_in_words, rewards)
+        reasons.append(f"the reward was {in_a} in A, {in_b} in B")
     for name in ("step_size", "discount"):
         schedules = [compile_schedule(getattr(config, name)) for config in configs]
         x, y = (float(schedule_value(schedule, episode, step)) for schedule in schedules)
@@ -156,8 +155,3 @@ def _reasons(a: Recording, b: Recording, records: Sequence[np.void]) -> list[str
         if matters and has[0] != has[1]:
             reasons.append(f"{'A' if has[0] else 'B'} {text} (quirks.{name})")
     return reasons
-
-
-def _rewards_in_words(rewards: Sequence[float]) -> str:
-    """Return the rewards of all learners in a step: `-1 and 20`."""
-    return " and ".join(f"{reward:g}" for reward in rewards)

@@ -29,7 +29,13 @@ from runner.analysis.sections import Grid, Section
 from runner.analysis.series import read_series
 from runner.drawing import svg
 from runner.environments.mdp import Mdp
-from runner.environments.naming import agent_actions_in_words, exploration_in_words, spoken, states_in_words
+from runner.environments.naming import (
+    agent_actions_in_words,
+    exploration_in_words,
+    rewards_in_words,
+    spoken,
+    states_in_words,
+)
 from runner.export.plots.comparisons import tables_svg
 from runner.export.plots.curves import Plot, plots_of
 from runner.export.reports.maps import drawn, on_grid, situation, situation_in_words
@@ -168,7 +174,7 @@ def _picture(recording: Recording, step: np.void, title: str, after: bool) -> St
     text = state_text
     if after:
         explored = exploration_in_words(int(step["explored"]), recording.agents) or "greedy"
-        rewards = " and ".join(f"{reward:g}" for reward in step["rewards"])
+        rewards = rewards_in_words(step["rewards"])
         end = "; the end" if step["terminated"] else "; the step limit" if step["truncated"] else ""
         text = f"{agent_actions_in_words(mdp)[int(step['action'])]} ({explored}); reward {rewards}{end}"
     if (drawing := svg.drawing_of(mdp)) is None:
