@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeVar
 
 from runner.analysis.axes import Axis
-from runner.analysis.series import RunSeries
+from runner.analysis.series import RunSeries, lines_in
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS, SHARES
 from runner.util.humanize import listed, setting
 from runner.util.values import flatten
+
+Key = TypeVar("Key", bound=Hashable)
 
 _NOT_CONTENT: Final = ("seeds", "recording", "name")
 _TRAINING_METRICS: Final = ("training.mean_return", "training.mean_reward", "training.mean_length")
@@ -35,17 +37,15 @@ class Group:
     @property
     def described(self) -> str:
         """The label and the runs: `quick, 3 runs (k3v9m2xq seed 0, ...)`."""
-        shown = listed(
-            [
-                run.run_id
-                + ("" if run.seed is None else f" seed {run.seed}")
-                + ("" if run.finished else f", {run.status}")
-                for run in self.runs
-            ]
-        )
+        runs = [
+            run.run_id
+            + ("" if run.seed is None else f" seed {run.seed}")
+            + ("" if run.finished else f", {run.status}")
+            for run in self.runs
+        ]
         count = f"{len(self.runs)} runs: " if len(self.runs) > 1 else "run "
         again = f"; left out, as they are the same: {listed(self.left_out)}" if self.left_out else ""
-        return f"{self.label} ({count}{shown}{again})"
+        return f"{self.label} ({count}{listed(runs)}{again})"
 
 
 def groups_of(series: Sequence[RunSeries]) -> list[Group]:
@@ -55,11 +55,7 @@ def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     seed the finished and then the last given counts; of loops, which a seed need not distinguish, the last of
     those of one content.
     """
-    by_content: dict[Hashable, list[RunSeries]] = {}
-    for run in series:
-        by_content.setdefault((run.name, _content(run)), []).append(run)
-    runs_of = list(by_content.values())
-    return _labelled(runs_of, [runs[0].name for runs in runs_of])
+    return _labelled(_gathered(series, lambda run: (run.name, _content(run))).values())
 
 
 def grouped(
@@ -80,15 +76,11 @@ def grouped(
     Raises:
         RunnerError: no run has a value of that path.
     """
-    by_value: dict[str, list[RunSeries]] = {}
     content = _content_without_task if across_tasks else _content
-    key = content if by is None else _value_at(by, series)
-    for run in series:
-        by_value.setdefault(key(run), []).append(run)
     if by is None:
-        names = [" / ".join(dict.fromkeys(run.name for run in runs)) for runs in by_value.values()]
-        groups = _labelled(list(by_value.values()), names)
+        groups = _labelled(_gathered(series, content).values())
     else:
+        by_value = _gathered(series, _value_at(by, series))
         groups = [_group(f"{by} = {value}", runs) for value, runs in by_value.items()]
     notes = duplicates(groups)
     for group in groups:
@@ -137,17 +129,10 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
         RunnerError: no run has one of them, or any at all.
     """
     by_name: dict[str, list[tuple[str, str]]] = {}
-    pairs = {
-        (metric, line): None
-        for group in groups
-        for run in group.runs
-        for _, readings in (*run.evaluation, *run.training)
-        for metric, lines in readings.items()
-        for line in (lines if metric != SHARES else ())
-    }
-    for metric, line in pairs:
-        for name in {metric, f"{metric}.{line}" if line else metric}:
-            by_name.setdefault(name, []).append((metric, line))
+    for metric, line in lines_in(run for group in groups for run in group.runs):
+        if metric != SHARES:
+            for name in {metric, f"{metric}.{line}" if line else metric}:
+                by_name.setdefault(name, []).append((metric, line))
     if not by_name:
         raise RunnerError(
             "found neither an evaluation nor a report of training in any run, so there is nothing to compare."
@@ -155,9 +140,11 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     usual = [metric.name for metric in METRICS]
     if not any(metric.name in by_name for metric in METRICS if metric.requires == "success_events"):
         usual.sort(key=lambda name: name != "mean_return")  # without a goal the return says most
-    names = list(chosen)
-    for some in (usual, _TRAINING_METRICS):
-        names = names or [name for name in some if name in by_name]
+    names = (
+        chosen
+        or [name for name in usual if name in by_name]
+        or [name for name in _TRAINING_METRICS if name in by_name]
+    )
     for name in names:
         if name not in by_name:
             expected = ", ".join(sorted(by_name))
@@ -185,7 +172,9 @@ def _content_without_task(run: RunSeries) -> str:
         if not isinstance(value, Mapping):
             return value
         return {
-            key: stripped(own) for key, own in value.items() if not (isinstance(own, str) and own in names)
+            key: stripped(item)
+            for key, item in value.items()
+            if not (isinstance(item, str) and item in names)
         }
 
     config = {k: stripped(v) for k, v in run.config.items() if k not in (*_NOT_CONTENT, "env")}
@@ -205,31 +194,50 @@ def _group(label: str, runs: Sequence[RunSeries]) -> Group:
     return Group(label, unique, tuple(run.run_id for run in runs if run not in unique))
 
 
-def _labelled(runs_of: Sequence[Sequence[RunSeries]], names: Sequence[str]) -> list[Group]:
-    """Return a group for each sequence of runs, labelled by its name and the values in which it differs."""
-    flat = [flat_config(runs[0].config) for runs in runs_of]
+def _gathered(series: Iterable[RunSeries], key: Callable[[RunSeries], Key]) -> dict[Key, list[RunSeries]]:
+    """Return the runs by the key of each, in the order given."""
+    gathered: dict[Key, list[RunSeries]] = {}
+    for run in series:
+        gathered.setdefault(key(run), []).append(run)
+    return gathered
+
+
+def _labelled(runs_of: Iterable[Sequence[RunSeries]]) -> list[Group]:
+    """Return a group for each sequence of runs, labelled by their names and the values in which it differs.
+
+    Only groups of the same names are told apart by values, so that a label stays short.
+    """
+    named = [
+        (" / ".join(dict.fromkeys(run.name for run in runs)), flat_config(runs[0].config), runs)
+        for runs in runs_of
+    ]
     groups = []
-    for name, own, runs in zip(names, flat, runs_of, strict=True):
-        same = [values for values, other in zip(flat, names, strict=True) if other == name]
-        differing = [
-            key
-            for key in sorted({key for values in same for key in values})
-            if not key.startswith("recording.")
-            and any(values.get(key) != same[0].get(key) for values in same)
-        ]
-        if "env.id" in differing:  # the values that repeat it, such as config.env_id, say nothing more
-            differing = [
-                key
-                for key in differing
-                if key == "env.id"
-                or any(
-                    values.get(key) not in (env_id := str(values.get("env.id")), env_id.rpartition(":")[2])
-                    for values in same
-                )
-            ]
-        values = ", ".join(f"{key}={setting(own[key])}" for key in differing if key in own)
+    for name, config, runs in named:
+        differing = _differing_keys([values for other, values, _ in named if other == name])
+        values = ", ".join(f"{key}={setting(config[key])}" for key in differing if key in config)
         groups.append(_group(f"{name}, {values}" if values else name, runs))
     return groups
+
+
+def _differing_keys(configs: Sequence[Mapping[str, object]]) -> list[str]:
+    """Return the keys whose values are not the same in all flat configurations, but for the recording's."""
+    differing = [
+        key
+        for key in sorted({key for config in configs for key in config})
+        if not key.startswith("recording.")
+        and any(config.get(key) != configs[0].get(key) for config in configs)
+    ]
+    if "env.id" not in differing:
+        return differing
+
+    def repeats_id(key: str, config: Mapping[str, object]) -> bool:
+        env_id = str(config.get("env.id"))
+        return config.get(key) in (env_id, env_id.rpartition(":")[2])
+
+    # Values that repeat the environment's id, such as config.env_id, say nothing more.
+    return [
+        key for key in differing if key == "env.id" or not all(repeats_id(key, config) for config in configs)
+    ]
 
 
 def _value_at(path: str, series: Sequence[RunSeries]) -> Callable[[RunSeries], str]:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from runner.analysis.axes import Axis
 from runner.analysis.compare.statistics import iqm_band
 from runner.analysis.groups import Group
-from runner.analysis.series import LOGGED, points_of, title_of
+from runner.analysis.series import LOGGED, lines_in, points_of, title_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF, SHARES
 
@@ -98,9 +98,9 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
     """
     curves: dict[str, list[Curve]] = {}
     for number, group in enumerate(groups):
-        for metric, line in _metrics(group):
-            curve = _curve(number, group, metric, line)
-            if curve is not None:
+        lines = sorted(lines_in(group.runs), key=lambda pair: float(pair[1]) if pair[0] == SHARES else 0)
+        for metric, line in lines:  # rewards by value
+            if (curve := _curve(number, group, metric, line)) is not None:
                 curves.setdefault(metric, []).append(curve)
     if len(groups) > 1:  # as many lines as rewards: too many for several groups, whose mean is shown
         curves.pop(SHARES, None)
@@ -115,18 +115,6 @@ def panels_of(groups: Sequence[Group]) -> list[Panel]:
     ]
 
 
-def _metrics(group: Group) -> list[tuple[str, str]]:
-    """Return the (metric, line) pairs of a group's runs, rewards last and by value."""
-    pairs = dict.fromkeys(
-        (metric, line)
-        for run in group.runs
-        for _, readings in (*run.evaluation, *run.training)
-        for metric, lines in readings.items()
-        for line in lines
-    )
-    return sorted(pairs, key=lambda pair: (pair[0] == SHARES, float(pair[1]) if pair[0] == SHARES else 0.0))
-
-
 def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     """Return the line and the band of a metric, over the runs that have come as far.
 
@@ -139,11 +127,7 @@ def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     if not len(places):
         return None
     values = np.array(
-        [
-            np.interp(places, sorted(points), [points[at] for at in sorted(points)], np.nan, np.nan)
-            for points in runs
-            if points
-        ]
+        [np.interp(places, list(points), list(points.values()), np.nan, np.nan) for points in runs if points]
     )
     inside = ~np.isnan(values).all(axis=0)  # between the end of one run and the beginning of another
     return Curve(number, line, places[inside], *iqm_band(values[:, inside]), values[:, inside])

@@ -129,8 +129,20 @@ def title_of(metric: str) -> tuple[str, str]:
 # --- curves -------------------------------------------------------------------------------------------
 
 
+def lines_in(runs: Iterable[RunSeries]) -> list[tuple[str, str]]:
+    """Return the (metric, line) pairs of which any run has readings."""
+    pairs = (
+        (metric, line)
+        for run in runs
+        for _, readings in (*run.evaluation, *run.training)
+        for metric, lines in readings.items()
+        for line in lines
+    )
+    return list(dict.fromkeys(pairs))
+
+
 def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[float, float]:
-    """Return value by position; a reward that was never paid is 0 percent of the steps.
+    """Return value by position, ascending; a reward that was never paid is 0 percent of the steps.
 
     A line is an agent, a reward, or "". With `aligned`, of the reports of training only those at evaluations
     count, which are at the same episodes in every run of a configuration; all of them if the run has no
@@ -138,14 +150,14 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[flo
     """
     source = run.training if metric.startswith("training.") else run.evaluation
     is_aligned = aligned and run.axis is EPISODES and run.can_train_again
-    at_evaluations = {place for place, _ in run.evaluation} if is_aligned else set()
+    at_evaluations = {at for at, _ in run.evaluation} if is_aligned else set()
     missing = 0.0 if metric == SHARES else np.nan
     points = {
-        place: readings[metric].get(line, missing)
-        for place, readings in source
-        if metric in readings and (not at_evaluations or place in at_evaluations)
+        at: readings[metric].get(line, missing)
+        for at, readings in source
+        if metric in readings and (not at_evaluations or at in at_evaluations)
     }
-    return {place: value for place, value in points.items() if not np.isnan(value)}
+    return {at: value for at, value in sorted(points.items()) if not np.isnan(value)}
 
 
 def parse_target(text: str) -> tuple[str, float]:

@@ -72,9 +72,9 @@ class PairResult:
     """Seeds that only A has."""
     left_out_b: list[Seed]
     median: float
-    """That of the differences A - B, seed by seed; nan without a common seed."""
+    """Median of the differences A - B, seed by seed; nan without a common seed."""
     iqm: Estimate
-    """That of the same differences."""
+    """IQM of the same differences."""
     simultaneous: Estimate
     """The same IQM with an interval that holds together with all others; nan for a single pair."""
     improvement: Estimate
@@ -140,10 +140,10 @@ def compare(
         if moment.kind != "position":
             raise RunnerError(f"found nothing to compare: {results[0].notes[0]}.")
         runs = [run for group in groups for run in group.runs]
-        places = {n for run in runs for name in metrics for n in points_of(run, *name, aligned=True)}
-        before = sorted(n for n in places if n < moment.number)[-1:]
-        after = sorted(n for n in places if n > moment.number)[:1]
-        nearest = " and ".join(f"{place:,g}" for place in before + after)
+        known = {at for run in runs for name in metrics for at in points_of(run, *name, aligned=True)}
+        before = sorted(at for at in known if at < moment.number)[-1:]
+        after = sorted(at for at in known if at > moment.number)[:1]
+        nearest = " and ".join(f"{at:,g}" for at in before + after)
         hint = f"; the nearest are those after {nearest}" if nearest else ""
         raise RunnerError(f"moment: found no values after {moment.axis.moment(moment.number)}{hint}.")
     pairs = [pair for metric in results for pair in metric.pairs]
@@ -210,14 +210,8 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     if moment.kind == "last" and (episodes := last_episodes(metric, groups)):
         title = f"{title}, {episodes}"
     sign = -1.0 if better is False else 1.0
-    finite = sorted(
-        {
-            value
-            for values in present.values()
-            for _, value in values.values()
-            if abs(value) < statistics.NEVER
-        }
-    )
+    numbers = {value for values in present.values() for _, value in values.values()}
+    finite = sorted(value for value in numbers if abs(value) < statistics.NEVER)
     # Evenly spaced levels from the worst value to the best; few where there are few values.
     levels = np.linspace(finite[0], finite[-1], THRESHOLDS) if len(finite) > 1 else np.array(finite)
     thresholds = levels[:: int(sign)]
@@ -235,17 +229,17 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
 
 
 def _group(label: str, values: Measured, thresholds: Values, sign: float) -> GroupResult:
-    own = np.array([value for _, value in values.values()])
+    numbers = np.array([value for _, value in values.values()])
     share, low, high = (
-        column.tolist() for column in statistics.share_at_least(sign * own, sign * thresholds)
+        column.tolist() for column in statistics.share_at_least(sign * numbers, sign * thresholds)
     )
     return GroupResult(
         label=label,
         seeds=list(values),
         run_ids=[run_id for run_ids, _ in values.values() for run_id in run_ids],
-        values=[statistics.bounded(value) for value in own.tolist()],
-        median=statistics.median(own),
-        iqm=statistics.interquartile_mean(own),
+        values=[statistics.bounded(value) for value in numbers.tolist()],
+        median=statistics.median(numbers),
+        iqm=statistics.interquartile_mean(numbers),
         profile=share,
         profile_low=low,
         profile_high=high,
@@ -256,7 +250,6 @@ def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> Pair
     seeds = sorted(ours.keys() & theirs.keys(), key=seed_order)
     left, right = (np.array([values[seed][1] for seed in seeds]) for values in (ours, theirs))
     difference = left - right
-    none = Estimate(np.nan, np.nan, np.nan)
     return PairResult(
         a=a,
         b=b,
@@ -265,8 +258,8 @@ def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> Pair
         left_out_b=sorted(theirs.keys() - ours.keys(), key=seed_order),
         median=statistics.median(difference) if seeds else np.nan,
         iqm=statistics.interquartile_mean(difference),
-        simultaneous=none,
-        improvement=statistics.improvement(sign * left, sign * right) if seeds else none,
+        simultaneous=Estimate(),
+        improvement=statistics.improvement(sign * left, sign * right) if seeds else Estimate(),
         wins=int((sign * difference > 0).sum()),
         ties=int((difference == 0).sum()),
         losses=int((sign * difference < 0).sum()),

@@ -27,6 +27,7 @@ Measured = dict[Seed, tuple[list[str], float]]
 """Seed to the ids of its runs and their value."""
 
 _OF_WHOLE_RUNS: Final[tuple[Kind, ...]] = ("last", "best", "area")
+"""Moments that an option gives by name."""
 
 
 def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
@@ -132,7 +133,7 @@ def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
 
 
 def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
-    """Return a note if the last evaluation comes after different numbers of episodes, ... in the groups."""
+    """Return a note if the last evaluation is not at the same position of the axis in all groups."""
     curves = [
         (group.label, points)
         for group in groups
@@ -225,37 +226,33 @@ def value_of(
     run: RunSeries, metric: str, line: str, moment: Moment, groups: Sequence[Group]
 ) -> tuple[float | None, str]:
     """Return a run's value of a metric, or None and why it has none."""
-    read = points_of(run, metric, line, aligned=True)
-    points = {place: read[place] for place in sorted(read) if math.isfinite(read[place])}
+    curve = points_of(run, metric, line, aligned=True)
+    points = {at: value for at, value in curve.items() if math.isfinite(value)}
     if not points:
         return None, f"has no {metric}{'.' + line if line else ''}"
-    places, values = list(points), list(points.values())
+    positions, values = list(points), list(points.values())
     if moment.kind == "position":
-        value, place = points.get(moment.number), moment.number
-        if moment.axis is not EPISODES and places[0] <= place <= places[-1]:
-            value = float(np.interp(place, places, values))
-        return value, f"has none after {moment.axis.moment(place)}"
+        value, at = points.get(moment.number), moment.number
+        if moment.axis is not EPISODES and positions[0] <= at <= positions[-1]:
+            value = float(np.interp(at, positions, values))
+        return value, f"has none after {moment.axis.moment(at)}"
     if not run.finished:
         return None, "not finished; an episode as the moment takes it as far as it got"
     if moment.kind == "area":
-        every = [other for group in groups for other in group.runs if other.finished]
-        return _area(places, values, *shared_span(every, metric, line))
+        finished = [other for group in groups for other in group.runs if other.finished]
+        first, last = shared_span(finished, metric, line)
+        if first >= last:
+            return None, "it has no part of training in common with the other runs"
+        span = sorted({first, *(at for at in positions if first <= at <= last), last})
+        return mean_height(span, np.interp(span, positions, values).tolist()), ""
     if moment.level is not None:
-        at = first_crossing(points, moment.level)
-        return NEVER if at is None else float(at), ""
-    best = min if higher_is_better(metric, groups) is False else max
-    last = run.recent.get(metric, {}).get(line, values[-1])
-    return best(values) if moment.kind == "best" else last, ""
-
-
-def _area(
-    places: Sequence[float], values: Sequence[float], first: float, last: float
-) -> tuple[float | None, str]:
-    """Return the mean of a curve over a span, or None and why it has none."""
-    if first >= last:
-        return None, "it has no part of training in common with the other runs"
-    span = sorted({first, *(place for place in places if first <= place <= last), last})
-    return mean_height(span, np.interp(span, places, values).tolist()), ""
+        crossing = first_crossing(points, moment.level)
+        value = NEVER if crossing is None else float(crossing)
+    elif moment.kind == "best":
+        value = min(values) if higher_is_better(metric, groups) is False else max(values)
+    else:
+        value = run.recent.get(metric, {}).get(line, values[-1])
+    return value, ""
 
 
 def shared_span(runs: Sequence[RunSeries], metric: str, line: str) -> tuple[float, float]:

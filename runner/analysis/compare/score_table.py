@@ -71,20 +71,20 @@ def parse_table(text: str, name: str) -> dict[str, Bounds]:
             raise RunnerError(f"{name}: found the columns {columns}, expected task, {', '.join(_SCORES)}.")
         rows = [(str(row.pop("task")), row) for row in reader]
     else:
-        rows = [(str(task), own) for task, own in _mapping(text, name).items()]
+        rows = [(str(task), scores) for task, scores in _mapping(text, name).items()]
     table: dict[str, Bounds] = {}
-    for task, own in rows:
+    for task, scores in rows:
         try:
-            zero, one = (float(own[score]) for score in _SCORES)
+            bounds = Bounds(*(float(scores[score]) for score in _SCORES))
         except (KeyError, TypeError, ValueError):
-            zero = math.nan
-            one = math.nan
-        if not math.isfinite(one - zero) or len(own) != len(_SCORES):
-            raise RunnerError(f"{name}: {task}: found {own}, expected finite numbers, random and expert.")
-        if zero == one or task in table:
-            problem = f"{zero:g} as random and as expert" if zero == one else "a second row"
+            bounds = Bounds(math.nan, math.nan)
+        if not math.isfinite(bounds.one - bounds.zero) or len(scores) != len(_SCORES):
+            raise RunnerError(f"{name}: {task}: found {scores}, expected finite numbers, random and expert.")
+        is_equal = bounds.zero == bounds.one
+        if is_equal or task in table:
+            problem = f"{bounds.zero:g} as random and as expert" if is_equal else "a second row"
             raise RunnerError(f"{name}: {task}: found {problem}, expected one row with two different scores.")
-        table[task] = Bounds(zero, one)
+        table[task] = bounds
     if not table:
         raise RunnerError(f"{name}: found no row, expected one for each environment.")
     return table

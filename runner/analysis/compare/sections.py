@@ -105,17 +105,14 @@ def unpaired(pairs: Sequence[PairResult]) -> list[str]:
     """Return which seeds are left out of the pairs, a sentence each."""
     sentences = []
     for pair in pairs:
-        for own, other, seeds in ((pair.a, pair.b, pair.left_out_a), (pair.b, pair.a, pair.left_out_b)):
-            if without := [seed for seed in seeds if isinstance(seed, str)]:
+        against = f"{pair.a} against {pair.b} without"
+        for label, other, seeds in ((pair.a, pair.b, pair.left_out_a), (pair.b, pair.a, pair.left_out_b)):
+            if run_ids := [seed for seed in seeds if isinstance(seed, str)]:
                 sentences.append(
-                    f"{pair.a} against {pair.b} without {listed(without)} of {own}: only runs with a seed "
-                    "can be paired"
+                    f"{against} {listed(run_ids)} of {label}: only runs with a seed can be paired"
                 )
             if numbers := [str(seed) for seed in seeds if not isinstance(seed, str)]:
-                left_out = listed(numbers)
-                sentences.append(
-                    f"{pair.a} against {pair.b} without seed {left_out}, which {own} has and {other} has not"
-                )
+                sentences.append(f"{against} seed {listed(numbers)}, which {label} has and {other} has not")
     return sentences
 
 

@@ -37,15 +37,16 @@ _BAND_RESAMPLES: Final = 2_000
 _TAILS: Final = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
 _SEED: Final = 2021
 _BATCH: Final = 4_000_000
+"""Values that are drawn at a time, which bounds the memory."""
 
 
 @dataclass(frozen=True)
 class Estimate:
     """A statistic and the interval in which it lies with 95 % confidence; nan where there is none."""
 
-    value: float
-    low: float
-    high: float
+    value: float = np.nan
+    low: float = np.nan
+    high: float = np.nan
 
     @property
     def excludes_zero(self) -> bool:
@@ -69,7 +70,7 @@ def median(values: Values) -> float:
 def interquartile_mean(values: Values) -> Estimate:
     """Return the mean of the middle half of the values, and its interval; nan for fewer than four."""
     if len(values) < FEWEST_FOR_IQM:
-        return Estimate(np.nan, np.nan, np.nan)
+        return Estimate()
     low, high = _interval(values, iqm)
     return Estimate(bounded(float(iqm(values, -1))), bounded(float(low)), bounded(float(high)))
 
@@ -82,19 +83,20 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
     bootstrap is that of `interquartile_mean`, for hundreds of positions at once and without SciPy: the IQM of
     a resample is a weighted mean of the sorted values, so that all positions share the weights.
     """
-    is_known = ~np.isnan(values)
+    runs_at = (~np.isnan(values)).sum(axis=0)
     result = np.empty((3, values.shape[1]))
-    for n in np.unique(is_known.sum(axis=0)).tolist():
-        chosen = np.flatnonzero(is_known.sum(axis=0) == n)
-        ordered = np.sort(values[:, chosen], axis=0)[:n]  # NaN is sorted last
+    for n in np.unique(runs_at).tolist():
+        columns = np.flatnonzero(runs_at == n)
+        ordered = np.sort(values[:, columns], axis=0)[:n]  # NaN is sorted last
         if n < FEWEST_FOR_IQM:
-            result[:, chosen] = ordered.mean(axis=0), ordered[0], ordered[-1]
+            result[:, columns] = ordered.mean(axis=0), ordered[0], ordered[-1]
             continue
-        cut, weights = n // 4, _weights(n, _BAND_RESAMPLES, n // 4)
-        result[0, chosen] = ordered[cut : n - cut].mean(axis=0)
-        for start in range(0, len(chosen), _BATCH // _BAND_RESAMPLES):
+        cut = n // 4
+        weights = _weights(n, _BAND_RESAMPLES, cut)
+        result[0, columns] = ordered[cut : n - cut].mean(axis=0)
+        for start in range(0, len(columns), _BATCH // _BAND_RESAMPLES):
             batch = slice(start, start + _BATCH // _BAND_RESAMPLES)
-            result[1:, chosen[batch]] = np.quantile(weights @ ordered[:, batch], _TAILS, axis=0)
+            result[1:, columns[batch]] = np.quantile(weights @ ordered[:, batch], _TAILS, axis=0)
     return result[0], result[1], result[2]
 
 
@@ -102,7 +104,7 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
 def _weights(n: int, resamples: int, cut: int = 0) -> Values:
     """Return the weight of each of n sorted values in the mean of each resample, [resamples, n].
 
-    The mean is that without the `cut` lowest and highest values of the resample.
+    The mean leaves out the `cut` lowest and the `cut` highest values of the resample.
     """
     drawn = np.random.default_rng(_SEED).integers(n, size=(resamples, n))
     kept = np.sort(drawn, axis=1)[:, cut : n - cut] if cut else drawn
@@ -123,8 +125,8 @@ def stratified(
     [resamples]; `cells` are the numbers that it holds for each resample, if more than there are values.
     """
     columns = strata[0].shape[1]
-    value = np.array([float(statistic([own[:, k : k + 1] for own in strata])[0]) for k in range(columns)])
-    if all(len(own) < 2 for own in strata):
+    value = np.array([float(statistic([sample[:, [k]] for sample in strata])[0]) for k in range(columns)])
+    if all(len(sample) < 2 for sample in strata):
         return value, np.full(columns, np.nan), np.full(columns, np.nan)
     resamples = RESAMPLES if columns == 1 else _BAND_RESAMPLES
     batch = max(1, _BATCH // max(cells, sum(map(len, strata))))
@@ -132,11 +134,11 @@ def stratified(
     drawn: list[list[Values]] = [[] for _ in range(columns)]
     for start in range(0, resamples, batch):
         size = min(batch, resamples - start)
-        places = [rng.integers(len(own), size=(len(own), size)) for own in strata]
-        for k in range(columns):
-            samples = [own[:, k][place] for own, place in zip(strata, places, strict=True)]
-            drawn[k].append(statistic(samples))
-    ends = np.quantile([np.concatenate(own) for own in drawn], _TAILS, axis=1)
+        rows = [rng.integers(len(sample), size=(len(sample), size)) for sample in strata]
+        for k in range(columns):  # all columns share the draws
+            resampled = [sample[:, k][at] for sample, at in zip(strata, rows, strict=True)]
+            drawn[k].append(statistic(resampled))
+    ends = np.quantile([np.concatenate(batches) for batches in drawn], _TAILS, axis=1)
     return value, ends[0], ends[1]
 
 
@@ -158,7 +160,7 @@ def bootstrap_ratio(numerator: Values, denominator: Values) -> Estimate:
     """Return the ratio of two means over the same seeds, [seeds], and its percentile bootstrap interval."""
     n, value = len(numerator), float(numerator.mean() / denominator.mean()) if denominator.any() else np.nan
     if n < 2 or np.isnan(value):
-        return Estimate(value, np.nan, np.nan)
+        return Estimate(value)
     weights = _weights(n, RESAMPLES)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = (weights @ numerator) / (weights @ denominator)
@@ -175,7 +177,7 @@ def improvement(a: Values, b: Values) -> Estimate:
     """
     value = 0.5 + 0.5 * float(np.sign(a[:, np.newaxis] - b).mean())
     if min(len(a), len(b)) < 2:
-        return Estimate(value, np.nan, np.nan)
+        return Estimate(value)
     low = 1.0 - _highest_probability(1.0 - value, len(a), len(b))
     return Estimate(value, low, _highest_probability(value, len(a), len(b)))
 

@@ -145,12 +145,13 @@ def compare_tasks(
     bounds = _bounds(tasks, by_label, table, better is False, own_notes)
     tasks = list(bounds)
     scores = {
-        label: {task: bounds[task].score(own[task]) for task in tasks} for label, own in by_label.items()
+        label: {task: bounds[task].score(values[task]) for task in tasks}
+        for label, values in by_label.items()
     }
-    every = np.concatenate([values for own in scores.values() for values in own.values()])
-    thresholds = np.linspace(float(every.min()), float(every.max()), POINTS)
+    all_scores = np.concatenate([values for by_task in scores.values() for values in by_task.values()])
+    thresholds = np.linspace(float(all_scores.min()), float(all_scores.max()), POINTS)
     if moment.kind != "position":  # which takes runs that are not finished too
-        groups = [replace(each, runs=tuple(run for run in each.runs if run.finished)) for each in groups]
+        groups = [replace(group, runs=tuple(run for run in group.runs if run.finished)) for group in groups]
     first, last = shared_span(_runs(groups, tasks), *metric)
     # The positions that every run in these environments covers, evenly spaced.
     positions = np.linspace(first, last, POINTS) if first < last else np.array([float(last)])
@@ -162,8 +163,8 @@ def compare_tasks(
     own_notes += few_seeds(groups, {result.label: min(result.seeds.values()) for result in results})
     if moment.kind == "last":
         for task in tasks:
-            here = [replace(each, runs=tuple(_runs([each], [task]))) for each in groups]
-            own_notes += [f"{task}: {note}" for note in uneven_ends(here, *metric)]
+            in_task = [replace(group, runs=tuple(_runs([group], [task]))) for group in groups]
+            own_notes += [f"{task}: {note}" for note in uneven_ends(in_task, *metric)]
     return TaskComparison(
         metric=".".join(filter(None, metric)),
         title=title_of(metric[0])[0],
@@ -189,32 +190,31 @@ def _values(
 ) -> Iterator[tuple[str, Values]]:
     """Yield each environment of a group with the values of its seeds, in the order of the seeds."""
     for task in dict.fromkeys(run.environment for run in group.runs):
-        own = replace(
-            group,
-            label=f"{group.label} in {task}",
-            runs=tuple(run for run in group.runs if run.environment == task),
-        )
-        if values := measured(own, *metric, moment, groups, notes):
+        in_task = replace(group, label=f"{group.label} in {task}", runs=tuple(_runs([group], [task])))
+        if values := measured(in_task, *metric, moment, groups, notes):
             yield task, np.array([value for _, value in values.values()])
 
 
-def _common_tasks(found: Mapping[str, Mapping[str, Values]], notes: list[str]) -> list[str]:
-    every = list(dict.fromkeys(task for own in found.values() for task in own))
-    tasks = [task for task in every if all(task in own for own in found.values())]
+def _common_tasks(by_label: Mapping[str, Mapping[str, Values]], notes: list[str]) -> list[str]:
+    """Return the environments in which all groups have values; `notes` gets the others."""
+    all_tasks = list(dict.fromkeys(task for by_task in by_label.values() for task in by_task))
+    tasks = [task for task in all_tasks if all(task in by_task for by_task in by_label.values())]
     if not tasks:
-        listing = "; ".join(f"{label}: {listed(list(own)) or 'none'}" for label, own in found.items())
+        listing = "; ".join(
+            f"{label}: {listed(list(by_task)) or 'none'}" for label, by_task in by_label.items()
+        )
         raise RunnerError(
             f"normalise: found no environment that all have a value in ({listing}), expected one at least; "
             "group the runs otherwise, such as by name."
         )
-    if left_out := [task for task in every if task not in tasks]:
+    if left_out := [task for task in all_tasks if task not in tasks]:
         notes.append(f"left out, as not every group has a value there: {listed(left_out)}")
     return tasks
 
 
 def _bounds(
     tasks: Sequence[str],
-    found: Mapping[str, Mapping[str, Values]],
+    by_label: Mapping[str, Mapping[str, Values]],
     table: Mapping[str, Bounds] | None,
     lower_is_better: bool,
     notes: list[str],
@@ -229,7 +229,7 @@ def _bounds(
     bounds = {}
     equal = []
     for task in tasks:
-        values = np.concatenate([own[task] for own in found.values()])
+        values = np.concatenate([by_task[task] for by_task in by_label.values()])
         low, high = float(values.min()), float(values.max())
         if low == high:
             equal.append(f"{task} ({low:g})")
@@ -266,8 +266,8 @@ def _result(
     label: str, scores: Mapping[str, Values], thresholds: Values, curves: Sequence[Values]
 ) -> AlgorithmResult:
     """Return the statistics of an algorithm; `curves` has [seeds, positions] for each environment."""
-    own = [values[:, np.newaxis] for values in scores.values()]
-    reached = [(values >= thresholds).astype(np.float64) for values in own]
+    strata = [values[:, np.newaxis] for values in scores.values()]
+    reached = [(values >= thresholds).astype(np.float64) for values in strata]
     profile = [
         part.tolist()
         for part in statistics.stratified(reached, lambda drawn: np.concatenate(drawn).mean(axis=0))
@@ -277,10 +277,10 @@ def _result(
         label=label,
         seeds={task: len(values) for task, values in scores.items()},
         scores={task: values.tolist() for task, values in scores.items()},
-        iqm=_estimate(own, _iqm),
-        median=_estimate(own, lambda drawn: np.median([task.mean(axis=0) for task in drawn], axis=0)),
-        mean=_estimate(own, lambda drawn: np.mean([task.mean(axis=0) for task in drawn], axis=0)),
-        optimality_gap=_estimate(own, lambda drawn: 1 - np.minimum(np.concatenate(drawn), 1).mean(axis=0)),
+        iqm=_estimate(strata, _iqm),
+        median=_estimate(strata, lambda drawn: np.median([task.mean(axis=0) for task in drawn], axis=0)),
+        mean=_estimate(strata, lambda drawn: np.mean([task.mean(axis=0) for task in drawn], axis=0)),
+        optimality_gap=_estimate(strata, lambda drawn: 1 - np.minimum(np.concatenate(drawn), 1).mean(axis=0)),
         profile=profile[0],
         profile_low=profile[1],
         profile_high=profile[2],
@@ -306,10 +306,10 @@ def _improvement(a: Mapping[str, Values], b: Mapping[str, Values]) -> Estimate:
 
     def probability(drawn: Sequence[Values]) -> Values:
         pairs = zip(drawn[::2], drawn[1::2], strict=True)
-        signs = [np.sign(own[:, np.newaxis] - other).mean(axis=(0, 1)) for own, other in pairs]
+        signs = [np.sign(ours[:, np.newaxis] - theirs).mean(axis=(0, 1)) for ours, theirs in pairs]
         return np.asarray(0.5 + 0.5 * np.mean(signs, axis=0))
 
-    strata = [own[task][:, np.newaxis] for task in a for own in (a, b)]
+    strata = [scores[task][:, np.newaxis] for task in a for scores in (a, b)]
     return _estimate(strata, probability, cells=max(len(a[task]) * len(b[task]) for task in a))
 
 
@@ -322,11 +322,11 @@ def _curves(
 ) -> list[Values]:
     """Return the scores of a group's seeds at each position, [seeds, positions] for each environment."""
     curves = []
-    for task, own in bounds.items():
+    for task, scale in bounds.items():
         seeds: dict[Seed, list[Values]] = {}
         for run in _runs([group], [task]):
             if points := points_of(run, *metric, aligned=True):
-                values = np.interp(positions, sorted(points), [points[at] for at in sorted(points)])
-                seeds.setdefault(seed_of(run), []).append(own.score(values))
+                values = np.interp(positions, list(points), list(points.values()))
+                seeds.setdefault(seed_of(run), []).append(scale.score(values))
         curves.append(np.array([np.mean(runs, axis=0) for runs in seeds.values()]))
     return curves
