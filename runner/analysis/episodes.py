@@ -215,7 +215,7 @@ def training_step(recording: Recording, at: EpisodeRef) -> int:
 
 
 def reference_to(recording: Recording, step: int) -> EpisodeRef:
-    """Return the reference to a training step of a job, by its episode and its place in it."""
+    """Return the reference to a training step of a job: its episode, and its number within the episode."""
     episode = recording.train.episodes.first_from("last_step", step)
     return EpisodeRef(episode, step - step_of_episode(recording, episode))
 
@@ -238,15 +238,15 @@ def _episode_named(recording: Recording, word: str) -> EpisodeRef:
     of an evaluation is unknown, the first trial after the last training. Without such a trial it is the
     last training episode.
     """
-    last = EpisodeRef(max(0, recording.train.episodes.count() - 1))
     if word not in ("last", TYPICAL):
-        phase, ranked = ranked_episodes(recording)
-        return references(recording, phase, ranked[[-1 if word == BEST else 0]])[0]
+        phase, numbers = ranked_episodes(recording)
+        return references(recording, phase, numbers[[-1 if word == BEST else 0]])[0]
     if word == TYPICAL and recording.eval.has_metrics:
-        evaluation = last_whole_evaluation(recording)
-        return last if evaluation is None else ranked_trials(recording, evaluation)[1]
-    evaluations = evaluations_of(recording) if word == TYPICAL else []
-    return EpisodeRef(after=evaluations[-1].after) if evaluations else last
+        if (evaluation := last_whole_evaluation(recording)) is not None:
+            return ranked_trials(recording, evaluation)[1]
+    elif word == TYPICAL and (evaluations := evaluations_of(recording)):
+        return EpisodeRef(after=evaluations[-1].after)
+    return EpisodeRef(max(0, recording.train.episodes.count() - 1))
 
 
 def references(
@@ -256,7 +256,8 @@ def references(
     if phase == "train":
         return [EpisodeRef(int(number)) for number in numbers]
     evaluations = evaluations_of(recording)
-    at = np.searchsorted([one.stop for one in evaluations], numbers, side="right").tolist()
+    stops = [evaluation.stop for evaluation in evaluations]
+    at = np.searchsorted(stops, numbers, side="right").tolist()
     return [
         EpisodeRef(int(number), after=UNKNOWN_EVALUATION)
         if index == len(evaluations) or number < evaluations[index].start
@@ -308,11 +309,9 @@ def last_whole_evaluation(recording: Recording) -> Evaluation | None:
     A recording that was cut off may have an evaluation's metrics without its trials. The evaluations of a
     loop are the trials that were recorded.
     """
-    episodes, steps = recording.eval.episodes.count(), recording.eval.steps.total()
-    for one in reversed(evaluations_of(recording)):
-        if (
-            one.stop <= episodes
-            and recording.eval.episodes.array(one.stop - 1, one.stop)[0]["last_step"] < steps
-        ):
-            return one
+    steps = recording.eval.steps.total()
+    for evaluation in reversed(evaluations_of(recording)):
+        last = recording.eval.episodes.array(evaluation.stop - 1, evaluation.stop)
+        if len(last) and last[0]["last_step"] < steps:
+            return evaluation
     return None

@@ -48,7 +48,7 @@ class TrainingRecord:
 
 @dataclass(frozen=True)
 class EvaluationRecord:
-    """The results of an evaluation; those of a loop are of the trials between two training episodes."""
+    """The results of an evaluation; a loop's evaluation is its trials between two training episodes."""
 
     number: int
     episode: int
@@ -59,7 +59,7 @@ class EvaluationRecord:
     successes: int | None
     """None if the environment does not define success."""
     values: Mapping[str, Mapping[str, float | None]]
-    """Name of a metric to its values: by agent, or under the empty name; None where unknown."""
+    """Metric to its values by agent, or to one value under the empty name; None where unknown."""
     terminations: int
     events: Mapping[str, int]
     """Event to its count over all trials."""
@@ -158,14 +158,14 @@ def evaluations_of(recording: Recording) -> list[Evaluation]:
     return [
         Evaluation(after, int(steps[after]), start, start + trials, number)
         for number, (after, start, trials) in enumerate(
-            zip(*(each.tolist() for each in distinct), strict=True)
+            zip(*(column.tolist() for column in distinct), strict=True)
         )
     ]
 
 
 def evaluation_after(evaluations: Sequence[Evaluation], episodes: int, where: str) -> Evaluation:
     """Return the evaluation after a number of training episodes."""
-    by_episodes = {one.after: one for one in evaluations}
+    by_episodes = {evaluation.after: evaluation for evaluation in evaluations}
     if episodes in by_episodes:
         return by_episodes[episodes]
     available = "it has none at all."
@@ -185,7 +185,10 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     if recording.eval.has_metrics:
         return [evaluation_record(metrics, agents, events) for metrics in recording.eval.all_metrics()]
     trials = recording.eval.episodes.array()
-    return [_loop_record(recording, one, trials[one.start : one.stop]) for one in evaluations_of(recording)]
+    return [
+        _loop_record(recording, evaluation, trials[evaluation.start : evaluation.stop])
+        for evaluation in evaluations_of(recording)
+    ]
 
 
 def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[str]) -> EvaluationRecord:
@@ -197,10 +200,10 @@ def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[
         trials=metrics["trials"],
         successes=metrics["successes"] if metrics["successes"] >= 0 else None,
         values={
-            each.name: dict(zip(agents, map(finite, metrics[each.field]), strict=True))
-            if each.per_agent
-            else {"": finite(metrics[each.field])}
-            for each in METRICS
+            metric.name: dict(zip(agents, map(finite, metrics[metric.field]), strict=True))
+            if metric.per_agent
+            else {"": finite(metrics[metric.field])}
+            for metric in METRICS
         },
         terminations=metrics["terminations"],
         events=dict(zip(events, metrics["events"], strict=True)),
@@ -211,12 +214,12 @@ def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[
 def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[np.void]) -> EvaluationRecord:
     agents, environment = recording.agents, recording.environment
     defined = defined_metrics(bool(environment["success_events"]), environment["penalty_below"] is not None)
-    own = {metric.name: metric.of_trials(trials) for metric in defined}
+    of_trials = {metric.name: metric.of_trials(trials) for metric in defined}
     unknown = np.empty(0)
     values = {
-        metric.name: dict(zip(agents, map(metric.of_usable, own[metric.name].T), strict=True))
+        metric.name: dict(zip(agents, map(metric.of_usable, of_trials[metric.name].T), strict=True))
         if metric.per_agent
-        else {"": metric.of_usable(own.get(metric.name, unknown))}
+        else {"": metric.of_usable(of_trials.get(metric.name, unknown))}
         for metric in METRICS
     }
     counts = trials["events"].sum(axis=0, dtype=int).tolist()
@@ -228,8 +231,8 @@ def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[n
         successes=int(trials["success"].sum()) if environment["success_events"] else None,
         values=values,
         terminations=int(trials["terminated"].sum()),
-        events=dict(zip(recording.environment["event_names"], counts, strict=True)),
-        not_finite=sum(int((~is_usable(each)).sum()) for each in own.values()),
+        events=dict(zip(environment["event_names"], counts, strict=True)),
+        not_finite=sum(int((~is_usable(numbers)).sum()) for numbers in of_trials.values()),
     )
 
 
@@ -259,22 +262,21 @@ def loop_summary(recording: Recording) -> Summary:
     It has `last_evaluation` (None without one), `recent_training`, and `logged`, the last value logged under
     each name. A value that is unknown or not finite is None.
     """
-    evaluations, last = evaluations_of(recording), None
-    if evaluations:
-        trials = recording.eval.episodes.array(evaluations[-1].start, evaluations[-1].stop)
-        last = _loop_record(recording, evaluations[-1], trials).summary()
-    logged = (
-        recording.result.logged
-        if "logged" in recording.result
-        else {one["name"]: finite(one["value"]) for one in recording.table(schema.SCALAR_TOPIC).decoded()}
-    )
+    last = None
+    for evaluation in evaluations_of(recording)[-1:]:
+        trials = recording.eval.episodes.array(evaluation.start, evaluation.stop)
+        last = _loop_record(recording, evaluation, trials).summary()
+    logged = recording.result.logged
+    if "logged" not in recording.result:  # the loop did not finish
+        scalars = recording.table(schema.SCALAR_TOPIC).decoded()
+        logged = {scalar["name"]: finite(scalar["value"]) for scalar in scalars}
     return Summary(last_evaluation=last, recent_training=recording.train.recent_means(), logged=logged)
 
 
 def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False) -> dict[str, list[str]]:
-    """Return position and metrics of evaluations as text, by heading; a loop's leave out unknown metrics.
+    """Return position and metrics of evaluations as text, by heading, without metrics unknown of a loop.
 
-    Narrow ones join the values of several agents: `-800.0/-812.5`.
+    Narrow columns join the values of several agents: `-800.0/-812.5`.
     """
     is_job = records[0].training is not None
     columns = {"episode": [f"{record.episode:,}" for record in records]}
@@ -284,26 +286,26 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
         if not is_job and all(record.value(metric.name) is None for record in records):
             continue
         values = [record.values[metric.name] for record in records]
-        texts = [list(map(humanize.number, own.values())) for own in values]
+        texts = [list(map(humanize.number, by_agent.values())) for by_agent in values]
         if is_narrow or len(texts[0]) == 1:
-            columns[metric.heading] = ["/".join(own) for own in texts]
+            columns[metric.heading] = list(map("/".join, texts))
             continue
-        for agent, *own in zip(values[0], *texts, strict=True):
-            columns[f"{metric.heading} {spoken(agent)}"] = own
+        for agent, *column in zip(values[0], *texts, strict=True):
+            columns[f"{metric.heading} {spoken(agent)}"] = column
     return columns
 
 
 def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord]) -> Section:
-    """Return evaluations of a recording, one at least, as a table; a loop's leaves out unknown metrics."""
+    """Return evaluations of a recording, one at least, as a table, without metrics unknown of a loop."""
     columns = list(metric_columns(records).items())
     for name in recording.environment["event_names"]:
         agent, dot, _ = name.rpartition(".")
         words = event_in_words(name)
         heading = f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words
         columns.append((heading, [f"{record.events[name]:,}" for record in records]))
-    filled = [list(record.training.percent_filled.values()) for record in records if record.training]
+    filled = [record.training.percent_filled.values() for record in records if record.training]
     if filled:
-        columns.append(("filled %", ["/".join(map(humanize.number, own)) for own in filled]))
+        columns.append(("filled %", ["/".join(map(humanize.number, shares)) for shares in filled]))
     explanation = (
         f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
         "episodes. Events are counted over all trials."

@@ -61,7 +61,9 @@ def evaluations(run: Source) -> pd.DataFrame:
     """
     with _opened(run) as recording:
         records = [_flat(record.as_json()) for record in evaluation_records(recording)]
-        return _frame([{_evaluation_column(key): value for key, value in each.items()} for each in records])
+        return _frame(
+            [{_evaluation_column(key): value for key, value in record.items()} for record in records]
+        )
 
 
 def training(run: Source) -> pd.DataFrame:
@@ -111,7 +113,7 @@ def steps(
     """
     with _opened(run) as recording:
         columns = step_columns(recording, phase, episode=episode, start=start, stop=stop)
-        return _frame({name: list(each) if each.ndim > 1 else each for name, each in columns.items()})
+        return _frame({name: list(values) if values.ndim > 1 else values for name, values in columns.items()})
 
 
 def logged(run: Source) -> pd.DataFrame:
@@ -158,9 +160,9 @@ def transition_columns(mdp: Mdp) -> dict[str, Array]:
         "reward": mdp.summed_rewards[at],
         "is_over": mdp.terminated[at],
     }
-    shared = mdp.rewards.shape[-1] == 1
-    own = {} if shared else _by_name(mdp.rewards[at], [f"reward.{agent}" for agent in mdp.agents])
-    return columns | own
+    if mdp.rewards.shape[-1] > 1:  # else the agents share the reward
+        columns |= _by_name(mdp.rewards[at], [f"reward.{agent}" for agent in mdp.agents])
+    return columns
 
 
 # --- columns ------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """The Q-tables at a step: their size and fill, one state with its history, all values as one array.
 
-Of a job they are exact at every step. A loop's are the arrays of a state's and an action's numbers that it
-recorded by `snapshot`, of each name the latest.
+A job's tables are exact at every step. A loop's tables are the arrays [states, actions] that it recorded by
+`snapshot`, the latest of each name.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class TableSummary(TypedDict):
     lowest: float
     highest: float
     snapshot_step: NotRequired[int]
-    """Of a loop: after how many training steps it was recorded."""
+    """The training steps before a loop recorded it."""
 
 
 class ActionValue(TypedDict):
@@ -51,8 +51,9 @@ class ActionValue(TypedDict):
     """Probability of the action, where the algorithm learns a policy."""
     greedy: bool
     visits: int | None
-    """None if a loop did not record all its steps; so are the changes, of a loop's table."""
+    """None if a loop did not record all its steps."""
     changed_step: int | None
+    """The step that last changed the value; None if none did, and for a loop."""
     changed_episode: int | None
 
 
@@ -88,27 +89,25 @@ class Tables:
         np.save(stream, self.array)
 
     def sections(self) -> list[Section]:
-        """Return the facts of the tables; of a state also the values of each table."""
-        own = self.description
-        facts = {"run": own["run_id"], "step": f"after {own['step']:,} training steps"}
-        for each in own["tables"]:
-            facts[each["agent"]] = (
-                f"{each['states']:,} states, {each['actions']} actions, {each['percent_filled']:.1f} % "
-                f"filled, values from {each['lowest']:.4g} to {each['highest']:.4g}"
+        """Return the facts of the tables; if a state was chosen, also its values in each table."""
+        description = self.description
+        facts = {"run": description["run_id"], "step": f"after {description['step']:,} training steps"}
+        for table in description["tables"]:
+            text = (
+                f"{table['states']:,} states, {table['actions']} actions, {table['percent_filled']:.1f} % "
+                f"filled, values from {table['lowest']:.4g} to {table['highest']:.4g}"
             )
-            if "snapshot_step" in each:
-                facts[each["agent"]] += f"; the latest snapshot, after {each['snapshot_step']:,} steps"
-        if "state" not in own:
-            return [Section("The table", facts=facts)]
-        facts |= {"state": f"{own['state']}: {own['state_in_words']}", "visits": _count(own["visits"])}
-        by_agent = [
-            (each["agent"], [row for row in own["values"] if row["agent"] == each["agent"]])
-            for each in own["tables"]
-        ]
-        return [
-            Section("The table", facts=facts),
-            *(Section(agent, grids=[_state_grid(rows)]) for agent, rows in by_agent),
-        ]
+            if "snapshot_step" in table:
+                text += f"; the latest snapshot, after {table['snapshot_step']:,} steps"
+            facts[table["agent"]] = text
+        by_agent: dict[str, list[ActionValue]] = {}
+        if "state" in description:
+            facts["state"] = f"{description['state']}: {description['state_in_words']}"
+            facts["visits"] = _count(description["visits"])
+            for value in description["values"]:
+                by_agent.setdefault(value["agent"], []).append(value)
+        states = [Section(agent, grids=[_state_grid(rows)]) for agent, rows in by_agent.items()]
+        return [Section("The table", facts=facts), *states]
 
 
 def _state_grid(rows: Sequence[ActionValue]) -> Grid:
@@ -153,12 +152,12 @@ def tables_of(
     if not recording.can_train_again:
         return _describe_snapshots(recording, step, state)
     step = last_step(recording) if step is None else step
-    chosen = None if state is None else state_of(recording.mdp, state)
+    number = None if state is None else state_of(recording.mdp, state)  # before the tables are replayed
     replay = TableReplay(recording, step)
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
     description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
-    if chosen is not None:
-        _add_state(description, recording, replay, chosen)
+    if number is not None:
+        _add_state(description, recording, replay, number)
     return Tables(description, one_array(replay.tables))
 
 
@@ -244,7 +243,7 @@ def _action_values(
 def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the tables as one array, [states, actions], of several learners [learners, states, actions].
 
-    Where learners differ in their actions, the places left over are nan.
+    Where learners differ in their actions, cells beyond a learner's own actions are nan.
     """
     if len(tables) == 1:
         return tables[0]
@@ -271,11 +270,11 @@ def summarize(agent: str, q: NDArray[np.float64]) -> TableSummary:
 def _add_state(description: TablesDescription, recording: Recording, replay: TableReplay, state: int) -> None:
     mdp = recording.mdp
     history = history_of(recording, state, replay.step)
-    joint, own = actions_in_words(mdp), action_names(mdp)
+    joint, of_agents = actions_in_words(mdp), action_names(mdp)
     values: list[ActionValue] = []
     for i, (agent, named) in enumerate(zip(replay.agents, replay.named_tables, strict=True)):
         q = named["q"]
-        names = joint if q.shape[1] == mdp.joint_actions else own[i] if own else range(q.shape[1])
+        names = joint if q.shape[1] == mdp.joint_actions else of_agents[i] if of_agents else range(q.shape[1])
         greedy = int(replay.greedy[i, state])
         for value in _action_values(agent, names, q[state], greedy, history.visits[i]):
             action = value["action"]

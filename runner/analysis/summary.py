@@ -57,7 +57,7 @@ class RecordedExtras:
 
 @dataclass(frozen=True)
 class RunDetails:
-    """All about a run; of one whose recording is missing or unreadable the contents of `run.json`."""
+    """All about a run; if its recording is missing or unreadable, only the contents of `run.json`."""
 
     run: Run
     config: JsonView
@@ -112,7 +112,7 @@ class RunDetails:
             "success_events": list(self.success_events),
             "tables": [table.as_json() for table in self.tables],
             "loop": None if self.loop is None else _loop_as_json(self.loop),
-            "extras": {phase: own.as_json() for phase, own in self.extras.items()},
+            "extras": {phase: extras.as_json() for phase, extras in self.extras.items()},
         }
 
     def as_json(self) -> dict[str, object]:
@@ -159,11 +159,12 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
 
 
 def _extras(recording: Recording) -> dict[str, RecordedExtras]:
-    extras = {phase: recording.phase(phase).extras for phase in schema.PHASES}
     return {
-        phase: RecordedExtras(own.count, {name: (kind.base.name, kind.shape) for name, kind in own.items()})
-        for phase, own in extras.items()
-        if own
+        phase: RecordedExtras(
+            extras.count, {name: (dtype.base.name, dtype.shape) for name, dtype in extras.items()}
+        )
+        for phase in schema.PHASES
+        if (extras := recording.phase(phase).extras)
     }
 
 
@@ -177,8 +178,8 @@ def brief_provenance(provenance: Mapping[str, str]) -> dict[str, str]:
 def random_policy_sentence(recording: Recording) -> str:
     """Return what a random policy achieves in a recording's environment; empty where that is no measure.
 
-    That is so of a loop, whose environment is not known as a table, and of a run that acts at random itself.
-    It takes about a second unless it was computed for this environment before.
+    It is none for a loop, as its environment is not known as a table, and for a run that acts at random.
+    Computing it takes about a second unless it was computed for this environment before.
     """
     from runner.planning.baseline import random_baseline
 
@@ -198,7 +199,7 @@ def _loop_as_json(loop: Summary) -> dict[str, object]:
 
 
 def _tables(recording: Recording) -> tuple[TableFill, ...]:
-    """Return the fill of each table; nothing of a loop, whose learning is its own."""
+    """Return the fill of each table; a loop has none that the runner knows."""
     if not recording.has_tables:
         return ()
     reports = [*recording.train.all_metrics(), *recording.eval.all_metrics()]
