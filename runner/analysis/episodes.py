@@ -56,11 +56,11 @@ class EpisodeRef:
     after: int | None = None
     """The training episodes before the evaluation; None for a training episode."""
     word: str = ""
-    """What stands for the episode until it is looked up in a recording, see `resolved`."""
+    """A word such as `typical`, until `resolved` looks the episode up in a recording; else empty."""
 
     @classmethod
     def parse(cls, at: str | int | Self, expected: str = EXPECTED) -> Self:
-        """Return the reference that a text or the number of a training step is.
+        """Parse a reference, or refer to a training step by its number.
 
         Args:
             at: the text or the number; a reference is returned as it is.
@@ -101,7 +101,7 @@ class EpisodeRef:
 
     @property
     def episode_path(self) -> str:
-        """The address of the episode, below that of its run's replay: `train/120`, `eval/3000/17`."""
+        """The address of the episode, below the replay of its run: `train/120`, `eval/3000/17`."""
         return f"train/{self.episode}" if self.after is None else f"eval/{self.after}/{self.episode}"
 
     @property
@@ -125,7 +125,7 @@ class EpisodeRef:
 
     @property
     def replay(self) -> str:
-        """The address of the replay at the frame after the step, below that of the run."""
+        """The address of the replay at the frame after the step, below the address of the run."""
         return f"replay/{self.episode_path}?t={self.outcome.t}"
 
     def replay_address(self, run_id: str) -> str:

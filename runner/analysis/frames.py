@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from runner.recording.schema import SCALAR_TOPIC
 from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.run import Run
-from runner.util.arrays import Array
+from runner.util.arrays import Array, leaves
 from runner.util.extras import require
 from runner.util.values import flatten
 
@@ -45,7 +45,8 @@ Phase = Literal["train", "eval"]
 
 _BEFORE: Final = ("step", "episode", "t", "environment", "state", "action", "next_state", "next_observation")
 _AFTER: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
-"""The fields of a step in the order of its columns: those before the rewards, and those after them."""
+"""The fields of a step that are columns before, and after, the columns of rewards."""
+_OF_EPISODE: Final = ("episode", "length", "penalties", "success", "terminated", "truncated", "last_step")
 
 
 def evaluations(run: Source) -> pd.DataFrame:
@@ -173,8 +174,7 @@ def episode_columns(
 ) -> dict[str, Array]:
     """Return the columns of `episodes`, an array each."""
     records = recording.phase(phase).episodes.array(start, stop)
-    columns = _plain_columns(records, ("episode", "length", "penalties", "success"))
-    columns |= _plain_columns(records, ("terminated", "truncated", "last_step"))
+    columns = _plain_columns(records, _OF_EPISODE)
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
     return columns | _by_name(records["events"], recording.environment["event_names"])
 
@@ -214,7 +214,8 @@ def step_columns(
     else:
         records = steps_of(recording, phase, episode)
     names = records.dtype.names or ()
-    columns = _spread(_plain_columns(records, [name for name in _BEFORE if name in names]))
+    before = _plain_columns(records, [name for name in _BEFORE if name in names])
+    columns = {path: part for name, values in before.items() for path, part in leaves(name, values)}
     columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
     columns |= _plain_columns(records, [name for name in _AFTER if name in names])
     extras = recording.phase(phase).extras.at(records["step"])
@@ -256,17 +257,6 @@ def _evaluation_column(key: str) -> str:
 def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Array]:
     """Return fields of records as arrays of their own."""
     return {name: records[name].copy() for name in names}
-
-
-def _spread(columns: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
-    """Return columns in which composed values, such as those of a `Dict` space, have one for each part."""
-    spread: dict[str, Array] = {}
-    for name, values in columns.items():
-        if values.dtype.names is None:
-            spread[name] = values
-        else:
-            spread |= _spread({f"{name}.{part}": values[part] for part in values.dtype.names})
-    return spread
 
 
 def _by_name(values: Array, names: Sequence[str]) -> dict[str, Array]:

@@ -51,9 +51,9 @@ class Group:
 def groups_of(series: Sequence[RunSeries]) -> list[Group]:
     """Return the runs by name and configuration, in the order given, labelled by name and by what differs.
 
-    A run that was recorded twice counts once, or it would weigh twice in a median: of a job's runs of one
-    seed the finished and then the last given counts; of loops, which a seed need not distinguish, the last of
-    those of one content.
+    A run that was recorded twice counts once, or it would weigh twice in a median. Of a job's runs with one
+    seed the last finished one counts, or else the last one. Of loops, which may share a seed, the last run of
+    each content counts.
     """
     return _labelled(_gathered(series, lambda run: (run.name, _content(run))).values())
 
@@ -64,7 +64,7 @@ def grouped(
     """Return runs in groups for a comparison, and notes on them, a sentence each.
 
     A group has the runs whose configurations differ in nothing but the seed, whatever their names and however
-    they were recorded; or, with `by`, those that have the same value there. A job that was run twice
+    they were recorded; or, with `by`, the runs that have the same value there. A job that was run twice
     counts once, as in `groups_of`. Several loops of one configuration and seed, such as the workers of one
     training, all count: the value of their seed is the mean over them.
 
@@ -119,7 +119,7 @@ def duplicates(groups: Sequence[Group]) -> list[str]:
 
 
 def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tuple[str, str]]:
-    """Return the (metric, line) pairs to compare: those chosen, or those of evaluations, or of training.
+    """Return the (metric, line) pairs to compare: the chosen ones, or else evaluations, or else training.
 
     Args:
         groups: the runs.

@@ -7,10 +7,11 @@ Memory is bounded, however long the run is.
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
 from runner.recording.spaces import decode
-from runner.util.arrays import Array
+from runner.util.arrays import Array, leaves
 
 Values = NDArray[np.float64]
 Quantity = Literal["return", "length", "action", "reward"]
@@ -57,7 +58,7 @@ class Histogram:
     axis: str
     """The name of the axis."""
     edges: list[float]
-    """Positions between the stretches, one more than there are of them."""
+    """The positions at which stretches begin and end, ascending."""
     values: list[float]
     """The distinct values, ascending, or else the edges of the ranges."""
     names: list[str]
@@ -194,7 +195,7 @@ def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, 
         values = [decode(recording.spaces["action"], action, str(recording.path)) for action in actions]
         are_arrays = all(isinstance(value, np.ndarray | np.generic) for value in values)
         actions = np.array(values if are_arrays else [None] * len(values))
-    parts = {part: column for part, column in _numbers("", actions) if column.dtype.kind in "biuf"}
+    parts = {part: column for part, column in _numbers(actions) if column.dtype.kind in "biuf"}
     if not parts:
         notes.append("Actions have no histogram, as they are not numbers of one shape.")
     if len(parts) > _MAX_PARTS:
@@ -202,16 +203,11 @@ def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, 
     return dict(itertools.islice(parts.items(), _MAX_PARTS))
 
 
-def _numbers(path: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
-    if values.dtype.names is not None:
-        for name in values.dtype.names:
-            yield from _numbers(f"{path}.{name}" if path else name, values[name])
-    elif values.ndim == 1:
-        yield path, values
-    else:
-        flat = values.reshape(len(values), -1)
-        for i in range(flat.shape[1]):
-            yield path if flat.shape[1] == 1 else f"{path}[{i}]", flat[:, i]
+def _numbers(actions: Array) -> Iterator[tuple[str, Array]]:
+    for path, values in leaves("", actions):
+        columns = values.reshape(len(values), math.prod(values.shape[1:])).T
+        for i, column in enumerate(columns):
+            yield path if len(columns) == 1 else f"{path}[{i}]", column
 
 
 def _action_names(recording: Recording, part: str) -> dict[float, str]:

@@ -21,9 +21,9 @@ class Grid:
     headings: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
     title: str = ""
-    """What a page calls it, where the section has another one."""
+    """Its title in a page, if that is not the section's."""
     links: Sequence[str] = ()
-    """What each row is about: an address below that of the run."""
+    """The address of what each row is about, below the address of the run."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:
@@ -50,7 +50,7 @@ class Section:
     """A picture as SVG, and its caption."""
     caption: str = ""
     replay: str = ""
-    """A step to look at: the address of its replay, below that of the run."""
+    """The address of the replay of a step to look at, below the address of the run."""
 
     @property
     def anchor(self) -> str:
@@ -58,9 +58,9 @@ class Section:
         return re.sub(r"\W+", "-", self.title.partition(":")[0].lower())
 
 
-def markdown(made: Sequence[Section]) -> Iterator[str]:
+def markdown(sections: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of sections in Markdown."""
-    for section in made:
+    for section in sections:
         yield from (f"## {section.title}", "")
         yield from (f"- {name}: {text}" for name, text in section.facts.items())
         yield from [""] * bool(section.facts)
@@ -76,10 +76,10 @@ def markdown(made: Sequence[Section]) -> Iterator[str]:
             yield from (f"{fence}diff", *lines, fence, "")
 
 
-def html(made: Sequence[Section]) -> str:
+def html(sections: Sequence[Section]) -> str:
     """Return sections as HTML that depends on no style sheet, as notebooks display it."""
     parts = []
-    for section in made:
+    for section in sections:
         parts += [f"<h3>{escape(section.title)}</h3>"]
         parts += [f"<p>{escape(sentence)}</p>" for sentence in section.sentences]
         for grid in section.grids:

@@ -56,7 +56,7 @@ class RunSeries:
     evaluation: list[tuple[float, Readings]]
     """(position, readings) of every evaluation; positions on an axis of whole numbers are integers."""
     training: list[tuple[float, Readings]]
-    """(position, readings) of every report of training, those at evaluations among them."""
+    """(position, readings) of every report of training, also of the reports at evaluations."""
     content_digest: str = ""
     """Digest of the recording; empty if that is not finished."""
     not_finite: Mapping[str, int] = field(default_factory=dict)
@@ -67,11 +67,11 @@ class RunSeries:
     environment: str = ""
     """The environment's id, with its keyword arguments: `FrozenLake-v1 map_name=8x8`."""
     recent: Readings = field(default_factory=dict)
-    """Means over the last training episodes of a finished loop, those that `ls` and `show` average too."""
+    """Means over the last training episodes of a finished loop, as `ls` and `show` average them."""
     recent_episodes: int = 0
     """Number of these episodes."""
     is_unended: bool = False
-    """Whether no training episode of a loop ended: its length and return are those of the unfinished ones."""
+    """Whether no training episode of a loop ended, so that length and return are of unfinished ones."""
     averaged: str = ""
     """What its values are means over, a sentence; empty if each recorded value is there."""
     names: Sequence[str] = ()

@@ -1,5 +1,6 @@
 """Types of arrays that many modules handle."""
 
+from collections.abc import Iterator
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -14,6 +15,14 @@ Records = NDArray[np.void]
 MaskedArray: TypeAlias = "np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]"
 """An `Array` with missing values; a string, as loading `numpy.ma` takes 20 ms."""
 Ints = NDArray[np.int64]
+
+
+def leaves(name: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Yield the parts of composed values, such as values of a `Dict` space, by dotted name."""
+    if values.dtype.names is None:
+        yield name, values
+    for part in values.dtype.names or ():
+        yield from leaves(f"{name}.{part}" if name else part, values[part])
 
 
 def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:

@@ -21,7 +21,7 @@ from runner.util.humanize import listed
 
 Kind = Literal["last", "best", "area", "position", "crossing"]
 Seed = int | str
-"""A seed; of a run that has none, its id."""
+"""A seed, or the id of a run without one."""
 
 Measured = dict[Seed, tuple[list[str], float]]
 """Seed to the ids of its runs and their value."""
@@ -85,7 +85,7 @@ def moment_in_words(moment: Moment, metrics: Sequence[str], groups: Sequence[Gro
 
 
 def last_episodes(metric: str, groups: Sequence[Group]) -> str:
-    """Return how many episodes the last value of a metric averages (`last 100 episodes`); else nothing."""
+    """Return which episodes the last value of a metric averages: `last 100 episodes`; empty for none."""
     runs = [run for group in groups for run in group.runs if metric in run.recent]
     counts = sorted({run.recent_episodes for run in runs})
     if not counts:

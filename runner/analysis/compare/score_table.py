@@ -1,4 +1,4 @@
-"""Tables of scores that normalise the values of environments: those of a random policy and an expert."""
+"""Tables of the scores of a random policy and an expert, which normalise the values of environments."""
 
 from __future__ import annotations
 

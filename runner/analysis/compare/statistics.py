@@ -2,8 +2,8 @@
 
 R. Agarwal, M. Schwarzer, P. S. Castro, A. Courville and M. G. Bellemare, "Deep reinforcement learning at
 the edge of the statistical precipice", NeurIPS 2021. Intervals of the IQM and of profiles are percentile
-bootstrap intervals, as there; the resampling is seeded, so the same values give the same interval. That of
-the probability of improvement is a score interval, which is right for few seeds too, and never without width.
+bootstrap intervals, as there; the resampling is seeded, so the same values give the same interval. The
+probability of improvement has a score interval, which is right for few seeds too, and never without width.
 
 `NEVER` stands for a level that is not reached: larger than anything, yet finite, so that quantiles
 between it and another value are what they should be, beyond all bounds.

@@ -47,7 +47,7 @@ class FileChange:
 def code_changes(a: Recording, b: Recording) -> list[FileChange]:
     """Return the recorded files that differ; none if a run did not record its code.
 
-    A file that one run did not load, and that it has as its commit has it, is not compared.
+    A file that one of the runs neither loaded nor changed since its commit is not compared.
     """
     ours, theirs = a.code, b.code
     if not (ours.files or ours.patch) or not (theirs.files or theirs.patch):

@@ -55,13 +55,11 @@ def replay_to(a: Recording, b: Recording, stop: int) -> tuple[list[TableReplay],
 
 def _last_equal_snapshot(a: Recording, b: Recording, stop: int) -> int:
     """Return the last step before `stop` at which both runs have snapshots, all of them equal; or 0."""
-    last = 0
-    step = 0
-    equal = True
+    last, step, equal = 0, 0, True
     for left, right in zip(a.snapshots(), b.snapshots(), strict=False):
         if left.step != right.step or left.step > stop:
             break
-        if left.step != step:
+        if left.step != step:  # only now it is known that all tables of the last moment are there
             last, step = (step if equal else last), left.step
         equal = equal and np.array_equal(left.values, right.values)
         if not equal:
