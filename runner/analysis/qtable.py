@@ -150,7 +150,7 @@ def tables_of(
     if episode is not None:
         step = step_of_episode(recording, episode)
     if not recording.can_train_again:
-        return _describe_snapshots(recording, step, state)
+        return _recorded(recording, step, state)
     step = last_step(recording) if step is None else step
     number = None if state is None else state_of(recording.mdp, state)  # before the tables are replayed
     replay = TableReplay(recording, step)
@@ -180,41 +180,42 @@ def _shape(recording: Recording) -> tuple[int, int]:
     return recording.spaces["observation"]["n"], recording.spaces["action"]["n"]
 
 
-def _describe_snapshots(recording: Recording, step: int | None, state: str | None) -> Tables:
-    """Return the latest tables that a loop recorded, or those at a step."""
+def _recorded(recording: Recording, step: int | None, state: str | None) -> Tables:
+    """Return the latest tables that a loop recorded, or the latest at a step."""
     arrays = list(recorded_tables(recording))
     last = max([recording.train.steps.total(), *(array.step for array in arrays)])
-    latest = {array.name: array for array in arrays if step is None or array.step <= step <= last}
+    step = last if step is None else step
+    latest = {array.name: array for array in arrays if array.step <= step <= last}
     if not latest:
         raise NotInRecording(
-            f"{recording.path}: found no table after {last if step is None else step:,} of {last:,} training "
+            f"{recording.path}: found no table after {step:,} of {last:,} training "
             f"steps, expected an array of shape {list(_shape(recording))}, such as a loop records by "
             '`rec.snapshot("q", q)`.'
         )
     tables = {name: array.values.astype(np.float64) for name, array in latest.items()}
     description: TablesDescription = {
         "run_id": recording.run_id,
-        "step": last if step is None else step,
+        "step": step,
         "tables": [{**summarize(name, q), "snapshot_step": latest[name].step} for name, q in tables.items()],
     }
     if state is not None:
-        shape = _shape(recording)
-        states = states_in_words(recording.mdp) if recording.tabular else range(shape[0])
-        number = numbered(state, list(map(str, states)), "a state", 1)
+        state_count, action_count = _shape(recording)
+        states = list(map(str, states_in_words(recording.mdp) if recording.tabular else range(state_count)))
+        number = numbered(state, states, "a state", 1)
+        names = recording.train.action_names() or range(action_count)
         stop = max(array.step for array in latest.values())
-        taken = None
+        visits = None
         if recording.train.steps and recording.train.steps.count() >= stop:  # else steps are missing
-            counts = np.zeros(shape[1], np.int64)
+            counts = np.zeros(action_count, np.int64)
             for block in recording.train.steps.blocks(0, stop):
-                counts += np.bincount(block["action"][block["state"] == number], minlength=shape[1])
-            taken = counts.tolist()
-        names = recording.train.action_names() or tuple(map(str, range(shape[1])))
-        description["state"], description["state_in_words"] = number, str(states[number])
-        description["visits"] = None if taken is None else sum(taken)
+                counts += np.bincount(block["action"][block["state"] == number], minlength=action_count)
+            visits = counts.tolist()
+        description["state"], description["state_in_words"] = number, states[number]
+        description["visits"] = None if visits is None else sum(visits)
         description["values"] = [
             value
             for table, q in tables.items()
-            for value in _action_values(table, names, q[number], int(q[number].argmax()), taken)
+            for value in _action_values(table, names, q[number], int(q[number].argmax()), visits)
         ]
     return Tables(description, one_array(list(tables.values())))
 

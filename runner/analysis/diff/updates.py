@@ -17,6 +17,11 @@ from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 
 _BATCH_STEPS: Final = 1 << 16
+_QUIRKS: Final = {
+    "second_table_uses_first_action": "updated the second agent's table at the first agent's action",
+    "bootstrap_after_termination": "added the value of the next state although the episode had ended",
+}
+"""Settings that change an update, and what an update with the setting did."""
 
 
 @dataclass(frozen=True)
@@ -137,19 +142,8 @@ def _reasons(a: Recording, b: Recording, records: Sequence[np.void]) -> list[str
         x, y = (float(schedule_value(schedule, episode, step)) for schedule in schedules)
         if x != y:
             reasons.append(f"the {name.replace('_', ' ')} was {x:g} in A, {y:g} in B")
-    for name, text, matters in (
-        (
-            "second_table_uses_first_action",
-            "updated the second agent's table at the first agent's action",
-            True,
-        ),
-        (
-            "bootstrap_after_termination",
-            "added the value of the next state although the episode had ended",
-            records[0]["terminated"],
-        ),
-    ):
-        has = [getattr(config.quirks, name) for config in configs]
-        if matters and has[0] != has[1]:
-            reasons.append(f"{'A' if has[0] else 'B'} {text} (quirks.{name})")
+    for name, text in _QUIRKS.items():
+        in_a, in_b = (getattr(config.quirks, name) for config in configs)
+        if in_a != in_b and (name != "bootstrap_after_termination" or records[0]["terminated"]):
+            reasons.append(f"{'A' if in_a else 'B'} {text} (quirks.{name})")
     return reasons
