@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -177,12 +177,13 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
             f"the environments differ ({where}): their figures do not measure the same; normalised, by "
             "`minmax` or a table of scores, algorithms are compared that all ran in the same environments"
         )
-    if moment.kind == "last" and all(metric.startswith("training.") for metric, _ in metrics):
+    names = [metric for metric, _ in metrics]
+    if moment.kind == "last" and all(name.startswith("training.") for name in names):
         yield (
-            f"training is compared, {moment_in_words(moment, [metric for metric, _ in metrics], groups)}; "
+            f"training is compared, {moment_in_words(moment, names, groups)}; "
             "the moment `area` takes the mean over all of it"
         )
-    yield from window_notes(groups, [metric for metric, _ in metrics], moment)
+    yield from window_notes(groups, names, moment)
     digests = {
         group.label: sorted((run.seed or 0, run.content_digest) for run in group.runs)
         for group in groups
@@ -198,19 +199,19 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
     notes: list[str] = []
     by_label = {group.label: measured(group, metric, line, moment, groups, notes) for group in groups}
-    present = {label: values for label, values in by_label.items() if values}
+    present = {label: values for label, values in by_label.items() if values.by_seed}
     title, unit = title_of(metric)
     better = higher_is_better(metric, groups)
     notes += uneven_ends(groups, metric, line) if moment.kind == "last" else []
     if moment.level is not None:
         better, title, unit = False, f"{title}: first at {moment.level:g}", moment.axis.label
         for label, values in present.items():
-            reached = sum(value < statistics.NEVER for _, value in values.values())
-            notes.append(f"{label}: {reached} of {len(values)} seeds reach it")
+            reached = sum(value < statistics.NEVER for value in values.by_seed.values())
+            notes.append(f"{label}: {reached} of {len(values.by_seed)} seeds reach it")
     if moment.kind == "last" and (episodes := last_episodes(metric, groups)):
         title = f"{title}, {episodes}"
     sign = -1.0 if better is False else 1.0
-    numbers = {value for values in present.values() for _, value in values.values()}
+    numbers = {value for values in present.values() for value in values.by_seed.values()}
     finite = sorted(value for value in numbers if abs(value) < statistics.NEVER)
     # Evenly spaced levels from the worst value to the best; few where there are few values.
     levels = np.linspace(finite[0], finite[-1], THRESHOLDS) if len(finite) > 1 else np.array(finite)
@@ -222,21 +223,24 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         unit=unit,
         higher_is_better=better,
         groups=[_group(label, values, thresholds, sign) for label, values in present.items()],
-        pairs=[_pair(*a, *b, sign) for a, b in itertools.combinations(present.items(), 2)],
+        pairs=[
+            _pair(a, present[a].by_seed, b, present[b].by_seed, sign)
+            for a, b in itertools.combinations(present, 2)
+        ],
         thresholds=thresholds.tolist(),
         notes=notes,
     )
 
 
 def _group(label: str, values: Measured, thresholds: Values, sign: float) -> GroupResult:
-    numbers = np.array([value for _, value in values.values()])
+    numbers = np.array(list(values.by_seed.values()))
     share, low, high = (
         column.tolist() for column in statistics.share_at_least(sign * numbers, sign * thresholds)
     )
     return GroupResult(
         label=label,
-        seeds=list(values),
-        run_ids=[run_id for run_ids, _ in values.values() for run_id in run_ids],
+        seeds=list(values.by_seed),
+        run_ids=values.run_ids,
         values=[statistics.bounded(value) for value in numbers.tolist()],
         median=statistics.median(numbers),
         iqm=statistics.interquartile_mean(numbers),
@@ -246,9 +250,11 @@ def _group(label: str, values: Measured, thresholds: Values, sign: float) -> Gro
     )
 
 
-def _pair(a: str, ours: Measured, b: str, theirs: Measured, sign: float) -> PairResult:
+def _pair(
+    a: str, ours: Mapping[Seed, float], b: str, theirs: Mapping[Seed, float], sign: float
+) -> PairResult:
     seeds = sorted(ours.keys() & theirs.keys(), key=seed_order)
-    left, right = (np.array([values[seed][1] for seed in seeds]) for values in (ours, theirs))
+    left, right = (np.array([by_seed[seed] for seed in seeds]) for by_seed in (ours, theirs))
     difference = left - right
     return PairResult(
         a=a,

@@ -23,9 +23,6 @@ Kind = Literal["last", "best", "area", "position", "crossing"]
 Seed = int | str
 """A seed, or the id of a run without one."""
 
-Measured = dict[Seed, tuple[list[str], float]]
-"""Seed to the ids of its runs and their value."""
-
 _OF_WHOLE_RUNS: Final[tuple[Kind, ...]] = ("last", "best", "area")
 """Moments that an option gives by name."""
 
@@ -36,6 +33,16 @@ def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
     if better == "lower_to_goal":
         return False if all(run.has_goal for group in groups for run in group.runs) else None
     return None if better is None else better == "higher"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The values of one group of runs at a moment."""
+
+    by_seed: dict[Seed, float]
+    """Seed to the mean over its runs, in the order of the seeds."""
+    run_ids: list[str]
+    """The runs with a value, in the order of the seeds."""
 
 
 @dataclass(frozen=True)
@@ -197,29 +204,28 @@ def measured(
     group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
 ) -> Measured:
     """Return the value of each seed of a group; `notes` gets the runs that are left out."""
-    by_seed: dict[Seed, list[tuple[str, float]]] = {}
+    runs_of: dict[Seed, list[tuple[str, float]]] = {}
     without: dict[str, list[str]] = {}
     for run in group.runs:
         value, reason = value_of(run, metric, line, moment, groups)
         if value is None:
             without.setdefault(reason, []).append(run.run_id)
         else:
-            by_seed.setdefault(seed_of(run), []).append((run.run_id, value))
+            runs_of.setdefault(seed_of(run), []).append((run.run_id, value))
     if metric.startswith("training.mean_") and any(run.is_unended for run in group.runs):
         unended = listed([run.run_id for run in group.runs if run.is_unended])
         notes.append(
             f"{group.label}: no episode ended in {unended}, so unfinished ones count as far as they got"
         )
     notes += [f"{group.label}, left out: {listed(runs)} ({reason})" for reason, runs in without.items()]
-    count = sum(map(len, by_seed.values()))
-    if count > len(by_seed):
+    seeds = sorted(runs_of, key=seed_order)
+    run_ids = [run_id for seed in seeds for run_id, _ in runs_of[seed]]
+    if len(run_ids) > len(seeds):
         notes.append(
-            f"{group.label}: {count} runs of {len(by_seed)} seeds, each seed with the mean of its runs"
+            f"{group.label}: {len(run_ids)} runs of {len(seeds)} seeds, each seed with the mean of its runs"
         )
-    return {
-        seed: ([run_id for run_id, _ in runs], float(np.mean([value for _, value in runs])))
-        for seed, runs in sorted(by_seed.items(), key=lambda entry: seed_order(entry[0]))
-    }
+    means = {seed: float(np.mean([value for _, value in runs_of[seed]])) for seed in seeds}
+    return Measured(means, run_ids)
 
 
 def value_of(
