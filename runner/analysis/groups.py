@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from runner.analysis.axes import Axis
-from runner.analysis.series import RunSeries, lines_in
+from runner.analysis.series import RunSeries, full_name, lines_in
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS, SHARES
 from runner.util.humanize import listed, setting
@@ -131,7 +131,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     by_name: dict[str, list[tuple[str, str]]] = {}
     for metric, line in lines_in(run for group in groups for run in group.runs):
         if metric != SHARES:
-            for name in {metric, f"{metric}.{line}" if line else metric}:
+            for name in {metric, full_name(metric, line)}:
                 by_name.setdefault(name, []).append((metric, line))
     if not by_name:
         raise RunnerError(

@@ -126,6 +126,11 @@ def title_of(metric: str) -> tuple[str, str]:
     return METRIC_OF[metric].title, METRIC_OF[metric].unit
 
 
+def full_name(metric: str, line: str) -> str:
+    """Return metric and line: `mean_return.taxi_1`."""
+    return f"{metric}.{line}" if line else metric
+
+
 # --- curves -------------------------------------------------------------------------------------------
 
 

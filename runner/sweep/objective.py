@@ -14,6 +14,7 @@ from runner.analysis.evaluations import evaluation_record
 from runner.analysis.series import (
     evaluation_readings,
     exact_readings,
+    full_name,
     training_readings,
 )
 from runner.errors import RunnerError, nearest
@@ -53,9 +54,7 @@ def readings(
     if exact is not None:
         by_metric |= exact_readings(exact, agents)
     flat = {
-        (f"{metric}.{line}" if line else metric): value
-        for metric, lines in by_metric.items()
-        for line, value in lines.items()
+        full_name(metric, line): value for metric, lines in by_metric.items() for line, value in lines.items()
     }
     alone = {metric: next(iter(lines.values())) for metric, lines in by_metric.items() if len(lines) == 1}
     return flat | alone

@@ -32,7 +32,7 @@ from runner.analysis.compare.moments import (
 )
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group
-from runner.analysis.series import points_of, title_of
+from runner.analysis.series import full_name, points_of, title_of
 from runner.errors import RunnerError
 
 THRESHOLDS: Final = 101
@@ -105,7 +105,7 @@ class MetricResult:
     @property
     def name(self) -> str:
         """Metric and line: `mean_return.taxi_1`."""
-        return f"{self.metric}.{self.line}" if self.line else self.metric
+        return full_name(self.metric, self.line)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from runner.analysis.axes import EPISODES, Axis, first_crossing, mean_height
 from runner.analysis.compare.statistics import FEW_SEEDS, NEVER
 from runner.analysis.groups import Group
-from runner.analysis.series import RunSeries, points_of
+from runner.analysis.series import RunSeries, full_name, points_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF
 from runner.util.humanize import listed
@@ -235,7 +235,7 @@ def value_of(
     curve = points_of(run, metric, line, aligned=True)
     points = {at: value for at, value in curve.items() if math.isfinite(value)}
     if not points:
-        return None, f"has no {metric}{'.' + line if line else ''}"
+        return None, f"has no {full_name(metric, line)}"
     positions, values = list(points), list(points.values())
     if moment.kind == "position":
         value, at = points.get(moment.number), moment.number

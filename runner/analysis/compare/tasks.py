@@ -30,7 +30,7 @@ from runner.analysis.compare.moments import (
 from runner.analysis.compare.score_table import MIN_MAX, Bounds
 from runner.analysis.compare.statistics import Estimate, Values
 from runner.analysis.groups import Group, grouped, metrics_of
-from runner.analysis.series import RunSeries, points_of, title_of
+from runner.analysis.series import RunSeries, full_name, points_of, title_of
 from runner.errors import RunnerError
 from runner.util.humanize import listed
 
@@ -100,7 +100,7 @@ def metric_of_tasks(groups: Sequence[Group], chosen: Sequence[str]) -> tuple[str
     if not chosen:
         pairs = [pair for pair in pairs if pair[0].endswith("mean_return")] or pairs[:1]
     if len(pairs) > 1:
-        names = [".".join(filter(None, pair)) for pair in pairs]
+        names = [full_name(*pair) for pair in pairs]
         raise RunnerError(f"metric: found {listed(names)}, expected one, as environments are compared by it.")
     return pairs[0]
 
@@ -166,7 +166,7 @@ def compare_tasks(
             in_task = [replace(group, runs=tuple(_runs([group], [task]))) for group in groups]
             own_notes += [f"{task}: {note}" for note in uneven_ends(in_task, *metric)]
     return TaskComparison(
-        metric=".".join(filter(None, metric)),
+        metric=full_name(*metric),
         title=title_of(metric[0])[0],
         moment=moment_in_words(moment, [metric[0]], groups),
         normalised_by="the worst and the best value in each environment"

@@ -8,7 +8,7 @@ from typing import Final
 
 from runner.analysis.axes import first_crossing, mean_height
 from runner.analysis.evaluations import evaluation_records
-from runner.analysis.series import evaluation_readings, training_readings
+from runner.analysis.series import evaluation_readings, full_name, training_readings
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRIC_OF, METRICS
 from runner.recording.reader import Recording
@@ -82,8 +82,7 @@ def _curves(recording: Recording) -> dict[str, dict[int, float]]:
             readings |= training_readings(record.training)
         for metric in _COMPARED:
             for line, value in readings.get(metric.name, {}).items():
-                name = f"{metric.name}.{line}" if line else metric.name
-                curves.setdefault(name, {})[record.episode] = value
+                curves.setdefault(full_name(metric.name, line), {})[record.episode] = value
     return curves
 
 
