@@ -194,9 +194,9 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     """Return the metrics of a recording over an axis, also of one that was cut off.
 
     The returns and lengths of a loop's training episodes, and the values it logged, are means over at most
-    200 stretches of 1, 2, 5, 10, ... episodes (or steps, ...), so that those of several runs agree. A run of
-    values alone is read as it is if it has at most 1,000 positions. Values that are not finite are left out
-    of the means, and counted in `not_finite`.
+    200 stretches of 1, 2, 5, 10, ... episodes (or steps, ...), so that stretches of several runs agree. A run
+    of values alone is read as it is if it has at most 1,000 positions. Values that are not finite are left
+    out of the means, and counted in `not_finite`.
 
     Of the names under which values were logged the first 64 are read; or those among `metrics`, such as
     `training.logged.loss`, if any are given.
@@ -206,9 +206,10 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     """
     not_finite: Counter[str] = Counter()
     moments = positions(recording, axis)
-    config, evaluations = recording.config, evaluation_records(recording)
+    evaluations = evaluation_records(recording)
     readings = [evaluation_readings(record) for record in evaluations]
-    averaged, names = "", dict[str, None]()
+    averaged = ""
+    names: dict[str, None] = {}
     recent: Readings = {}
     recent_episodes, is_unended = 0, False
     if recording.eval.has_metrics:
@@ -228,11 +229,9 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     else:
         axis = moments.axis
         readings = [_single_agent_unnamed(values) for values in readings]
-        wanted = [name.removeprefix(LOGGED) for name in metrics if name.startswith(LOGGED)]
-        names = dict.fromkeys(wanted)
-        training, averaged = _loop_training(
-            recording, moments, names, 0 if metrics else _MAX_NAMES, not_finite
-        )
+        names = dict.fromkeys(name.removeprefix(LOGGED) for name in metrics if name.startswith(LOGGED))
+        max_further = 0 if metrics else _MAX_NAMES
+        training, averaged = _loop_training(recording, moments, names, max_further, not_finite)
         is_unended = not recording.train.episodes.count()
         if recording.status == "finished" and len(last := recording.train.recent_episodes()):
             recent = _episode_readings(
@@ -241,15 +240,12 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
             recent_episodes = len(last)
         if left_out := sum(record.not_finite for record in evaluations):
             not_finite["mean_return"] = left_out
-        loop = config.get("config")
-        if isinstance(loop, Mapping) and loop.get("seed") == recording.seed:  # as in vars(args)
-            config = {**config, "config": {key: value for key, value in loop.items() if key != "seed"}}
     return RunSeries(
         run_id=recording.run_id,
         name=recording.name,
         seed=recording.seed,
         status=recording.status,
-        config=config,
+        config=_config(recording),
         evaluation=[
             (moments.of_moment(record.episode, record.step), values)
             for record, values in zip(evaluations, readings, strict=True)
@@ -265,6 +261,15 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         averaged=averaged,
         names=list(names),
     )
+
+
+def _config(recording: Recording) -> JsonView:
+    """Return the configuration; a loop's without the seed that it repeats, as `vars(args)` does."""
+    config = recording.config
+    loop = config.get("config")
+    if not isinstance(loop, Mapping) or loop.get("seed") != recording.seed:
+        return config
+    return {**config, "config": {key: value for key, value in loop.items() if key != "seed"}}
 
 
 def _environment(recording: Recording) -> str:
@@ -295,8 +300,8 @@ def exact_readings(measures: Message, agents: Sequence[str]) -> Readings:
     }
     readings["value"] = {"": sum(measures["values"]), "optimum": measures["optimal_value"]}
     readings["to_gain"] = {
-        agent: best - own
-        for agent, own, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
+        agent: best - value
+        for agent, value, best in zip(agents, measures["values"], measures["best_responses"], strict=True)
     }
     return {f"exact.{name}": lines for name, lines in readings.items()}
 

@@ -113,7 +113,7 @@ def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment
             log = run.config["log"]
             window = f"the last {log['episodes']:,} episodes (lengths) or {log['window']:,} steps (rewards)"
         elif run.training:
-            ends = [0.0, *sorted(place for place, _ in run.training)]
+            ends = [0.0, *sorted(at for at, _ in run.training)]
             width = min(after - before for before, after in itertools.pairwise(ends))
             if width > 1 or not run.axis.whole:
                 window = f"stretches of {run.axis.moment(width)}"
