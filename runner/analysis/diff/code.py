@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -104,33 +104,35 @@ def made_in_words(files: Sequence[FileChange], provenance: Sequence[Change]) -> 
 
     For example `14 lines of ppo.py`, `torch 2.9.0 to 2.10.0`, `another GPU: A100 to H100`.
     """
-    values: Mapping[str, tuple[str, str]] = {
-        change.path: (str(change.a or "none"), str(change.b or "none")) for change in provenance
+    texts = {
+        change.path: " to ".join(
+            _short(str(value or "none")) if change.path == "git" else str(value or "none")
+            for value in (change.a, change.b)
+        )
+        for change in provenance
     }
-    words = _some([change.words for change in files], "files")
-    if "git" in values:
-        words.append("commit " + " to ".join(map(_short, values["git"])))
-    for key, name in (("python", "Python"), ("dualtaxi", "dualtaxi")):
-        if key in values:
-            words.append(f"{name} {' to '.join(values[key])}")
+    words = _first([change.words for change in files], "files")
+    for key, name in (("git", "commit"), ("python", "Python"), ("dualtaxi", "dualtaxi")):
+        if key in texts:
+            words.append(f"{name} {texts[key]}")
     packages = [
-        f"{path.removeprefix('package.')} {' to '.join(pair)}"
-        for path, pair in values.items()
+        f"{path.removeprefix('package.')} {text}"
+        for path, text in texts.items()
         if path.startswith("package.") and path != "package.dualtaxi"
     ]
-    words += _some(packages, "packages")
-    gpus = [pair for path, pair in values.items() if re.fullmatch(r"gpu\.\d+", path)]
+    words += _first(packages, "packages")
+    gpus = [text for path, text in texts.items() if re.fullmatch(r"gpu\.\d+", path)]
     if gpus:
-        words.append(f"another GPU: {' to '.join(gpus[0])}")
+        words.append(f"another GPU: {gpus[0]}")
     for key, name in (("processor", "processor"), ("gpu.driver", "driver"), ("torch.cuda", "CUDA")):
-        if key in values:
-            words.append(f"another {name}: {' to '.join(values[key])}")
+        if key in texts:
+            words.append(f"another {name}: {texts[key]}")
     return words
 
 
-def _some(words: list[str], what: str) -> list[str]:
+def _first(words: list[str], nouns: str) -> list[str]:
     more = len(words) - _MAX_NAMED
-    return words[:_MAX_NAMED] + ([f"{more} more {what}"] if more > 0 else [])
+    return words[:_MAX_NAMED] + ([f"{more} more {nouns}"] if more > 0 else [])
 
 
 def _short(commit: str) -> str:
