@@ -22,8 +22,7 @@ from runner.recording.turns import is_of_environment
 from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned, Start
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
-from runner.replay.stepping import GameStepper, Stepper
-from runner.replay.stepping_vector import VectorStepper
+from runner.replay.stepping import GameStepper, Stepper, VectorStepper
 from runner.replay.trust import require_plain, trusting
 from runner.util.arrays import Ints
 

@@ -15,14 +15,24 @@ from numpy.typing import NDArray
 
 from runner.environments.games import game_spaces
 from runner.environments.gym_types import Space
+from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_spaces import describe_space, value_of
-from runner.recording.gym_values import Put, filler, filler_by_agent, leaves_by_agent, leaves_of
+from runner.recording.gym_values import (
+    Put,
+    element_of,
+    filler,
+    filler_by_agent,
+    fitted,
+    leaves_by_agent,
+    leaves_of,
+)
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
+from runner.recording.turns import is_taken
 from runner.replay.comparison import Frame, PlacedReset, Returned, Start
-from runner.replay.recorded import RecordedReset
+from runner.replay.recorded import RecordedReset, calls
 from runner.util.arrays import Array
 from runner.util.extras import missing
 from runner.util.processes import raise_if_out_of_memory
@@ -67,9 +77,10 @@ class Stepper:
             resets: step of each environment, and reset, in order; each comes before its step.
         """
         got, ends = np.zeros(len(rows), self._dtype), np.zeros(len(rows), self._ends_dtype)
-        self._actions, self._fill = self.actions(rows), self._filler(got, ends)
+        seen = np.zeros(len(rows), self._first_dtype) if self._has_states else got[self._after]
+        self._actions, self._fill = self.actions(rows), self._filler(seen, ends, got)
         self._firsts = np.zeros(len(resets), self._first_dtype)
-        self._put_first = self._putter(self._firsts, is_first=True)
+        self._put_first = self._putter(self._firsts)
         returned = Returned(rows, resets, got)
         try:
             for step, group in groupby(resets, key=lambda placed: placed[0]):
@@ -81,6 +92,8 @@ class Stepper:
         except Exception as error:  # foreign code raises anything
             raise_if_out_of_memory()
             returned.error = error
+        if self._has_states:  # states are counted from 0, observations are as they came
+            got[self._after] = seen - self.observation_space.start  # type: ignore[attr-defined]
         for name in _ENDS:
             got[name] = ends[name]
         if self.ends_once:
@@ -134,23 +147,27 @@ class Stepper:
         """Return the spaces of observation and action."""
         return self.env.observation_space, self.env.action_space
 
-    def _putter(self, column: Array, is_first: bool = False) -> Put:
-        """Return a function that puts an observation, of a step or of a reset, into a row of a column."""
-        if self._has_states:
-            # States are counted from 0, the first observations are as they came.
-            start = 0 if is_first else int(self.observation_space.start)  # type: ignore[attr-defined]
+    def _putter(self, column: Array) -> Put:
+        """Return a function that puts an observation into a row of a column."""
+        if not self._has_states:
+            return filler(leaves_of(self.observation_space, "observation"), column)
 
-            def put_state(row: int, observation: object) -> None:
-                if observation.__class__ is not int:
-                    observation = int(np.asarray(observation).reshape(()))
-                column[row] = observation - start
+        def put_state(row: int, observation: object) -> None:
+            if observation.__class__ is not int:
+                observation = int(np.asarray(observation).reshape(()))
+            column[row] = observation
 
-            return put_state
-        return filler(leaves_of(self.observation_space, "observation"), column)
+        return put_state
 
-    def _filler(self, got: NDArray[np.void], ends: NDArray[np.void]) -> Fill:
-        """Return a function that puts down steps: observations in `got`, and rewards and ends in `ends`."""
-        put, pack = self._putter(got[self._after]), _ENDING.pack_into
+    def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
+        """Return a function that puts down steps.
+
+        Args:
+            seen: [rows], for observations.
+            ends: [rows], for rewards and ends.
+            got: [rows], for what games return besides.
+        """
+        put, pack = self._putter(seen), _ENDING.pack_into
         data, size = ends.view(np.uint8).data, _ENDING.size
 
         def fill(row: int, result: Any) -> None:
@@ -240,11 +257,11 @@ class GameStepper(Stepper):
             )
         return game_spaces(self.env)
 
-    def _putter(self, column: Array, is_first: bool = False) -> Put:  # noqa: ARG002
+    def _putter(self, column: Array) -> Put:
         return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
 
-    def _filler(self, got: NDArray[np.void], ends: NDArray[np.void]) -> Fill:
-        put, agents = self._putter(got[self._after]), self.env.possible_agents
+    def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:
+        put, agents = self._putter(seen), self.env.possible_agents
         masks = [got[name] for name in got.dtype.names or () if name.startswith("agents_")]
 
         def fill(row: int, result: Any) -> None:
@@ -272,6 +289,112 @@ class GameStepper(Stepper):
             ]
         values = values_in(by_agent, np.array(column))
         return [{agent: action[agent] for agent in some} for action, some in zip(values, acting, strict=True)]
+
+
+class VectorStepper(Stepper):
+    """All environments of a vector; rows are those of all of them, in the order of the recording.
+
+    Args:
+        autoreset: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of
+            an episode shows the beginning of the next one.
+        drawn: the environment that is drawn.
+    """
+
+    def __init__(self, env: Any, recording: Recording, autoreset: str, drawn: int = 0) -> None:
+        super().__init__(env, recording)
+        self.n = recording.environments
+        if env.num_envs != self.n:
+            raise CannotRedo(f"The vector has {env.num_envs} environments, and the recording {self.n}.")
+        self._autoreset, self._drawn = autoreset, drawn
+        self._leaves = leaves_of(self.observation_space, "observation")
+        self._over = np.zeros(self.n, np.bool_)
+        """The environments whose episode ended with the last step."""
+        self._last: Array = np.zeros(self.n, self._first_dtype)
+        """[n]: what the vector returned last."""
+
+    def _spaces(self) -> tuple[Space, Space]:
+        return spaces_of_one(self.env)
+
+    def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
+        are_steps, explicit, automatic = is_taken(returned.rows[step * self.n :][: self.n]), [], []
+
+        def add(reset: RecordedReset) -> None:
+            frame = self.draw() if self.draws and reset.environment == self._drawn else None
+            returned.starts.append(Start(step, reset, self._last[reset.environment], frame))
+
+        for reset in resets:
+            environment = reset.environment
+            if len(are_steps) and not are_steps[environment]:
+                automatic.append(reset)  # the step does it
+            elif self._autoreset == "SameStep" and self._over[environment]:
+                self._over[environment] = False  # the step before did it
+                add(reset)
+            else:
+                explicit.append(reset)
+        for call in calls(explicit):
+            observations = self.env.reset(**self._arguments(call))[0]
+            self._last = fitted(self._leaves, observations, (self.n,), self._first_dtype)
+            for reset in call:
+                add(reset)
+        if automatic:
+            self._take(step + 1, returned)
+            for reset in automatic:
+                add(reset)
+
+    def _base(self, environment: int) -> Any:
+        base = self.env.unwrapped
+        return base.envs[environment].unwrapped if hasattr(base, "envs") else base
+
+    def _arguments(self, call: Sequence[RecordedReset]) -> dict[str, object]:
+        """Return the arguments of a call of `reset`."""
+        environments = [reset.environment for reset in call]
+        mask = np.isin(np.arange(self.n), environments)
+        options = dict(call[0].options or {}) | ({} if mask.all() else {"reset_mask": mask})
+        seeds = {reset.environment: self._seed(reset) for reset in call}
+        first = seeds[environments[0]]
+        arguments: dict[str, object] = {"options": options} if options else {}
+        if all(seed is None for seed in seeds.values()):
+            return arguments
+        # Not every vector takes a list
+        is_counted = list(seeds.values()) == list(range(first or 0, (first or 0) + self.n))
+        is_one = is_counted or not hasattr(self.env.unwrapped, "envs")
+        return arguments | {"seed": first if is_one else [seeds.get(i) for i in range(self.n)]}
+
+    def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
+        rows = seen.reshape(len(seen) // self.n, self.n, *seen.shape[1:])
+        put, put_last = filler(self._leaves, rows, (self.n,)), filler(self._leaves, seen)
+        columns = [ends[name].reshape(-1, self.n) for name in _ENDS]
+
+        def fill(step: int, result: Any) -> None:
+            observations, *values, infos = result
+            put(step, observations)
+            self._last = rows[step]
+            for column, value in zip(columns, values, strict=True):
+                column[step] = value
+            self._over = columns[1][step] | columns[2][step]
+            final = final_observations(infos) if self._autoreset == "SameStep" else None
+            if final is not None and self._over.any():
+                self._last = self._last.copy()
+                for i in np.flatnonzero(self._over).tolist():
+                    put_last(step * self.n + i, element_of(final, i))
+
+        return fill
+
+    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
+        """Return the actions of all environments as the vector takes them, for each of its steps."""
+        space, n, column = self.action_space, self.n, np.array(rows["action"])
+        if column.dtype.hasobject:
+            values = super().actions(rows)
+            return [batched(space, values[k : k + n]) for k in range(0, len(values), n)]
+        if self._has_states:
+            column = column.astype(np.int64) + int(space.start)  # type: ignore[attr-defined]
+        return values_in(space, column.reshape(-1, n, *column.shape[1:]))
+
+    def _render(self) -> Any:
+        pictures = self.env.render()
+        if pictures is None or len(pictures) != self.n:
+            raise CannotRedo("The vector environment draws no pictures of its environments.")
+        return pictures[self._drawn]
 
 
 def values_in(space: Space, column: NDArray[Any]) -> Sequence[Value]:
