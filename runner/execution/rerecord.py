@@ -21,7 +21,7 @@ from runner.execution.initial_tables import address, recorded_tables
 from runner.execution.session import Report, Session, Stop, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS
+from runner.recording.actions import ACTION_TOPICS, after_step
 from runner.recording.description import recorded_facts
 from runner.recording.digest import combined_digest
 from runner.recording.reader import Recording, open_recording
@@ -33,10 +33,9 @@ from runner.replay.engine import Replay
 from runner.replay.environment import stream_from_child
 from runner.replay.makers import why_not_rerun
 from runner.replay.recorded import Piece, pieces
-from runner.replay.steps import last_step
+from runner.replay.steps import blank_steps, first_of, last_step, put_states, whole_records
 from runner.replay.tables import tables_at
 from runner.replay.trust import require_may_train
-from runner.replay.whole_steps import blank_steps, state_of, whole_records
 from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
@@ -292,21 +291,17 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
 def _whole_steps(
     recording: Recording, replay: Replay, piece: Piece, states: NDArray[np.int64]
 ) -> NDArray[np.void]:
-    """Return the whole records of the steps of a piece; `states` are those after the last of each."""
-    records, before, n = blank_steps(recording, piece.phase, piece.rows), states.copy(), len(states)
-    are_steps = is_taken(records)
+    """Return the whole records of the steps of a piece; `states` are as for `put_states`."""
+    records = blank_steps(recording, piece.phase, piece.rows)
     for environment in replay.environments:
         for steps in replay.steps(piece, environment, draws=False):
-            whole, state = whole_records(recording, steps, states[steps.environment])
-            states[steps.environment] = state
-            records[steps.recorded["step"] - piece.first] = whole
+            records[steps.recorded["step"] - piece.first] = whole_records(recording, steps)
+    are_steps, begun = is_taken(records), []
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment
         if row >= len(records) or are_steps[row]:
-            continue
-        if recording.has_states:
-            records["state"][row] = records["next_state"][row - n] if row >= n else before[row]
-            records["next_state"][row] = state_of(recording, reset)
+            begun.append((row, reset))
         else:
-            records["next_observation"][row] = reset.observation
+            records[after_step(records.dtype)][row] = first_of(recording, reset)
+    put_states(recording, records, states, begun)
     return records

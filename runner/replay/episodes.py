@@ -15,7 +15,7 @@ from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
 from runner.replay.comparison import RerunSteps
 from runner.replay.engine import ALL, Replay
-from runner.replay.recorded import Piece, RecordedReset, part, pieces, reset_of, resets_back
+from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
 from runner.replay.stepping import Stepper
 
 _HELD_STEPS: Final = 64
@@ -205,8 +205,8 @@ def _approach(
             # The environments of a vector that are reset with the same step stay together.
             at = [other.step for other in piece.resets].index(reset.step)
             at, rows = at if is_whole else numbers.index(reset.number), reset.step - piece.first
-            yield part(piece, 0, rows, piece.resets[:at]), False
-            yield part(piece, rows, len(piece.rows), piece.resets[at:]), True
+            yield piece.part(0, rows, piece.resets[:at]), False
+            yield piece.part(rows, len(piece.rows), piece.resets[at:]), True
             is_reached = True
         elif is_of_phase or not is_reached:  # what the other phase does meanwhile is not part of the episode
             yield piece, is_reached

@@ -82,6 +82,11 @@ class Piece:
     time: int
     """Nanoseconds before its first step, or at its resets."""
 
+    def part(self, begin: int, end: int, resets: Sequence[RecordedReset]) -> Piece:
+        """Return the rows from `begin` to `end`, with their resets."""
+        time = self.time + begin * STEP_NANOSECONDS
+        return Piece(self.phase, self.first + begin, self.rows[begin:end], resets, time)
+
 
 def pieces(
     recording: Recording, phases: Iterable[str], start_time: int = 0, stop_time: int | None = None
@@ -211,12 +216,6 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
             waiting = next(resets, None)
         yield Piece(phase, first, block, here, time)
     yield from _without_steps(phase, resets if waiting is None else [waiting, *resets], nothing)
-
-
-def part(piece: Piece, begin: int, end: int, resets: Sequence[RecordedReset]) -> Piece:
-    """Return the rows from `begin` to `end` of a piece, with their resets."""
-    first, time = piece.first + begin, piece.time + begin * STEP_NANOSECONDS
-    return Piece(piece.phase, first, piece.rows[begin:end], resets, time)
 
 
 def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: NDArray[np.void]) -> Iterator[Piece]:

@@ -1,8 +1,10 @@
-"""Steps by episode, and checks of steps; a module of its own, as it needs no compiled code."""
+"""Steps by episode, rerun where only their actions were recorded, and checks of steps; no compiled code."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -12,9 +14,10 @@ from runner.environments.mdp import Mdp
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message, frame_place
-from runner.recording.reader import Recording
-from runner.replay.recorded import reset_of
-from runner.replay.whole_steps import whole_steps
+from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
+from runner.recording.spaces import Value, least_number
+from runner.replay.comparison import RerunSteps
+from runner.replay.recorded import RecordedReset, reset_of
 
 _END_OF_TIME: Final = 2**62
 """Later than any message, in nanoseconds."""
@@ -78,6 +81,98 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
     """
     own = recording.phase(phase)
     return whole_steps(recording, phase, episode) if own.steps.are_actions else own.episode_steps(episode)
+
+
+# --- of actions alone ---------------------------------------------------------------------------------
+
+
+def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
+    """Return the steps of an episode as `Phase.episode_steps` does, from its recorded actions.
+
+    The environment is made again in a child process with limits, from what is installed. The last episodes
+    are kept for the next call.
+
+    Raises:
+        CannotRedo: the environment cannot be made, or is another one.
+        RecordingError: actions of the episode were lost, or it is too long for an array.
+    """
+    steps = recording.phase(phase).episode(episode)
+    if len(steps) * recording.layout.rows(steps.table.topic).itemsize > MAX_EPISODE_BYTES:
+        raise RecordingError(
+            f"{recording.path}: {phase} episode {episode} has {len(steps):,} steps, too many to rerun for "
+            f"an array; `dualtaxi rerecord {recording.run_id}` records them."
+        )
+    return _whole_steps(recording.path, recording.file.size, phase, episode)
+
+
+@lru_cache(4)
+def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
+    from runner.replay.environment import rerun_in_child  # loads Gymnasium
+
+    with open_recording(path) as recording:
+        recorded = recording.phase(phase).episode(episode)
+        if sum(map(len, recorded.rows())) != len(recorded):
+            raise RecordingError(
+                f"{path}: steps of {schema.PHASE_NAMES[phase]} episode {episode:,} were lost."
+            )
+        parts, states = [np.empty(0, recording.layout.rows(recorded.table.topic))], np.zeros(1, np.int64)
+        for steps in rerun_in_child(path, phase, [episode]):
+            parts.append(whole_records(recording, steps))
+            put_states(recording, parts[-1], states, [(start.row, start.reset) for start in steps.starts])
+    whole = np.concatenate(parts)
+    whole.setflags(write=False)
+    return whole
+
+
+def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDArray[np.void]:
+    """Return whole records of recorded actions, without states, observations and rewards."""
+    topic = recording.phase(phase).steps.topic
+    records = np.zeros(len(rows), recording.layout.rows(topic))
+    for name in rows.dtype.names or ():
+        if name != "digest":
+            records[name] = rows[name]
+    return records
+
+
+def whole_records(recording: Recording, steps: RerunSteps) -> NDArray[np.void]:
+    """Return rerun steps as whole records, but for the states before them.
+
+    Raises:
+        CannotRedo: the environment is not the recorded one.
+    """
+    records = blank_steps(recording, steps.phase, steps.recorded)
+    for name in steps.require_equal().got.dtype.names or ():
+        records[name] = steps.got[name]
+    return records
+
+
+def put_states(
+    recording: Recording,
+    records: NDArray[np.void],
+    states: NDArray[np.int64],
+    resets: Iterable[tuple[int, RecordedReset]],
+) -> None:
+    """Put the state before each step into whole records, where they have states.
+
+    Args:
+        states: the states after the last step of each environment; becomes that after these.
+        resets: the row before which each reset was.
+    """
+    if recording.has_states:
+        before = np.concatenate([states, records["next_state"]])
+        for row, reset in resets:
+            before[row] = first_of(recording, reset)
+        records["state"], states[:] = before[: len(records)], before[len(records) :]
+
+
+def first_of(recording: Recording, reset: RecordedReset) -> Value:
+    """Return the first observation of a reset as steps have it: the state, counted from 0."""
+    if not recording.has_states:
+        return reset.observation
+    return int(reset.observation) - least_number(recording.spaces["observation"])
+
+
+# --- beside the steps ---------------------------------------------------------------------------------
 
 
 def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:

@@ -34,7 +34,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
 from runner.replay.recorded import reset_of
-from runner.replay.whole_steps import whole_steps
+from runner.replay.steps import whole_steps
 from runner.util.arrays import Array, Ints, Records
 
 MAX_SERIES: Final = 32

@@ -28,7 +28,7 @@ from runner.export.reports.report import render_report
 from runner.recording.actions import packed, unpacked
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
-from runner.replay.whole_steps import whole_steps
+from runner.replay.steps import whole_steps
 from runner.runs.marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import Settings
