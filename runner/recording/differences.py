@@ -1,4 +1,4 @@
-"""The first row in which recorded values differ from those that were made again."""
+"""Rows in which recorded values differ from others: from those that were made again, or of another run."""
 
 from __future__ import annotations
 
@@ -33,33 +33,35 @@ def first_differing_row(recorded: Array, got: Array, tolerance: float | None = N
         tolerance: as for `first_difference`.
     """
     n = len(recorded)
-    if recorded.dtype == object:
-        different = (k for k in range(n) if recorded[k] != got[k])
-        return next(different, None)
     # Bytes are copied to be compared: few at a time stay in the processor's caches.
     rows = max(_COMPARED_BYTES * n // max(got.nbytes, 1), 1)
     for start in range(0, n, rows):
         left, right = recorded[start : start + rows], got[start : start + rows]
         if left.tobytes() == right.tobytes():
             continue
-        if tolerance is not None:
-            differs = _beyond(left, right, tolerance)
-        else:
-            a, b = (
-                np.ascontiguousarray(each).view(np.uint8).reshape(len(left), -1) for each in (left, right)
-            )
-            differs = (a != b).any(axis=1)
-        if differs.any():
+        if (differs := differing_rows(left, right, tolerance)).any():
             return start + int(np.argmax(differs))
     return None
 
 
-def _beyond(recorded: NDArray[Any], got: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
-    if recorded.dtype.names:
-        parts = [_beyond(recorded[name], got[name], tolerance) for name in recorded.dtype.names]
-        return np.asarray(np.logical_or.reduce(parts))
-    if recorded.dtype.kind == "f":
-        same = np.isclose(got, recorded, rtol=tolerance, atol=tolerance, equal_nan=True)
+def differing_rows(a: NDArray[Any], b: NDArray[Any], tolerance: float | None = None) -> NDArray[np.bool_]:
+    """Return which rows of two columns, [rows, ...], differ; arguments as for `first_difference`."""
+    if tolerance is None:
+        differs = _bits(a) != _bits(b)
+    elif a.dtype.names:
+        parts = [differing_rows(a[name], b[name], tolerance) for name in a.dtype.names]
+        differs = np.logical_or.reduce(parts)
+    elif a.dtype.kind == "f":
+        differs = ~np.isclose(b, a, rtol=tolerance, atol=tolerance, equal_nan=True)
     else:
-        same = recorded == got
-    return np.asarray(~same.reshape(len(recorded), -1).all(axis=1))
+        differs = a != b
+    rows: NDArray[np.bool_] = np.asarray(differs).reshape(len(a), -1)
+    return np.asarray(rows.any(axis=1))
+
+
+def _bits(values: Array) -> Array:
+    """Return values other than whole numbers and objects as whole numbers of the same bits."""
+    kind, size = values.dtype.kind, values.dtype.itemsize
+    if kind not in "bfV":
+        return values
+    return np.ascontiguousarray(values).view(f"u{size}" if kind == "f" and size in (2, 4, 8) else "u1")

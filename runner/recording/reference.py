@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from runner.errors import Diverged
 from runner.recording import schema
-from runner.recording.differences import first_difference
+from runner.recording.differences import differing_rows, first_difference
 from runner.recording.messages import Message, decode
 from runner.recording.schema import BLOCK_TOPICS, Topic
 
@@ -148,7 +148,7 @@ def _cell_difference(found: Message, expected: Message) -> tuple[str, object, ob
     left, right = (np.frombuffer(values["data"], "<f8") for values in (found, expected))
     if left.shape != right.shape:
         return "data", f"{len(left)} cells", f"{len(right)} cells"
-    cell = int(np.argmax(left.view("<i8") != right.view("<i8")))
+    cell = int(np.argmax(differing_rows(left, right)))
     state, action = divmod(cell, int(expected["shape"][-1]))
     return f"data[{state}, {action}]", float(left[cell]), float(right[cell])
 

@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +20,12 @@ from runner.analysis.evaluations import evaluations_of
 from runner.errors import shortened
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
+from runner.recording.differences import differing_rows
 from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
-from runner.util.arrays import Array
 
 Block = NDArray[np.void]
 
@@ -115,14 +115,14 @@ def first_difference(
         if left is None or right is None:
             return None if left is None else left[:1], None if right is None else right[:1]
         n = min(len(left), len(right))
-        differs = differing_rows(left[:n], right[:n], fields)
+        differs = differing_steps(left[:n], right[:n], fields)
         if differs.any():
             k = int(np.argmax(differs))
             return left[k : k + 1], right[k : k + 1]
         left, right = left[n:], right[n:]
 
 
-def differing_rows(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
+def differing_steps(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
     """Return which of two equally long blocks of records differ in any of the fields."""
     if a.dtype == b.dtype and not a.dtype.hasobject and "digest" not in (a.dtype.names or ()):
         left, right = (
@@ -141,19 +141,11 @@ def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
     left, right = a[name], b[name]
     if name in ("explored", "rewards") and a["rewards"].shape != b["rewards"].shape:
         left, right = (left != 0, right != 0) if name == "explored" else (left.sum(1), right.sum(1))
-    differs: NDArray[np.bool_] = np.not_equal(_bits(left), _bits(right)).reshape(len(a), -1).any(axis=1)
+    differs = differing_rows(left, right)
     if name == "digest":  # recorded at some steps only
         for values in (left, right):
-            differs &= _bits(values).reshape(len(a), -1).any(axis=1)
-    return np.asarray(differs)
-
-
-def _bits(values: Array) -> NDArray[Any]:
-    """Return floats and composed values as whole numbers of the same bits, so that NaN equals NaN."""
-    kind, size = values.dtype.kind, values.dtype.itemsize
-    if kind not in "fV":
-        return values
-    return np.ascontiguousarray(values).view(f"u{size}" if kind == "f" and size in (2, 4, 8) else "u1")
+            differs &= differing_rows(values, np.zeros_like(values))
+    return differs
 
 
 def training_divergence(a: Recording, b: Recording) -> Divergence | None:
@@ -233,7 +225,7 @@ def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
             return _differing_part(f"{name}.{entry}", a[entry], b[entry])
     if a.size <= _MAX_NUMBERS:
         return name, a.tolist(), b.tolist()
-    differs = _bits(a.reshape(-1)) != _bits(b.reshape(-1))
+    differs = differing_rows(a.reshape(-1), b.reshape(-1))
     index = np.unravel_index(int(differs.argmax()), a.shape)
     return f"{name}[{', '.join(map(str, index))}]", a[index].tolist(), b[index].tolist()
 

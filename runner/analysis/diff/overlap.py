@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.analysis.diff.divergence import FIELDS, Block, differing_rows, unbroken
+from runner.analysis.diff.divergence import FIELDS, Block, differing_steps, unbroken
 from runner.environments.mdp import Mdp
 from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
@@ -177,7 +177,7 @@ def _agreement(left: _Steps, right: _Steps, ours: Lengths, theirs: Lengths) -> L
         agree = 0
         for first in range(0, int(common[0]), _BATCH_STEPS):
             n = min(_BATCH_STEPS, int(common[0]) - first)
-            agree += n - int(differing_rows(left.take(n), right.take(n), _ALIGNED).sum())
+            agree += n - int(differing_steps(left.take(n), right.take(n), _ALIGNED).sum())
         left.skip(int(ours[0] - common[0]))
         right.skip(int(theirs[0] - common[0]))
         return np.array([agree])
@@ -191,12 +191,12 @@ def _agreement(left: _Steps, right: _Steps, ours: Lengths, theirs: Lengths) -> L
 def _agreeing_pairs(left: Block, right: Block, ours: Lengths, theirs: Lengths) -> NDArray[np.int64]:
     """Return which of the pairs of steps (`ours` in `left`, `theirs` in `right`) agree in all but number."""
     if len(left) == len(right) == len(ours):
-        return np.flatnonzero(~differing_rows(left, right, _ALIGNED))
+        return np.flatnonzero(~differing_steps(left, right, _ALIGNED))
     agree = np.flatnonzero(left["state"][ours] == right["state"][theirs])  # most that differ do so there
     pairs = [
         _without_fields(steps)[at[agree]].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
     ]
-    return agree[~differing_rows(pairs[0], pairs[1], _ALIGNED)]
+    return agree[~differing_steps(pairs[0], pairs[1], _ALIGNED)]
 
 
 def _without_fields(steps: Block) -> NDArray[np.void]:
