@@ -76,11 +76,7 @@ class Replay:
         """The environments whose random generators are in the recorded state."""
         self._is_separate = _are_separate(recording)
         """Whether training and evaluation have environments of their own."""
-        self.environments: Sequence[int] = range(environment_count(recording))
-        """The environments that can be stepped alone; `ALL` where the vector must be stepped as a whole."""
-        makers = (recording.phase(phase).maker_of() for phase in schema.PHASES)
-        if not recording.shards and any(maker is not None and is_whole_vector(maker) for maker in makers):
-            self.environments = [ALL]
+        self.environments = environments_of(recording)
         self._max_rows = 1 if render else 256
         self.taken = 0
         """Steps taken so far."""
@@ -108,7 +104,7 @@ class Replay:
         """Yield the steps of one environment in a piece, in blocks, up to the first difference.
 
         Args:
-            environment: the number of one in `environments`; `ALL` yields the steps of each in turn.
+            environment: one of `environments`; `ALL` yields the steps of each in turn.
             start: where to begin if it was not rerun before; None for the first reset that is known.
         """
         phase, n = piece.phase, self._recording.environments if environment == ALL else 1
@@ -234,6 +230,14 @@ class Replay:
         with trusting(self._recording.path, maker, self._trust) as trust:
             make = make_vector if environment == ALL else make_environment
             return make(maker, trust, self.render), trust
+
+
+def environments_of(recording: Recording) -> Sequence[int]:
+    """Return the environments that can be stepped alone; `ALL` where only the whole vector can be."""
+    makers = (recording.phase(phase).maker_of() for phase in schema.PHASES)
+    if not recording.shards and any(maker is not None and is_whole_vector(maker) for maker in makers):
+        return [ALL]
+    return range(environment_count(recording))
 
 
 def _last_step_time(recording: Recording) -> int:

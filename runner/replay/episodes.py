@@ -14,7 +14,7 @@ from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
 from runner.replay.comparison import RerunSteps
-from runner.replay.engine import ALL, Replay
+from runner.replay.engine import ALL, Replay, environments_of
 from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
 from runner.replay.stepping import Stepper
 
@@ -52,7 +52,7 @@ def rerun_episode(
         make: returns a new replay.
     """
     target = _target(recording, phase, number)
-    for start in _starts(recording, target, make):
+    for start in _starts(recording, target):
         try:
             with closing(make()) as replay:
                 yield from _held(_episode(recording, replay, target, start), is_last=start is None)
@@ -81,6 +81,8 @@ def episode_at(
             f"{recording.path}: found no step {t:,} of {schema.PHASE_NAMES[phase]} episode {number}; it has "
             f"{len(recorded):,}, from 0."
         )
+    if ALL in environments_of(recording):
+        raise CannotRedo("The environments of this vector cannot be stepped one by one.")
     target = _target(recording, phase, number)
     environment = target.reset.environment
     turns = recorded.table.round_of(int(recorded.one(t)["step"]))
@@ -88,8 +90,6 @@ def episode_at(
     until = replace(target, stop_time=max(time, target.reset.time) + 1)
     start = _right_start(recording, target, make)
     with closing(make()) as replay:
-        if ALL in replay.environments:
-            raise CannotRedo("The environments of this vector cannot be stepped one by one.")
         stepper = replay.stepper(phase, environment)
         actions = (
             action
@@ -103,11 +103,10 @@ def episode_at(
 
 def _right_start(recording: Recording, target: _Target, make: Callable[[], Replay]) -> RecordedReset | None:
     """Return the reset from which to begin, so that the episode's first steps agree."""
-    for start in _starts(recording, target, make):
+    for start in filter(None, _starts(recording, target)):
         try:
             with closing(make()) as replay:
-                if start is not None:
-                    next(_held(_episode(recording, replay, target, start), is_last=False), None)
+                next(_held(_episode(recording, replay, target, start), is_last=False), None)
             return start
         except _Astray:
             continue
@@ -133,14 +132,11 @@ def _step_time(steps: Steps, number: int) -> int:
     return int(steps.one(number)["log_time"])
 
 
-def _starts(
-    recording: Recording, target: _Target, make: Callable[[], Replay]
-) -> Iterator[RecordedReset | None]:
+def _starts(recording: Recording, target: _Target) -> Iterator[RecordedReset | None]:
     """Yield the resets from which to begin, the best first; None for the beginning of the recording."""
-    with closing(make()) as replay:
-        if ALL in replay.environments:
-            yield None
-            return
+    if ALL in environments_of(recording):
+        yield None
+        return
     has_state = False
     for reset in resets_back(recording, target.reset.phase, target.reset.time):
         if reset.environment != target.reset.environment or reset.number > target.reset.number:
