@@ -214,20 +214,14 @@ def _held(found: Iterator[RerunSteps], is_last: bool) -> Iterator[RerunSteps]:
     Raises:
         _Astray: they do not, and there is another place to begin.
     """
-    held: list[RerunSteps] = []
-    count = 0
-    size = 0
-    is_holding, begun = not is_last, time.monotonic()
-    for steps in found:
-        is_early = count < _HELD_STEPS and size < _HELD_BYTES
-        if is_holding and is_early and (not held or time.monotonic() < begun + _HELD_SECONDS):
-            if steps.difference is not None:
-                raise _Astray
-            held.append(steps)
-            count, size = count + len(steps), size + sum(frame.nbytes for frame in steps.frames)
-            continue
-        is_holding = False  # what was yielded cannot be taken back
-        while held:
-            yield held.pop(0)
-        yield steps
-    yield from held
+    held, count, size, end = list[RerunSteps](), 0, 0, time.monotonic() + _HELD_SECONDS
+    for steps in () if is_last else found:
+        if steps.difference is not None:
+            raise _Astray
+        held.append(steps)
+        count, size = count + len(steps), size + sum(frame.nbytes for frame in steps.frames)
+        if count >= _HELD_STEPS or size >= _HELD_BYTES or time.monotonic() >= end:
+            break  # what was yielded cannot be taken back
+    while held:
+        yield held.pop(0)
+    yield from found
