@@ -133,6 +133,11 @@ class MissingExtra(RunnerError):
     """An optional package is not installed; the message says how to install it."""
 
 
+def full_message(error: BaseException) -> str:
+    """Return the message of an error with the notes that were added to it, a line each."""
+    return "\n".join([str(error), *getattr(error, "__notes__", [])])
+
+
 def nearest(name: str, known: Iterable[str]) -> str:
     """Return ` Did you mean 'x'?` for the known name nearest to `name`, or an empty string."""
     close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)

@@ -18,7 +18,15 @@ from typing import IO, Final
 import click
 
 from runner.cli.command import Group
-from runner.errors import ConfigError, ConfigProblem, ExitCode, OutOfResources, RunnerError, StorageError
+from runner.errors import (
+    ConfigError,
+    ConfigProblem,
+    ExitCode,
+    OutOfResources,
+    RunnerError,
+    StorageError,
+    full_message,
+)
 from runner.util import __version__
 from runner.util.humanize import printable
 
@@ -124,7 +132,7 @@ class Failure(click.ClickException):
             super().__init__(error.format_message())
             self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
         else:
-            super().__init__("\n".join([str(error), *getattr(error, "__notes__", [])]))
+            super().__init__(full_message(error))
             self.exit_code = exit_code_of(error)  # type: ignore[misc]
         self.problems = error.problems if isinstance(error, ConfigError) else ()
         self.as_json = as_json

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import click
@@ -75,7 +75,8 @@ def _with_examples(text: str | None) -> str | None:
 class Command(click.Command):
     """A command of a function; its help keeps the lines of its examples.
 
-    The defaults of the function's parameters declare them, unless they are `declared`.
+    The defaults of the function's parameters declare them, unless they are `declared`; `params` are further
+    ones, which the function does not get.
     """
 
     def __init__(
@@ -83,10 +84,11 @@ class Command(click.Command):
         name: str | None,
         callback: Callable[..., object],
         declared: Mapping[str, Declared] | None = None,
+        params: Sequence[click.Parameter] = (),
         **attributes: Any,
     ) -> None:
         call = _Record(callback, declared)
-        super().__init__(name, **attributes | {"callback": call, "params": list(call.parameters())})
+        super().__init__(name, callback=call, params=[*call.parameters(), *params], **attributes)
         self.help = _with_examples(self.help)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:

@@ -149,6 +149,22 @@ class JobEvent:
             return values
         return {key: value for key, value in values.items() if value is not None}
 
+    def as_line(self) -> str:
+        """Return the event as a line of a job's log, without the line break; `from_line` is the reverse."""
+        return json.dumps({"kind": self.kind, "values": self.as_json()})
+
+    @classmethod
+    def from_line(cls, line: str | bytes, event_id: str = "") -> JobEvent:
+        """Return the event of a line of a job's log.
+
+        Raises:
+            RunnerError: it has none.
+        """
+        try:
+            return cls.from_json(**json.loads(line), event_id=event_id)
+        except (TypeError, ValueError) as error:
+            raise RunnerError("found a line of a job's log that is no event.") from error
+
     @classmethod
     def from_json(cls, kind: str, values: JsonView, event_id: str = "") -> JobEvent:
         """Return an event from a stream or a log.

@@ -26,6 +26,7 @@ from runner.errors import (
     RunnerError,
     RunNotFound,
     StorageError,
+    full_message,
 )
 from runner.service.errors import RequestError
 from runner.service.logs import LOG
@@ -94,7 +95,7 @@ def status_of(error: RunnerError) -> HTTPStatus:
 
 def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
     """Return an error's message, and the problems of a configuration with their lines and keys."""
-    message = settings.without_folders("\n".join([str(error), *getattr(error, "__notes__", [])]))
+    message = settings.without_folders(full_message(error))
     if not isinstance(error, ConfigError):
         return ErrorBody(message=message)
     problems = [

@@ -11,6 +11,7 @@ state       a sweep on disk: its resolved file, and locks; progress follows from
 trials      trials, and what is recorded of them
 running     the loop that gives batches of runs to workers
 plan        disk and runs that a sweep will take
+whole       a sweep from its start to its end, as a command and the service run it
 results     ranking, importance, the best configuration
 charts      charts of the trials, one sheet with all of them, and the sweep as a page
 

@@ -58,12 +58,10 @@ def connect(address: str | None, processors: int | None = None) -> ModuleType:
 
 
 class RayActor:
-    """Runs one function at a time in a process of Ray, and keeps its messages until fetched."""
+    """Runs one function at a time in a process of Ray."""
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
-        self._messages: list[object] = []
-        self._lock = threading.Lock()
 
     def run(self, function: Callable[Concatenate[RayActor, P], T], *args: P.args, **kwargs: P.kwargs) -> T:
         """Call a function with this actor and these arguments."""
@@ -76,17 +74,6 @@ class RayActor:
     def stop(self) -> bool:
         """Return whether the function must stop."""
         return self._stopping.is_set()
-
-    def send(self, message: object) -> None:
-        """Keep a message of the function until it is fetched."""
-        with self._lock:
-            self._messages.append(message)
-
-    def take_messages(self) -> list[object]:
-        """Return the messages since the last call."""
-        with self._lock:
-            messages, self._messages = self._messages, []
-        return messages
 
 
 def start_actor(ray: ModuleType) -> Any:

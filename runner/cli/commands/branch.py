@@ -13,6 +13,7 @@ from click.core import ParameterSource
 
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
+from runner.cli.jobs import job_option
 from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
 from runner.cli.output import draw, facts, grid_table, print_json, print_result, say
 from runner.cli.parameter_types import COUNT, INDEX, STEP
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 
 @click.command("branch", cls=Command)
+@job_option
 def branch_command(
     run_name: str = run_argument,
     at: EpisodeRef | None = option(

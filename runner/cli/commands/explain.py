@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Command, argument, option
+from runner.cli.jobs import job_option
 from runner.cli.options import (
     json_option,
     markdown_option,
@@ -38,6 +39,7 @@ class _Planned(Exception):
 
 
 @click.command("explain", cls=Command)
+@job_option
 def explain_command(
     a: str = argument(metavar="A"),
     b: str = argument(metavar="B"),

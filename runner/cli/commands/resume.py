@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.cli.command import Command, option
+from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
     checkpoint_option,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
 
 @click.command("resume", cls=Command)
+@job_option
 def resume_command(
     run_name: str = run_argument,
     accept_changes: bool = accept_changes_option,

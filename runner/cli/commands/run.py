@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Command, option
+from runner.cli.jobs import job_option
 from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
 from runner.cli.output import console, draw, facts, print_json, say
 from runner.cli.parameter_types import INDEX
@@ -28,6 +29,7 @@ if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
 
 
 @click.command("run", cls=Command)
+@job_option
 def run_command(
     config: Path = config_argument,
     seed: int | None = option(

@@ -85,9 +85,9 @@ def serve_command(
         ray=ray,
     )
     if ray is not None:
-        from runner.sweep.cluster import require_ray
+        from runner.service.jobs.cluster import require_job_api
 
-        require_ray()
+        require_job_api()
     with storage_errors(log or settings.recordings[0]):
         settings.recordings[0].mkdir(parents=True, exist_ok=True)
         stream = log.open("a", encoding="utf-8") if log else sys.stderr

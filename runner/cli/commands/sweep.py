@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Group, argument, option
+from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
     all_option,
@@ -35,11 +36,9 @@ from runner.util.humanize import UNKNOWN, amount, duration, size
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:
-    from runner.sweep.local import Workers
     from runner.sweep.model import Range, Sweep
     from runner.sweep.plan import Plan
     from runner.sweep.running import SweepStatus
-    from runner.sweep.task import Result, Task
     from runner.sweep.trials import Trials
 
 
@@ -55,6 +54,7 @@ def sweep_command() -> None:
 
 
 @sweep_command.command("run")
+@job_option
 def run(
     file: Path = argument(metavar="FILE", type=ConfigName("sweep")),
     workers: int | None = workers_option("one per processor"),
@@ -88,45 +88,38 @@ def run(
       dualtaxi sweep run hyperparameters --resume
     """
     from runner.api import interruptible
-    from runner.sweep import state
-    from runner.sweep.cluster import worker_pool
     from runner.sweep.loading import load_sweep
-    from runner.sweep.plan import limit_of, plan_of, require_disk
-    from runner.sweep.running import run_sweep
+    from runner.sweep.plan import plan_of
     from runner.sweep.search import require_optuna
+    from runner.sweep.whole import run_whole_sweep
 
     require_optuna()
-    folder = recordings_folder(recordings)
     sweep = load_sweep(file, checked_name(name))
-    plan = plan_of(sweep)
     if dry_run:
-        _print_plan(sweep, plan, as_json)
+        _print_plan(sweep, plan_of(sweep), as_json)
         return
-    with state.locked(sweep.name, folder):
-        state.require_startable(sweep, folder, is_resumed, accept_changes)
-        before = len(state.runs_of(sweep.name, folder))
-        require_disk(plan, before, folder)
+
+    def planned(plan: Plan, before: int) -> None:
         started = f"; {before:,} started before" if before else ""
         say(f"{sweep.name}: {plan.runs:,} runs, about {size(plan.bytes)}{started}.")
-        pool: Workers[Task, Result]
-        with (
-            contextlib.redirect_stdout(sys.stderr),  # Ray prints messages about workers that died
-            worker_pool(workers, ray, plan.runs) as pool,
-            interruptible(second=signal.SIG_DFL) as interrupt,
-            _live_status(sweep) as report,
-        ):
-            state.begin(sweep, folder, is_resumed, accept_changes)
-            if retry_failed:
-                state.forget_failures(sweep.name, folder)
-            trials, status = run_sweep(
-                sweep,
-                folder,
-                pool,
-                stop=interrupt,
-                report=report,
-                limit=limit_of(sweep.file.limits, plan, folder, before),
-                accept_changes=accept_changes,
-            )
+
+    with (
+        contextlib.redirect_stdout(sys.stderr),  # Ray prints messages about workers that died
+        interruptible(second=signal.SIG_DFL) as interrupt,
+        _live_status(sweep) as report,
+    ):
+        trials, status = run_whole_sweep(
+            sweep,
+            recordings_folder(recordings),
+            workers,
+            ray,
+            resume=is_resumed,
+            retry_failed=retry_failed,
+            accept_changes=accept_changes,
+            stop=interrupt,
+            report=report,
+            planned=planned,
+        )
     _print_results(sweep, trials, status, as_json)
     if status.stopped or status.failed:
         raise click.exceptions.Exit(ExitCode.INTERRUPTED if interrupt.came else ExitCode.DIFFERENT)

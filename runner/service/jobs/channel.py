@@ -1,17 +1,14 @@
-"""The specification of a job, and the worker's end of the pipe to the server."""
+"""What a job is given: its folder, where its events go, and whether it must stop."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 from runner.client.jobs import EventData
 from runner.errors import RunnerError
@@ -27,60 +24,35 @@ OTHER_OWNER_SECONDS: Final = 60.0
 
 @dataclass(frozen=True)
 class JobSpec:
-    """What a worker process needs to know of a job."""
+    """A job, its folder, and where to do it."""
 
+    folder: Path
     job: Job
-    recordings: Path
-    workers: int | None
-    """How many processes may train at once; None for as many as a cluster has."""
-    ray: str | None
-    """The address of the Ray cluster that runs the job; None for this machine."""
+    ray: str | None = None
+    """The address of the Ray cluster that this process belongs to; None if it belongs to none."""
+
+    @property
+    def recordings(self) -> Path:
+        """The recordings folder that the job is of."""
+        return self.folder.parents[1]
+
+    @property
+    def workers(self) -> int | None:
+        """How many processes may train at once; None for as many as the cluster has."""
+        return self.job.workers if self.ray is None else None
 
     def values(self) -> dict[str, object]:
-        """Return the configuration or sweep, every value present."""
-        return read_values(self.recordings, self.job.number)
+        """Return the configuration, sweep or question, every value present."""
+        return read_values(self.folder)
 
 
-class JobChannel(Protocol):
-    """Where a run sends its events, and learns that it must stop."""
+@dataclass(frozen=True)
+class JobChannel:
+    """Where a job sends its events, and learns that it must stop."""
 
-    def send(self, event: EventData) -> None:
-        """Send an event to the server."""
-
-    def stop(self) -> bool:
-        """Return whether the run must stop."""
-
-
-class PipeChannel:
-    """The worker's end of the pipe to the server.
-
-    The server sends one message: that the job must stop. If the server dies, the worker stops as well: it
-    closes its recording, so that the next server of the folder can resume it.
-    """
-
-    def __init__(self, pipe: Connection) -> None:
-        self._pipe = pipe
-        self._stopping = threading.Event()
-        self._lock = threading.Lock()
-        threading.Thread(target=self._receive, name="channel", daemon=True).start()
-
-    def send(self, event: EventData) -> None:
-        """Send an event to the server; nothing happens if it is gone."""
-        with self._lock, contextlib.suppress(OSError):
-            self._pipe.send(event)
-
-    def stop(self) -> bool:
-        """Return whether the job must stop."""
-        return self._stopping.is_set()
-
-    def request_stop(self, *_: object) -> None:
-        """Stop the job; also a handler of signals."""
-        self._stopping.set()
-
-    def _receive(self) -> None:
-        with contextlib.suppress(EOFError, OSError):
-            self._pipe.recv()
-        self.request_stop()
+    send: Callable[[EventData], None]
+    stop: Callable[[], bool]
+    """Returns whether the job must stop; called every few milliseconds."""
 
 
 def until_free(

@@ -26,7 +26,7 @@ from runner.debugging.explanation import summary
 from runner.debugging.mixtures import Measured, Measurement
 from runner.errors import ConfigError, RunNotFound
 from runner.runs.resolve import find_run
-from runner.service.jobs.channel import JobSpec, PipeChannel, until_free
+from runner.service.jobs.channel import JobChannel, JobSpec, until_free
 from runner.service.jobs.checking import MAX_RUNS, is_path
 from runner.service.jobs.store import CheckedJob
 from runner.sweep.cluster import worker_pool
@@ -80,7 +80,7 @@ def _refuse_initial_path(source: str, recordings: Path) -> None:
             raise ConfigError(f"initial_q: found the path {run!r}, expected the id of a run here.")
 
 
-def run_explain_job(spec: JobSpec, channel: PipeChannel) -> None:
+def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
     """Train what is left of an explanation, and store it."""
     question = _question(ExplainQuestion.model_validate(spec.values()), spec.recordings)
     stages = set[str]()

@@ -11,9 +11,9 @@ from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
 from runner.service.jobs.checking import JobChecker
+from runner.service.jobs.cluster import require_job_api
 from runner.service.jobs.store import WITHOUT_RUNS, CheckedJob, Job, JobStore, now
 from runner.service.jobs.workers import WorkerPool
-from runner.sweep.cluster import require_ray
 from runner.util.humanize import size
 
 
@@ -38,7 +38,7 @@ class JobQueue:
         self, recordings: Path, workers: int, *, max_unfinished: int = 1000, ray: str | None = None
     ) -> None:
         if ray is not None:
-            require_ray()
+            require_job_api()
         self.recordings = recordings.absolute()
         self.store = JobStore(self.recordings, max_unfinished)
         self.pool = WorkerPool(self.store, workers, ray)

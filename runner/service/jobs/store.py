@@ -11,7 +11,6 @@ A job is a configuration with all its seeds, or a sweep. Its number is its place
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import threading
@@ -255,10 +254,8 @@ class JobStore:
                 if not line.endswith(b"\n"):
                     break  # it is being written
                 after += len(line)
-                with contextlib.suppress(
-                    TypeError, ValueError, RunnerError
-                ):  # damaged when the machine stopped
-                    events.append(JobEvent.from_json(**json.loads(line), event_id=str(after)))
+                with contextlib.suppress(RunnerError):  # damaged when the machine stopped
+                    events.append(JobEvent.from_line(line, str(after)))
         return events, after
 
     def last_events(self, number: int, limit: int) -> tuple[list[JobEvent], int]:
@@ -279,12 +276,7 @@ class JobStore:
         if not path.exists():
             self._forget(number)
             return
-        try:
-            self._jobs[number] = _STORED.validate_json(path.read_bytes())
-        except ValueError as error:
-            raise StorageError(
-                f"{path}: found a file that describes no job; move its folder away to start without the job."
-            ) from error
+        self._jobs[number] = read_job(path.parent)
         with self.path(number, LOG_FILE).open("rb") as log:
             log.seek(max(log.seek(0, os.SEEK_END) - LOG_TAIL_BYTES, 0))
             begin, tail = log.tell(), log.read()
@@ -296,8 +288,8 @@ class JobStore:
         shutil.rmtree(self.path(number), ignore_errors=True)
 
     def _append(self, number: int, data: StateEvent | RunEvent | LogEvent) -> None:
-        event, size = JobEvent(replace(data, time=now())), self._log_sizes.get(number, 0)
-        line = json.dumps({"kind": event.kind, "values": event.as_json()}).encode() + b"\n"
+        size = self._log_sizes.get(number, 0)
+        line = f"{JobEvent(replace(data, time=now())).as_line()}\n".encode()
         with self.path(number, LOG_FILE).open("r+b" if size else "wb") as log:
             log.seek(size)  # over a line that was not written to its end because the disk was full
             log.write(line)
@@ -319,10 +311,25 @@ def _write(path: Path, data: bytes) -> None:
         os.fsync(stream.fileno())
 
 
-def read_values(recordings: Path, number: int) -> dict[str, object]:
-    """Return the configuration or sweep of a job, every value present."""
-    text = (recordings / FOLDER / str(number) / VALUES_FILE).read_bytes().decode()
-    return dict(read_yaml(text, f"job {number}").value)
+def read_job(folder: Path) -> Job:
+    """Return the job in a folder.
+
+    Raises:
+        StorageError: its file cannot be read, or describes no job.
+    """
+    path = folder / STATE_FILE
+    try:
+        with storage_errors(path):
+            return _STORED.validate_json(path.read_bytes())
+    except ValueError as error:
+        raise StorageError(
+            f"{path}: found a file that describes no job; move its folder away to start without the job."
+        ) from error
+
+
+def read_values(folder: Path) -> dict[str, object]:
+    """Return the configuration, sweep or question of the job in a folder, every value present."""
+    return dict(read_yaml((folder / VALUES_FILE).read_bytes().decode(), f"job {folder.name}").value)
 
 
 def lock_folder(recordings: Path, lock_file: str) -> FileLock:

@@ -11,50 +11,39 @@ from runner.errors import RunnerError
 from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
     REPORT_SECONDS,
+    JobChannel,
     JobSpec,
-    PipeChannel,
     until_free,
     wait_for_owners,
 )
-from runner.sweep import state, sweeps_in
-from runner.sweep.cluster import worker_pool
+from runner.sweep import state
 from runner.sweep.loading import from_values
-from runner.sweep.local import Workers
-from runner.sweep.plan import limit_of, plan_of, require_disk
-from runner.sweep.running import SweepStatus, run_sweep
-from runner.sweep.task import Result, Task
+from runner.sweep.running import SweepStatus
+from runner.sweep.whole import run_whole_sweep
 
 
-def run_sweep_job(spec: JobSpec, channel: PipeChannel) -> None:
+def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
     """Run what is left of a sweep, once no other process runs it."""
     rest = partial(_run_rest, spec, channel)
     until_free(rest, state.SweepBusy, channel.stop, OTHER_OWNER_SECONDS)
 
 
-def _run_rest(spec: JobSpec, channel: PipeChannel) -> None:
-    sweep = from_values(spec.values())
-    with state.locked(spec.job.name, spec.recordings):
-        exists = spec.job.name in sweeps_in(spec.recordings)
-        state.begin(sweep, spec.recordings, resume=exists, accept_changes=spec.job.accept_changes)
-        if spec.job.retry:
-            state.forget_failures(spec.job.name, spec.recordings)
-        wait_for_owners(state.runs_of(spec.job.name, spec.recordings).values(), channel.stop)
-        before = len(state.runs_of(spec.job.name, spec.recordings))
-        plan = plan_of(sweep)
-        require_disk(plan, before, spec.recordings)
-        reporter = _SweepReporter(channel)
-        workers: Workers[Task, Result]
-        with worker_pool(spec.workers, spec.ray, plan.runs) as workers:
-            _, status = run_sweep(
-                sweep,
-                spec.recordings,
-                workers,
-                stop=channel.stop,
-                report=reporter.report,
-                limit=limit_of(sweep.file.limits, plan, spec.recordings, before),
-                accept_changes=spec.job.accept_changes,
-            )
-        reporter.send(status)
+def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
+    sweep, recordings = from_values(spec.values()), spec.recordings
+    wait_for_owners(state.runs_of(sweep.name, recordings).values(), channel.stop)
+    reporter = _SweepReporter(channel)
+    _, status = run_whole_sweep(
+        sweep,
+        recordings,
+        spec.workers,
+        spec.ray,
+        resume=True,
+        retry_failed=spec.job.retry,
+        accept_changes=spec.job.accept_changes,
+        stop=channel.stop,
+        report=reporter.report,
+    )
+    reporter.send(status)
     if status.stopped:
         raise RunnerError(f"stopped: {status.stopped}")
     if status.failed:
@@ -64,7 +53,7 @@ def _run_rest(spec: JobSpec, channel: PipeChannel) -> None:
 class _SweepReporter:
     """Sends a sweep's progress a few times a second, and each trial that is the best one yet."""
 
-    def __init__(self, channel: PipeChannel) -> None:
+    def __init__(self, channel: JobChannel) -> None:
         self._channel = channel
         self._sent, self._best = 0.0, -1
 

@@ -1,19 +1,20 @@
-"""A worker process: runs one job, a configuration seed by seed or a sweep, here or on a Ray cluster."""
+"""Doing a job: a configuration seed by seed, a sweep or an explanation; and the process that does it."""
 
 from __future__ import annotations
 
 import contextlib
 import signal
+import threading
 import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
 from runner.archive.places import at_hand
-from runner.client.jobs import LogEvent, RunEvent, RunProgress, StateEvent
+from runner.client.jobs import EventData, LogEvent, RunEvent, RunProgress, StateEvent
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
-from runner.errors import RunnerError
+from runner.errors import RunnerError, full_message
 from runner.execution.branching import train_branch
 from runner.execution.resume import resume
 from runner.execution.session import Progress, evaluation_brief, run_job
@@ -21,18 +22,12 @@ from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.resolve import run_of_id
 from runner.runs.run import Run, create_run
-from runner.service.jobs.channel import (
-    REPORT_SECONDS,
-    JobChannel,
-    JobSpec,
-    PipeChannel,
-    wait_for_owners,
-)
+from runner.service.jobs.channel import REPORT_SECONDS, JobChannel, JobSpec, wait_for_owners
+from runner.service.jobs.cluster import do_on_cluster
 from runner.service.jobs.explanations import run_explain_job
 from runner.service.jobs.sweeps import run_sweep_job
 from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
-from runner.sweep.cluster import RayActor, connect, start_actor
 from runner.util.compilation import MESSAGE, announced
 from runner.util.values import as_utf8
 
@@ -40,31 +35,51 @@ MAX_TEXT: Final = 4000
 """The length of a log line."""
 
 
-def work(pipe: Connection, spec: JobSpec) -> None:
-    """Run a job and report its outcome; the main function of a worker process."""
+def work(pipe: Connection, spec: JobSpec, cluster: str | None = None) -> None:
+    """Do a job, or have a Ray cluster do it; the main function of a worker process.
+
+    Events go through the pipe. The server sends one message: that the job must stop. If the server dies, the
+    worker stops as well: it closes its recording, so that the next server of the folder can resume it.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C, which reaches every process, is for the server
     lower_priority()
-    channel = PipeChannel(pipe)
-    signal.signal(signal.SIGTERM, channel.request_stop)
+    stopping, lock = threading.Event(), threading.Lock()
+
+    def wait_for_stop() -> None:
+        with contextlib.suppress(EOFError, OSError):
+            pipe.recv()
+        stopping.set()
+
+    def send(event: EventData) -> None:
+        with lock, contextlib.suppress(OSError):  # the server is gone
+            pipe.send(event)
+
+    signal.signal(signal.SIGTERM, lambda *_: stopping.set())
+    threading.Thread(target=wait_for_stop, name="channel", daemon=True).start()
+    channel = JobChannel(send, stopping.is_set)
+    outcome = do_job(spec, channel) if cluster is None else do_on_cluster(spec, cluster, channel)
+    if outcome is not None:
+        send(outcome)
+
+
+def do_job(spec: JobSpec, channel: JobChannel) -> StateEvent:
+    """Do what is left of a job, and return its outcome; a worker and the option --job call this."""
     try:
         with announced(lambda: channel.send(LogEvent(MESSAGE))):
             run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.job.kind, run_config_job)
             run(spec, channel)
-        outcome = StateEvent("finished")
+        return StateEvent("finished")
     except (RunnerError, OSError, KeyboardInterrupt) as error:
-        message = "\n".join([str(error), *getattr(error, "__notes__", [])])
-        outcome = StateEvent("failed", as_utf8(without_folders(message, spec.recordings)))
         if channel.stop():  # whatever else was the matter, the next worker meets it again
-            outcome = StateEvent("interrupted")
-    channel.send(outcome)
+            return StateEvent("interrupted")
+        return StateEvent("failed", as_utf8(without_folders(full_message(error), spec.recordings)))
 
 
 def run_config_job(spec: JobSpec, channel: JobChannel) -> None:
     """Run what is left of a configuration's seeds, one after the other."""
     config = from_mapping(spec.values())
-    run = run_seed if spec.ray is None else run_seed_on_ray
     for seed in config.seeds:
-        if channel.stop() or run(spec, channel, config, seed) != "finished":
+        if channel.stop() or run_seed(spec, channel, config, seed) != "finished":
             raise KeyboardInterrupt
 
 
@@ -72,6 +87,8 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
     """Start or resume a job's run of one seed; return its status."""
     run = _existing_run(spec.recordings / spec.job.run_ids[seed])
     if run is not None and run.status == "finished":
+        if seed not in spec.job.started_runs:  # the server was killed before it was told
+            channel.send(RunEvent(run.run_id, seed))
         return run.status
     if run is not None:
         wait_for_owners([run], channel.stop)
@@ -145,40 +162,3 @@ class Reporter:
             last_evaluation=evaluation_brief(progress.evaluations[-1]) if progress.evaluations else None,
         )
         self._channel.send(sent)
-
-
-def run_seed_on_ray(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed: int) -> str:
-    """Run a seed in a Ray actor, and forward its messages; return the run's status.
-
-    Raises:
-        RunnerError: the cluster cannot be reached, the run fails, or the actor dies.
-    """
-    ray = connect(spec.ray)
-    try:
-        actor = start_actor(ray)
-        result = actor.run.remote(_run_seed_in_actor, spec, config.to_mapping(), seed)
-        is_over = False
-        while not is_over:
-            is_over = bool(ray.wait([result], timeout=REPORT_SECONDS)[0])
-            for message in ray.get(actor.take_messages.remote()):
-                channel.send(message)
-            if channel.stop():
-                actor.request_stop.remote()
-        status, error_message = ray.get(result)
-    except ray.exceptions.RayError as error:
-        raise RunnerError(f"--ray: the actor of seed {seed} is gone: {error}") from error
-    finally:
-        ray.shutdown()
-    if error_message:
-        raise RunnerError(error_message)
-    return str(status)
-
-
-def _run_seed_in_actor(
-    actor: RayActor, spec: JobSpec, values: dict[str, object], seed: int
-) -> tuple[str, str]:
-    """Run the seed; return the run's status, and the error message if it failed."""
-    try:
-        return run_seed(spec, actor, from_mapping(values), seed), ""
-    except RunnerError as error:
-        return "failed", str(error)

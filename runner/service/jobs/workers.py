@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Final
@@ -127,17 +127,12 @@ class WorkerPool:
     def _start_worker(self, job: Job) -> _Worker:
         """Start the worker process of a job."""
         workers = self._needed(job)
-        spec = JobSpec(
-            job=job,
-            recordings=self._store.recordings,
-            workers=workers if self.ray is None else None,
-            ray=self.ray,
-        )
+        spec = JobSpec(self._store.path(job.number), replace(job, workers=workers))
         ours, theirs = self._context.Pipe()
         with contextlib.closing(theirs):
             # Not a daemon: a sweep's worker has child processes of its own.
             try:
-                process = start_process(self._context, work, theirs, spec, name=f"job-{job.number}")
+                process = start_process(self._context, work, theirs, spec, self.ray, name=f"job-{job.number}")
             except BaseException:
                 ours.close()
                 raise

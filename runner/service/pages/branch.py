@@ -7,7 +7,6 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.environments.naming import numbered_actions
@@ -18,7 +17,7 @@ from runner.service.api.questions import queue_branch
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.jobs.checking import BranchQuestion
 from runner.service.pages.frame import run_page
-from runner.service.pages.rendering import Form, message_of, number_in
+from runner.service.pages.rendering import Form, message_of, number_in, to_job
 
 router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
 
@@ -37,7 +36,7 @@ async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -
         job = await queue_branch(run, jobs, _question(given))
     except RunnerError as error:
         return await run_in_threadpool(_page, request, run, given, message_of(error, request))
-    return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
+    return to_job(job.number)
 
 
 def _question(given: Mapping[str, str]) -> BranchQuestion:

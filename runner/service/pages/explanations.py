@@ -6,7 +6,6 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import EpisodeRef
@@ -18,7 +17,7 @@ from runner.service.api.comparing import Part, found_explanation
 from runner.service.api.questions import queue_explanation
 from runner.service.dependencies import JobsOf, SettingsOf
 from runner.service.jobs.explanations import ExplainQuestion
-from runner.service.pages.rendering import Form, message_of, number_in, page
+from runner.service.pages.rendering import Form, message_of, number_in, page, to_job
 
 router = APIRouter(include_in_schema=False)
 Name = Annotated[str, Query(max_length=200)]
@@ -47,7 +46,7 @@ async def explain(request: Request, sent: Form, jobs: JobsOf) -> Response:
     except RunnerError as error:
         values = {"form": given, "problem": message_of(error, request)}
         return await run_in_threadpool(page, request, "explain.html", values, HTTPStatus.UNPROCESSABLE_ENTITY)
-    return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
+    return to_job(job.number)
 
 
 @router.get("/sweeps/explanations/{pair}/{metric}")

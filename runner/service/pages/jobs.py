@@ -7,7 +7,6 @@ from http import HTTPStatus
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import RedirectResponse
 
 from runner.debugging.explanation_files import explanations_in
 from runner.service.addresses import Paging
@@ -16,7 +15,7 @@ from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import Job
-from runner.service.pages.rendering import page
+from runner.service.pages.rendering import page, to_job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
 
@@ -66,14 +65,14 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
 def cancel(jobs: JobsOf, number: Number) -> Response:
     """Cancel a job."""
     jobs.cancel(number)
-    return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
+    return to_job(number)
 
 
 @router.post("/{number}/resume")
 def resume(jobs: JobsOf, number: Number) -> Response:
     """Resume a job."""
     jobs.resume(number)
-    return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
+    return to_job(number)
 
 
 def _rows(jobs: JobQueue, number: int) -> dict[str, object]:

@@ -14,6 +14,7 @@ from urllib.parse import parse_qsl
 
 import jinja2
 from fastapi import Depends, FastAPI, Request, Response
+from fastapi.responses import RedirectResponse
 from markupsafe import Markup
 
 from runner.errors import RunnerError
@@ -51,6 +52,11 @@ def page(
     """Return a template filled with values as the response to a request."""
     body = render(request.url.path, viewer_of(request), template, values)
     return Response(body, status, media_type="text/html")
+
+
+def to_job(number: int) -> Response:
+    """Return the redirection to the page of a job."""
+    return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
 
 
 def render(path: str, viewer: Viewer, template: str, values: Mapping[str, object]) -> bytes:

@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import RedirectResponse
 from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
@@ -20,7 +19,7 @@ from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS
 from runner.service.jobs.store import CheckedJob
-from runner.service.pages.rendering import Form, number_in, page, viewer_of
+from runner.service.pages.rendering import Form, number_in, page, to_job, viewer_of
 from runner.service.problems import error_body
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
@@ -118,7 +117,7 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     except RunnerError as error:
         values = _values(text, sent, _problems(request, text, error))
         return await run_in_threadpool(page, request, TEMPLATE, values, HTTPStatus.UNPROCESSABLE_ENTITY)
-    return RedirectResponse(f"/queue/{job.number}", HTTPStatus.SEE_OTHER)
+    return to_job(job.number)
 
 
 def _problems(request: Request, text: str, error: RunnerError) -> list[Problem]:

@@ -6,17 +6,21 @@ import concurrent.futures
 import errno
 import json
 import time
+from dataclasses import replace
 from multiprocessing.process import BaseProcess
 
 import pytest
+from click.testing import CliRunner
 from submitted import ENDLESS, ICY
 
 import runner
+from runner.cli import cli
 from runner.client.jobs import LogEvent
 from runner.config import from_mapping
 from runner.runs.listing import list_runs
 from runner.service.api.jobs import POLL_SECONDS
 from runner.service.jobs import queue, workers
+from runner.service.jobs.checking import check
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob, JobStore
 from tests.waiting import until
@@ -314,6 +318,36 @@ def test_a_reserved_run_that_was_never_made_is_made(tmp_path, folder):
         assert over.state == "finished"
         runs = list_runs(jobs.recordings)
         assert [run.run_id for run in runs] == [over.started_runs[3]] == ["abcdefgh"]
+
+
+def test_a_command_does_a_job_from_its_folder_alone(tmp_path):
+    folder = tmp_path / "runs"
+    with JobStore(folder) as store:
+        text = json.dumps(CONFIG)
+        path = store.path(store.add(check(text, "job.yaml", folder), text).number)
+        missing = one_seed().values | {"env": {"id": "Missing-v0", "kwargs": {}}}
+        broken = store.path(store.add(replace(one_seed(), values=missing), "").number)
+    lines, code = done_by_command("run", path)
+    assert code == 0
+    assert [line["values"]["seed"] for line in lines if line["kind"] == "run"] == [0, 1]
+    assert lines[-1] == {"kind": "state", "values": {"state": "finished"}}
+    here = runner.run_all(CONFIG, recordings=tmp_path / "here")
+    digests = [
+        {run.seed: run.summary["content_digest"] for run in runs} for runs in (list_runs(folder), here)
+    ]
+    assert digests[0] == digests[1]
+    for command in ("resume", "branch", "explain", "sweep run"):
+        assert done_by_command(command, path)[1] == 0, "it is finished already"
+    assert len(list_runs(folder)) == 2
+    lines, code = done_by_command("run", broken)
+    assert code == 1
+    assert "Missing" in lines[-1]["values"]["error"]
+
+
+def done_by_command(command, folder):
+    """Return the lines of JSON that a command prints which does a job, and its exit code."""
+    result = CliRunner().invoke(cli, [*command.split(), "--job", str(folder)])
+    return [json.loads(line) for line in result.stdout.splitlines()], result.exit_code
 
 
 def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(

@@ -47,10 +47,10 @@ def test_jobs_their_runs_and_events_outlive_the_process(tmp_path):
             (2, "queued", ""),
             (3, "queued", ""),
         ]
-        assert (read_values(tmp_path, third.number), third.run_ids, third.workers) == (SWEEP, {}, 2)
+        assert (read_values(store.path(third.number)), third.run_ids, third.workers) == (SWEEP, {}, 2)
         assert store.events(2) == events
         assert [event.kind for event in events[0]] == ["state", "log", "run"]
-        assert (store.submitted(1), read_values(tmp_path, 1)) == ("episodes: 3\n", CONFIG)
+        assert (store.submitted(1), read_values(store.path(1))) == ("episodes: 3\n", CONFIG)
         assert store.job(2).run_ids == {2**64 - 1: "aaaa", 3: "bbbb"}
         assert store.job(2).started_runs == {2**64 - 1: "aaaa"}
         assert [len(run_id) for run_id in store.job(1).run_ids.values()] == [8], "reserved at once"
