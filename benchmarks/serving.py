@@ -26,11 +26,12 @@ async def client(host, port, paths, number, until, taken):
         began = time.perf_counter()
         writer.write(f"GET {path} HTTP/1.1\\r\\nHost: {host}:{port}\\r\\n\\r\\n".encode())
         head = await reader.readuntil(b"\\r\\n\\r\\n")
-        length = int(head.lower().partition(b"content-length:")[2].partition(b"\\r\\n")[0])
+        length = int(head.lower().partition(b"content-length:")[2].partition(b"\\r\\n")[0] or 0)
         await reader.readexactly(length)
-        if not head.startswith(b"HTTP/1.1 200"):
+        if not head.startswith((b"HTTP/1.1 200", b"HTTP/1.1 204")):
             raise SystemExit(f"{path}: {head.decode()}")
         taken.append(time.perf_counter() - began)
+        await asyncio.sleep(float(sys.argv[7]))
     writer.close()
 
 async def main():
@@ -62,9 +63,11 @@ class Service:
 
 
 @contextlib.contextmanager
-def serving(recordings: Path, *words: str, environment: Mapping[str, str] | None = None) -> Iterator[Service]:
+def serving(
+    recordings: Path, *words: str, environment: Mapping[str, str] | None = None, module: str = "runner"
+) -> Iterator[Service]:
     """Run `dualtaxi serve` over a folder on a free port, until the block is left."""
-    line = [sys.executable, "-m", "runner", "serve", "--port", "0", "--recordings", str(recordings)]
+    line = [sys.executable, "-m", module, "serve", "--port", "0", "--recordings", str(recordings)]
     process = subprocess.Popen(
         [*line, "--log", os.devnull, *words],
         stdout=subprocess.PIPE,
@@ -82,7 +85,12 @@ def serving(recordings: Path, *words: str, environment: Mapping[str, str] | None
 
 
 def response_times(
-    service: Service, paths: Sequence[str], clients: int = 20, seconds: float = 5, warm: float = 1
+    service: Service,
+    paths: Sequence[str],
+    clients: int = 20,
+    seconds: float = 5,
+    warm: float = 1,
+    pause: float = 0,
 ) -> list[float]:
     """Return the response times, in seconds, of concurrent clients that each send one request after another.
 
@@ -94,8 +102,10 @@ def response_times(
         clients: the number of clients, each with its own connection.
         seconds: duration of the measurement.
         warm: duration of the warm-up before it.
+        pause: how long a client waits before its next request.
     """
     line = [service.host, str(service.port), str(seconds), json.dumps(list(paths)), str(warm), str(clients)]
+    line.append(str(pause))
     done = subprocess.run(
         [sys.executable, "-I", "-S", "-c", _CLIENTS, *line], capture_output=True, text=True, check=False
     )

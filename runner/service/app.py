@@ -144,6 +144,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
         app.state.spooling = anyio.CapacityLimiter(1)
+        app.state.downloads = anyio.CapacityLimiter(2)
         app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
         stack.callback(app.state.uploads.close)
         app.state.pictures = PictureStreams()

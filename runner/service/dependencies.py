@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
@@ -29,9 +29,12 @@ Shown = TypeVar("Shown")
 
 
 def _state(name: str) -> object:
-    """Return the dependency on a part of the service, as `app.state` has it."""
+    """Return the dependency on a part of the service, as `app.state` has it.
 
-    def get(request: Request) -> object:
+    Dependencies that only look something up are `async`: FastAPI calls others in threads, and waits for one.
+    """
+
+    async def get(request: Request) -> object:
         return getattr(request.app.state, name)
 
     return Depends(get)
@@ -47,7 +50,7 @@ JobsOf = Annotated[JobQueue, _state("jobs")]
 UploadsOf = Annotated[Uploads, _state("uploads")]
 
 
-def owner_of(request: Request) -> str:
+async def owner_of(request: Request) -> str:
     """Return the owner of a request's uploads: the id of its token, or nothing."""
     return request.state.token.id if request.state.token else ""
 
@@ -102,21 +105,30 @@ After = Annotated[
 ]
 
 
-def training_episode(episode: EpisodeNumber) -> EpisodeRef:
+async def training_episode(episode: EpisodeNumber) -> EpisodeRef:
     """Return the training episode that the path names."""
     return EpisodeRef(episode)
 
 
-def trial_of_evaluation(after: After, trial: EpisodeNumber) -> EpisodeRef:
+async def trial_of_evaluation(after: After, trial: EpisodeNumber) -> EpisodeRef:
     """Return the trial that the path names."""
     return EpisodeRef(trial, after=after)
 
 
-EPISODES: Final[dict[str, Callable[..., EpisodeRef]]] = {
+EPISODES: Final[dict[str, Callable[..., Awaitable[EpisodeRef]]]] = {
     "/train/{episode}": training_episode,
     "/eval/{after}/{trial}": trial_of_evaluation,
 }
 """The ends of paths that name an episode, and the dependencies that return it."""
+
+
+async def in_turn(request: Request) -> AsyncIterator[None]:
+    """Let few downloads look for their file at a time, so that a page does not wait for all of many."""
+    async with request.app.state.downloads:
+        yield
+
+
+InTurn: Final = Depends(in_turn, scope="function")
 
 
 def recording_state(run: Run) -> tuple[str, int, int]:
@@ -138,7 +150,7 @@ def _state_of(argument: object) -> object:
 class Computation:
     """Functions of runs and recordings, called in a child process, their results cached."""
 
-    def __init__(self, cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> None:
+    def __init__(self, cache: ResponseCache, processes: ProcessPool, spooling: CapacityLimiter) -> None:
         self._cache, self._processes, self._spooling = cache, processes, spooling
 
     async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
@@ -167,7 +179,12 @@ class Computation:
         return json_response(await self(function, *args, alone=alone))
 
 
-ComputationOf = Annotated[Computation, Depends()]
+async def computation(cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> Computation:
+    """Return what computes for a request."""
+    return Computation(cache, processes, spooling)
+
+
+ComputationOf = Annotated[Computation, Depends(computation)]
 
 
 def json_response(body: bytes) -> Response:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
+import sys
 from types import FrameType
 from typing import Final
 
@@ -23,6 +24,10 @@ BURST: Final = 8
 """Connections accepted at once; asyncio accepts this many before the first of them is known here."""
 OWN_DESCRIPTORS: Final = 64
 """File descriptors of the service itself: log, databases, pipes of child processes, connections to accept."""
+SWITCH_SECONDS: Final = 0.0005
+"""How long a thread may keep the interpreter while the event loop waits for it."""
+MAX_UNSENT_BYTES: Final = 256 << 10
+"""Bytes of a response that the system takes before it can send them; else megabytes that nobody may read."""
 _DISCARD: Final = struct.pack("ii", 1, 0)
 """The option SO_LINGER: discard unsent data when the socket is closed."""
 
@@ -73,6 +78,7 @@ def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
         async with app.router.lifespan_context(app):
             await server.serve(sockets=[listening])
 
+    sys.setswitchinterval(SWITCH_SECONDS)
     with asyncio.Runner(loop_factory=config.get_loop_factory()) as loop:
         loop.run(run())
 
@@ -128,6 +134,8 @@ def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
             connection = transport.get_extra_info("socket")
             if connection is not None:  # asyncio does this only for sockets that it made itself
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                if hasattr(socket, "TCP_NOTSENT_LOWAT"):  # not on Windows
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, MAX_UNSENT_BYTES)
             self._set_timer(limits.header_seconds)
 
         def connection_lost(self, exc: Exception | None) -> None:

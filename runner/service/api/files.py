@@ -18,7 +18,7 @@ from runner.errors import RunNotFound
 from runner.export.rerun.selection import Request
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.dependencies import CacheOf, ProcessesOf, RecordedRun, recording_state
+from runner.service.dependencies import CacheOf, InTurn, ProcessesOf, RecordedRun, recording_state
 from runner.service.errors import Refused
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
 from runner.util.processes import CallFailed
@@ -32,7 +32,7 @@ router = APIRouter(
 MEDIA: Final = "application/octet-stream"
 DRAW_SECONDS: Final = 120.0
 """Time for an export whose pictures an environment draws; then it is made without them."""
-BLOCK: Final = 1 << 20
+BLOCK: Final = 256 << 10
 """Bytes of a file that are read at a time."""
 FILE: Final[dict[int | str, dict[str, object]]] = {
     200: {"description": "All of it.", "content": {MEDIA: {}}},
@@ -67,7 +67,13 @@ class _File(FileResponse):
     chunk_size = BLOCK
 
 
-@router.get("/recording", response_class=Response, responses=FILE, summary="The recording; ranges of it too.")
+@router.get(
+    "/recording",
+    response_class=Response,
+    responses=FILE,
+    summary="The recording; ranges of it too.",
+    dependencies=[InTurn],
+)
 @router.head("/recording", response_class=Response, responses=FILE, include_in_schema=False)
 def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
     """Return the MCAP file. Its ETag holds the content digest, and changes with every byte of the file."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Hashable
+from collections.abc import Awaitable, Callable, Hashable
 from functools import partial
 from typing import Annotated, Final, NamedTuple
 
@@ -52,7 +52,7 @@ class Part(BaseModel):
     """Why there are none, or no better ones; may be empty."""
 
 
-def _add_routes(path: str, episode: Callable[..., EpisodeRef], kind: str) -> None:
+def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: str) -> None:
     @router.get(path, name=kind, response_model=Part, summary=f"A part of a {kind}, to be replayed.")
     async def part(
         run: RecordedRun,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Final
 
@@ -22,7 +22,7 @@ MAX_PANELS: Final = 8
 """Environments of a vector that a page shows side by side."""
 
 
-def _add_route(path: str, episode: Callable[..., EpisodeRef]) -> None:
+def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
     @router.get(f"{path}/environments")
     def environments(
         request: Request,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
@@ -163,7 +163,7 @@ async def latest(
     return await run_in_threadpool(show)
 
 
-def _add_route(path: str, episode: Callable[..., EpisodeRef]) -> None:
+def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
     @router.get(path)
     async def replay(
         request: Request,

@@ -117,6 +117,19 @@ def test_a_client_that_does_not_read_is_cut_off(impatient, recordings):
         assert received < 32 << 20
 
 
+def test_clients_that_do_not_read_keep_neither_pages_nor_each_other_waiting(impatient, recordings):
+    run = next(recordings.glob("*/recording.mcap")).parent.name
+    request = f"GET /api/v1/runs/{run}/recording HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
+    with contextlib.ExitStack() as unread:
+        slow = [unread.enter_context(socket.create_connection(("localhost", impatient))) for _ in range(100)]
+        for connection in slow:
+            connection.sendall(request)
+        assert httpx.get(f"http://localhost:{impatient}/runs", timeout=2).status_code == 200
+        for connection in slow:
+            connection.settimeout(5)
+            assert connection.recv(12) == b"HTTP/1.1 200"
+
+
 def test_many_slow_clients_do_not_block_others(impatient):
     slow = [socket.create_connection(("localhost", impatient)) for _ in range(200)]
     try:
