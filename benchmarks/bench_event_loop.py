@@ -68,7 +68,7 @@ def measure(quick: bool) -> list[Figure]:
             "ms",
             *TARGET,
             higher_is_better=False,
-            detail=f"{what}: with it {max(whole for _, whole in long):.0f} ms",
+            detail=f"{what}: with it {max((whole for _, whole in long), default=0.0):.0f} ms",
         ),
         Figure(
             "lateness of a 10 ms ticker, 99th percentile",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -129,6 +130,11 @@ _TYPES: Final[Mapping[str, Any]] = {
 """The types of events, as they are named in a stream of events and in the server's logs."""
 
 
+@functools.cache
+def _adapter(kind: str) -> TypeAdapter[Any]:
+    return TypeAdapter(_TYPES[kind])  # takes milliseconds
+
+
 @dataclass(frozen=True)
 class JobEvent:
     """An event of a job. Only the latest progress counts, so no log has it."""
@@ -173,7 +179,7 @@ class JobEvent:
             RunnerError: it is none.
         """
         try:
-            return cls(TypeAdapter(_TYPES[kind]).validate_python(values), event_id)
+            return cls(_adapter(kind).validate_python(values), event_id)
         except (KeyError, ValueError) as error:
             raise RunnerError(f"found an event {kind[:20]!r} of a job that is not as expected.") from error
 
