@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import signal
+import subprocess
 import threading
 
 import httpx2
 import psutil
 import pytest
 from served import Served
+from submitted import ENDLESS
 
 import runner
 from runner.runs.listing import list_runs
@@ -181,3 +185,41 @@ def test_a_killed_sweep_ends_as_if_it_never_was(tmp_path):
         server.until(are_finished)
     assert len(list_runs(killed)) == len(tried(calm)) == 8
     assert tried(killed) == tried(calm)
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """Return the folder of a disk of 400 MB; a job is started while 268 MB are free."""
+    mount = shutil.which("mount")
+    command = [mount, "-t", "tmpfs", "-o", "size=400m", "tmpfs", str(tmp_path)]
+    if mount is None or subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("only root mounts a disk")
+    yield tmp_path
+    subprocess.run(["umount", "--lazy", str(tmp_path)], check=True)
+
+
+def test_on_a_full_disk_jobs_are_seen_and_cancelled_and_later_resumed(small_disk, undisturbed):
+    with Served(small_disk / "runs", "--workers", "1") as server:
+        server.post("/jobs", json.dumps(ENDLESS))
+        submitted(server, [0, 1])
+        server.until(is_under_way)
+        filling = small_disk / "filling"
+        with filling.open("wb") as stream:
+            os.posix_fallocate(stream.fileno(), 0, shutil.disk_usage(small_disk).free)
+        assert shutil.disk_usage(small_disk).free == 0
+        assert [job["state"] for job in server.get("/jobs")["jobs"]] == ["queued", "queued", "running"]
+        assert server.client.post("/jobs", content=json.dumps(CONFIG)).status_code == 507
+        for number in (1, 2):
+            assert server.post(f"/jobs/{number}/cancel")["state"] == "cancelled"
+        jobs = server.until(lambda _: {run.status for run in list_runs(small_disk / "runs")} != {"running"})
+        assert [jobs[number]["state"] for number in (1, 2, 3)] == ["cancelled", "cancelled", "queued"]
+        assert "are free" in server.get("/jobs")["queue"]["waiting_for"]
+
+        filling.unlink()
+        server.until(lambda jobs: jobs[3]["state"] == "finished")
+        server.post("/jobs/2/resume")
+        server.until(lambda jobs: jobs[2]["state"] == "finished")
+        finished = [run for run in list_runs(small_disk / "runs") if run.status == "finished"]
+        assert {run.seed: run.summary["content_digest"] for run in finished} == {
+            seed: undisturbed[seed] for seed in (0, 1)
+        }
