@@ -57,7 +57,7 @@ class WatchedEnvironment:
     The script keeps its own object, whose `step` and `reset` call the twin; the twin calls what they were.
     """
 
-    def __init__(self, env: object, recorded: Recorded[Any]) -> None:
+    def __init__(self, env: object, recorded: Recorded) -> None:
         self._env = env
         self._recorded: Any = recorded
         self.is_inside = False

@@ -27,8 +27,6 @@ from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
 from runner.loops.options import CallbackOptions, options_of, settings_in
 from runner.loops.parallel import described_game, record_parallel
 from runner.loops.recorded import Recorded
-from runner.loops.rows import Rows
-from runner.loops.single_rows import single_rows
 from runner.loops.values import warn_user
 from runner.loops.vector import (
     autoreset_mode_of,
@@ -107,10 +105,10 @@ class Recording:
         return _Callbacks(self)
 
 
-class _Run(Recorded[Rows]):
+class _Run(Recorded):
     """The run of an algorithm, whose process takes no steps."""
 
-    def __init__(self, loop: Loop[Rows]) -> None:
+    def __init__(self, loop: Loop) -> None:
         self.env = SimpleNamespace(close=lambda **_: None)
         self._record_into(loop)
         self._enter("train")
@@ -189,7 +187,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             },
             valid=CallbackOptions.__annotations__,
         )
-        return _Run(Loop(described, options, maker, single_rows(described)))
+        return _Run(Loop(described, options, maker))
 
     def _joining(self, is_evaluation: bool) -> Callable[[object], str]:
         """Return what has an env runner record its environments; it is sent to the process of each."""
@@ -344,7 +342,7 @@ def _join(join: _Join, env_runner: Any) -> None:
     env_runner._recorded_join = join
 
 
-def _recorded(env_runner: object) -> list[Recorded[Any]]:
+def _recorded(env_runner: object) -> list[Recorded]:
     """Return what an env runner has recorded: its vector, or each of its environments of several agents."""
     outer = getattr(env_runner, "env", None)
     inner = outer.envs if isinstance(outer, VectorMultiAgentEnv) else [getattr(outer, "env", None)]

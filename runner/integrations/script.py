@@ -106,7 +106,7 @@ class ScriptRun:
         """The number of calls so far, where the script's tracker counts them; None where it does not."""
         self._waiting: list[tuple[str, str, object, int | None, int | None]] = []
         self._since, self._waiting_bytes = 0.0, 0
-        self._loop: Loop[Any] | None = None
+        self._loop: Loop | None = None
         self._is_own = False
         """Whether this run made the loop, and closes it."""
         self._has_joined = False
@@ -211,7 +211,7 @@ class ScriptRun:
             self.warn_once(f"run {before} has ended: further values go into run {self.run_id}.")
 
     def _record(
-        self, loop: Loop[Any], method: str, name: str, value: Any, step: int | None, call: int | None
+        self, loop: Loop, method: str, name: str, value: Any, step: int | None, call: int | None
     ) -> None:
         """Record a value in the recording, at the script's own step, or its number where it gave none."""
         try:
@@ -277,13 +277,13 @@ class ScriptRun:
         self._begin(loops[-1])
         return True
 
-    def _begin(self, loop: Loop[Any]) -> None:
+    def _begin(self, loop: Loop) -> None:
         self._loop = loop
         waiting, self._waiting = self._waiting, []
         for each in waiting:
             self._record(loop, *each)
 
-    def _begin_own(self, loop: Loop[Any]) -> None:
+    def _begin_own(self, loop: Loop) -> None:
         self._is_own = True
         self.run_id = loop.run.run_id
         if self._tags or self._note:
@@ -345,7 +345,7 @@ class ScriptRun:
             return
         self.begin_recorded(recorded._loop, WatchedEnvironment(env, recorded))
 
-    def begin_recorded(self, loop: Loop[Any], watched: Watched) -> None:
+    def begin_recorded(self, loop: Loop, watched: Watched) -> None:
         """Log into the recording of the script's environments, which ends with this run."""
         self._watched = watched
         self._begin_own(loop)

@@ -78,11 +78,11 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
 
 _loggers: weakref.WeakSet[object] = weakref.WeakSet()
 """Those that are not closed."""
-_to_close: list[Loop[Any]] = []
+_to_close: list[Loop] = []
 """The recordings of closed environments, which end with the logger."""
 
 
-def _close(made: Recorded[Any], **arguments: object) -> None:
+def _close(made: Recorded, **arguments: object) -> None:
     """Close an environment, and the recording if no logger needs it any more.
 
     A collector closes its environment before it yields the last batch, whose losses are logged after that.

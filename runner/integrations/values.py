@@ -47,7 +47,7 @@ class ValueRows:
         """Do nothing: there are no actions."""
 
 
-def begin_values(recordings: str | os.PathLike[str] | None, **arguments: Any) -> tuple[Loop[Any], ValueRows]:
+def begin_values(recordings: str | os.PathLike[str] | None, **arguments: Any) -> tuple[Loop, ValueRows]:
     """Begin a recording without an environment; arguments of `record` that need one are ignored.
 
     Raises:
@@ -56,6 +56,7 @@ def begin_values(recordings: str | os.PathLike[str] | None, **arguments: Any) ->
     """
     given = {key: value for key, value in arguments.items() if key in _ARGUMENTS}
     rows = ValueRows()
-    loop: Loop[Any] = Loop(_NO_ENVIRONMENT, options_of(recordings, given), _NOT_MADE, lambda *_: rows)
+    make: Any = lambda *_: rows  # noqa: E731
+    loop = Loop(_NO_ENVIRONMENT, options_of(recordings, given), _NOT_MADE, make_rows=make)
     loop.activate(loop.rows("train"))
     return loop, rows

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any, Literal, Unpack
 
@@ -15,7 +14,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 
 from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import ConfigError, RunnerError
-from runner.loops.batch_rows import BatchRows
 from runner.loops.loop import Loop
 from runner.loops.makers import NAME_MAKE, checked_make, vector_maker_of
 from runner.loops.options import Options, RunOptions, options_of
@@ -42,7 +40,7 @@ class NamedEnvironments(AnyVectorEnv):
         self.single_action_space = action
 
 
-class RecordedBatches(Recorded[BatchRows]):
+class RecordedBatches(Recorded):
     """The recording of environments whose steps come in batches; made by `record_batches`."""
 
     why_not_made = f"it was recorded in batches, and is known by its name alone; {NAME_MAKE}"
@@ -77,9 +75,8 @@ class RecordedBatches(Recorded[BatchRows]):
             maker = vector_maker_of(envs, first, self._mode, self._make)
         if isinstance(envs, NamedEnvironments):
             maker = replace(maker, reason=self.why_not_made)
-        rows = partial(BatchRows, mode=self._mode)
         self.env = envs
-        self._record_into(Loop(described, self._options, maker, rows, (described.environments,)))
+        self._record_into(Loop(described, self._options, maker, self._mode))
         super()._enter(self._phase)
 
     def _enter(self, phase: str) -> None:
@@ -103,11 +100,13 @@ class RecordedBatches(Recorded[BatchRows]):
             return
         try:
             with self._loop.lock:
-                if self._loop.records():
-                    self._loop.activate(self._rows)
-                    self._rows.reset(observations, (), np.ones(self.env.num_envs, np.bool_), {})
+                if self._loop.activate(self._rows):
+                    self._reset(observations)
         except Exception as error:
             self._loop.fail(error)
+
+    def _reset(self, observations: object) -> None:
+        self._rows.reset(observations, (), range(self.env.num_envs))
 
     def batch(
         self,
@@ -167,9 +166,8 @@ class RecordedBatches(Recorded[BatchRows]):
             self._open_from(before, seen, done)
         self._check_finals(finals, ends | cut, seen)
         with self._loop.lock:
-            if not self._loop.records():
+            if not self._loop.activate(self._rows):
                 return
-            self._loop.activate(self._rows)
             if before is not None:
                 self._begin_with(before)
             final = None if finals is None else _numpy(finals)
@@ -199,7 +197,7 @@ class RecordedBatches(Recorded[BatchRows]):
     def _begin_with(self, observations: object) -> None:
         """Take the observations before a batch: its reset, or those that the last batch ended with."""
         if not self._rows.resets:
-            self._rows.reset(observations, (), np.ones(self.env.num_envs, np.bool_), {})
+            self._reset(observations)
         elif not self._rows.continues_with(observations):
             raise ConfigError(
                 "observations: found T + 1, whose first are not the last observations that were recorded; "

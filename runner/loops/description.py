@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 from gymnasium import spaces
 
@@ -21,6 +21,16 @@ from runner.util.jsonable import as_json
 
 _NOT_SETTINGS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "wrappers", "base_path"})
 """What `gymnasium.make_vec` and EnvPool add to an environment's own settings."""
+
+
+@dataclass(frozen=True)
+class Copied:
+    """What the steps of a recording depend on that others are copied into: of one environment at a time."""
+
+    layout: Layout
+    recorded_spaces: Mapping[str, Any]
+    mdp: Mdp | None
+    environments: int = 1
 
 
 @dataclass(frozen=True)
@@ -54,13 +64,13 @@ class Described:
         return self.action if self.wide_action is None else self.wide_action
 
     @cached_property
-    def _spaces(self) -> dict[str, object]:
+    def _spaces(self) -> dict[str, Any]:
         """The descriptions of the environment's own spaces."""
         spaces_of = {"observation": self.observation, "action": self.action}
         return {name: describe_space(space) for name, space in spaces_of.items()}
 
     @cached_property
-    def recorded_spaces(self) -> dict[str, object]:
+    def recorded_spaces(self) -> dict[str, Any]:
         """The descriptions of both spaces, of actions as they are recorded."""
         wide = {} if self.wide_action is None else {"action": describe_space(self.wide_action)}
         return self._spaces | wide

@@ -19,20 +19,17 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, maker_of
 from runner.loops.options import PackingOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
-from runner.loops.single_rows import SingleRows, single_rows
-from runner.loops.values import UNCHANGEABLE, as_given, check_phase
+from runner.loops.values import UNCHANGEABLE, check_phase
 from runner.loops.wrappers import return_name
 from runner.runs.run import Run
 
 
-class RecordedEnv(RecordedAlone[SingleRows], gymnasium.Wrapper[object, object, object, object]):
+class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, object]):
     """A Gymnasium environment whose every reset and step is recorded; made by `record`."""
 
     env: Env
 
-    def __init__(
-        self, env: Env, loop: Loop[SingleRows], phase: str = "train", owner: RecordedEnv | None = None
-    ) -> None:
+    def __init__(self, env: Env, loop: Loop, phase: str = "train", owner: RecordedEnv | None = None) -> None:
         gymnasium.Wrapper.__init__(self, env)
         self._owner = owner
         self._env_step = env.step
@@ -42,29 +39,29 @@ class RecordedEnv(RecordedAlone[SingleRows], gymnasium.Wrapper[object, object, o
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
 
-    def _enter(self, phase: str) -> None:
-        super()._enter(phase)
-        self._take = self._rows.take
-        self._lock = self._loop.lock
-
     def step(self, action: object, extras: Mapping[str, object] | None = None) -> StepResult:
         """Take a step, and record it, with values of your own: `extras={"value": v, "logits": logits}`.
 
         A name keeps the dtype and the shape of its first value; a step need not have all names.
         """
-        given = action if action.__class__ in UNCHANGEABLE else as_given(action)
+        rows = self._rows
+        given = action if action.__class__ in UNCHANGEABLE else rows.keep(action)
         result = self._env_step(action)
         try:
             observation, reward, terminated, truncated, info = result
-            with self._lock:
-                if self._loop.active is not self._rows:
-                    self._loop.activate(self._rows)
-                self._take(given, observation, reward, terminated, truncated)
+            loop = self._loop
+            loop.lock.acquire()  # `with` takes a tenth of a microsecond longer
+            try:
+                if loop.active is not rows and not loop.activate(rows):
+                    return result
+                rows.take(given, observation, reward, terminated, truncated)
                 if extras is not None:
                     try:
                         self._take_extras(extras)
                     except ConfigError as error:
-                        self._loop.leave_out(error)
+                        loop.leave_out(error)
+            finally:
+                loop.lock.release()
             if self._has_messages:
                 if self._options.info:
                     self._messages.info(self._phase, info)
@@ -172,7 +169,7 @@ def record(
     if frames_every:
         require_pictures(env)
     maker = maker_of(env, checked_make(make))
-    loop: Loop[SingleRows] = Loop(described, options_of(recordings, options), maker, single_rows(described))
+    loop: Loop = Loop(described, options_of(recordings, options), maker)
     return RecordedEnv(env, loop, phase)
 
 

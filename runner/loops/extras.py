@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RunnerError
-from runner.loops.rows import Rows
+from runner.loops.step_buffer import StepBuffer
 from runner.loops.values import numbers_of
 from runner.recording import schema
 from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
@@ -69,7 +69,7 @@ class Extras:
         self._final = dict.fromkeys(schema.PHASES, -1)
         """The last step of each phase that cannot be extended any more."""
 
-    def taker(self, phase: str, rows: Rows) -> Callable[[Mapping[str, object]], None]:
+    def taker(self, phase: str, rows: StepBuffer) -> Callable[[Mapping[str, object]], None]:
         """Return a function that puts down the values of a step that was just taken, by name.
 
         It is called with each step, so it has what it needs at hand.
@@ -103,7 +103,7 @@ class Extras:
 
         return take
 
-    def extend(self, phase: str, rows: Rows, values: Mapping[str, object]) -> None:
+    def extend(self, phase: str, rows: StepBuffer, values: Mapping[str, object]) -> None:
         """Put down further values of the last step of the phase that is recorded now.
 
         Raises:
@@ -151,7 +151,7 @@ class Extras:
             for name, array in arrays.items()
         }
 
-    def put_batch(self, phase: str, rows: Rows, values: Mapping[str, Array]) -> None:
+    def put_batch(self, phase: str, rows: StepBuffer, values: Mapping[str, Array]) -> None:
         """Hand the values of the T steps of all environments that were just taken to the recorder.
 
         Args:

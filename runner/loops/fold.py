@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError, RunnerError, StorageError, truncated_message
-from runner.loops.copied_rows import Copied, CopiedExtras, CopiedRows
+from runner.loops.copied_extras import CopiedExtras
+from runner.loops.description import Copied
 from runner.loops.fold_check import Content, left_out
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source, open_sources
+from runner.loops.step_buffer import StepBuffer
 from runner.recording import schema
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
@@ -306,8 +308,9 @@ class _Fold:
     def _copy_units(self) -> int:
         """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
         recorder = self._recorder
-        copied = Copied(self._layout, self._mdp)
-        rows = {phase: CopiedRows(recorder, copied, phase) for phase in PHASES}
+        copied = Copied(self._layout, self._first.spaces, self._mdp)
+        rows = {phase: StepBuffer(recorder, copied, phase) for phase in PHASES}
+        begun = dict.fromkeys(PHASES, 0)
         extras = CopiedExtras(recorder, self._sources)
         active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
         for unit in self._units:
@@ -321,15 +324,17 @@ class _Fold:
             unit["new_step"] = own.place[0]
             unit["new_position"] = recorder.position + own.filled
             reset, read = source.reset(phase, unit), self._read[source.number]
-            own.put_reset(reset, source.environment + int(unit["environment"]))
+            environment = source.environment + int(unit["environment"])
+            own.copy_reset(reset, environment)
             self.content.take(topics.resets, reset)
             read[topics.resets.name] += 1
-            unit["new_episode"] = own.begun + 1
+            unit["new_episode"] = begun[phase]
             for steps, numbers in source.steps(phase, unit):
                 self.content.take(topics.steps, steps)
                 position = recorder.position + own.filled
                 read[topics.extras.name] += extras.copy(source, phase, numbers, own.place[0], position)
-                own.put(steps)
+                own.copy(steps, environment)
+                begun[phase] += int(np.count_nonzero(steps["t"] == 0))
                 copied_steps += len(numbers)
                 self._report(copied_steps, total)
         for each in rows.values():

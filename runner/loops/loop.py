@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 import time
-import weakref
 from collections.abc import Callable, Mapping
-from typing import Any, Final, Generic, TypeVar
+from typing import Final
+
+from gymnasium.vector import AutoresetMode
 
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
@@ -15,52 +16,24 @@ from runner.loops.flushing import FLUSHER
 from runner.loops.loop_run import LoopRun
 from runner.loops.messages import Messages
 from runner.loops.options import Options
-from runner.loops.rows import Rows
+from runner.loops.step_buffer import StepBuffer
 from runner.loops.values import check_phase, warn_user
-from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import RECORDING_STOPPED
-from runner.recording.recorder import FLUSH_SECONDS, Recorder
+from runner.recording.recorder import FLUSH_SECONDS
 from runner.runs.run import Run
 from runner.util.values import is_whole
 
 _UNDECIDED_SECONDS: Final = 5.0
 """The dtype of actions is left open this long while no step is taken; then it is that of their space."""
 
-R = TypeVar("R", bound=Rows)
 
-
-class _IgnoredRows:
-    """Ignores the steps of a forked process, and their extras."""
-
-    filled = 0
-    place = (0, 0)
-    resets = 0
-    is_any_over = False
-
-    def ignore(self, *_: object) -> None:
-        """Do nothing."""
-
-    def taker(self, *_: object) -> Callable[..., None]:
-        """Return a function that does nothing."""
-        return self.ignore
-
-    commit = ignore
-    finish = ignore
-    extend = ignore
-    reshape = ignore
-    take = ignore
-    take_game = ignore
-    reset = ignore
-
-
-class Loop(Generic[R]):
+class Loop:
     """A loop that is being recorded; safe to use from several threads.
 
     Args:
-        make_rows: returns the rows of a phase for recorder, description, phase and what to call with the
-            first action.
-        batch: (N,) for N environments that step at once, else ().
+        mode: how the environments of a vector reset themselves; None for one environment, alone.
+        make_rows: returns the steps of a phase; takes the arguments of `StepBuffer`.
     """
 
     should_stop = False
@@ -71,17 +44,17 @@ class Loop(Generic[R]):
         described: Described,
         options: Options,
         maker: EnvironmentMaker,
-        make_rows: Callable[[Recorder, Described, str, Callable[[object], None]], R],
-        batch: tuple[int, ...] = (),
+        mode: AutoresetMode | None = None,
+        make_rows: Callable[..., StepBuffer] = StepBuffer,
     ) -> None:
         options = options.for_environment(maker)
         self._loop_run = LoopRun(described, options, maker)
         self.started = self._loop_run.started
         self._recorder = self._loop_run.recorder
         self._recorder.when_full = self._write
-        self._make_rows = make_rows
-        self._rows: dict[str, R] = {}
-        self.active: R | None = None
+        self._mode, self._make_rows = mode, make_rows
+        self._rows: dict[str, StepBuffer] = {}
+        self.active: StepBuffer | None = None
         """The rows of the last step; None before any, and when the loop is closed."""
         self.options = options
         self.lock = threading.RLock()
@@ -90,10 +63,8 @@ class Loop(Generic[R]):
         """Whether this process records nothing: it was forked from the one that does, or recording failed."""
         self._failure = ""
         """Why recording stopped, if it did and `on_error` is "warn"."""
-        self.views: weakref.WeakSet[Any] = weakref.WeakSet()
-        """The recorded environments; `_detach` of each is called in a forked process."""
         self._warnings: set[str] = set()
-        self.extras = Extras(self._recorder, batch)
+        self.extras = Extras(self._recorder, () if mode is None else (described.environments,))
         self.messages = Messages(
             self,
             self._recorder,
@@ -121,12 +92,14 @@ class Loop(Generic[R]):
 
     # --- what is recorded -----------------------------------------------------------------------------
 
-    def rows(self, phase: str) -> R:
+    def rows(self, phase: str) -> StepBuffer:
         """Return the rows of a phase."""
         check_phase(phase)
         with self.lock:
             if phase not in self._rows:
-                self._rows[phase] = self._make_rows(self._recorder, self.described, phase, self._first_action)
+                self._rows[phase] = self._make_rows(
+                    self._recorder, self.described, phase, self._first_action, self._mode
+                )
             return self._rows[phase]
 
     def add_maker(self, phase: str, maker: EnvironmentMaker) -> None:
@@ -140,10 +113,13 @@ class Loop(Generic[R]):
             if not self.closed:
                 self._loop_run.own_makers[phase] = maker
 
-    def activate(self, rows: R) -> None:
-        """Record the next steps in these rows. The caller holds the lock."""
+    def activate(self, rows: StepBuffer) -> bool:
+        """Record the next steps in these rows; return whether this process records.
+
+        The caller holds the lock.
+        """
         if not self.records():
-            return
+            return False
         if self.closed:
             raise RunnerError(
                 f"run {self.run.run_id} is closed: no more steps can be recorded in it. "
@@ -153,15 +129,18 @@ class Loop(Generic[R]):
             self.active.commit()
             self.extras.finish()
         self.active = rows
+        return True
 
-    def note(self, phase: str, rows: R, values: Mapping[str, object]) -> None:
+    def note(self, phase: str, rows: StepBuffer, values: Mapping[str, object]) -> None:
         """Record values with the last step of a phase.
 
         Raises:
             RunnerError: there is no such step any more, or the loop is closed.
         """
         with self.lock:
-            if self.records() and self.position and self.active is not rows:
+            if not self.records():
+                return
+            if self.position and self.active is not rows:
                 raise RunnerError(
                     "note_step: found that the last step was one of another phase, expected one of this phase"
                 )
@@ -186,7 +165,7 @@ class Loop(Generic[R]):
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
         return self._recorder.position + (self.active.filled if self.active else 0)
 
-    def moment(self, rows: Rows) -> tuple[int, int, int]:
+    def moment(self, rows: StepBuffer) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""
         step, episode = rows.place
         if (active := self.active) is None:
@@ -364,7 +343,3 @@ class Loop(Generic[R]):
         """Leave the recording to the process that this one was just forked from."""
         self.is_foreign, self.active = True, None
         self.lock = threading.RLock()  # a thread that does not exist here may have held the other one
-        ignored: Any = _IgnoredRows()
-        self._rows, self.extras = dict.fromkeys(schema.PHASES, ignored), ignored
-        for view in list(self.views):
-            view._detach()

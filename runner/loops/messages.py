@@ -17,7 +17,7 @@ from runner.loops.media import media_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.pictures import Picture
-from runner.loops.rows import Rows
+from runner.loops.step_buffer import StepBuffer
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
@@ -63,10 +63,10 @@ class LoopState(Protocol):
     def position(self) -> int:
         """The number of steps executed so far; raises `RunnerError` if the loop is closed."""
 
-    def moment(self, rows: Rows) -> tuple[int, int, int]:
+    def moment(self, rows: StepBuffer) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""
 
-    def rows(self, phase: str) -> Rows:
+    def rows(self, phase: str) -> StepBuffer:
         """Return the steps of a phase; raises `ConfigError` if there is no such phase."""
 
     def records(self) -> bool:
@@ -80,7 +80,7 @@ class _Series(NamedTuple):
     """The numbers that are logged under one name in one phase."""
 
     name: str
-    rows: Rows
+    rows: StepBuffer
     encode: Callable[[float, int, int], bytes]
     """Returns the message for a value, step and episode."""
 

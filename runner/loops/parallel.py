@@ -17,19 +17,18 @@ from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import RecordedAlone, require_pictures
-from runner.loops.single_rows import AgentRows
 from runner.loops.values import as_given, check_phase
 from runner.loops.vector import by_field
 from runner.recording.spaces import Value
 
 
-class RecordedParallel(RecordedAlone[AgentRows]):
+class RecordedParallel(RecordedAlone):
     """A PettingZoo parallel environment whose every reset and step is recorded; made by `record_parallel`.
 
     Its other attributes are those of the environment: `agents`, `action_space`, ...
     """
 
-    def __init__(self, env: object, loop: Loop[AgentRows], phase: str = "train") -> None:
+    def __init__(self, env: object, loop: Loop, phase: str = "train") -> None:
         self.env = env
         self._watch = GeneratorWatch(env)
         self._record_into(loop)
@@ -54,7 +53,8 @@ class RecordedParallel(RecordedAlone[AgentRows]):
         try:
             observations, rewards, terminated, truncated, infos = result
             with self._loop.lock:
-                self._loop.activate(self._rows)
+                if not self._loop.activate(self._rows):
+                    return result  # type: ignore[no-any-return]
                 over = not self.env.agents
                 self._rows.take_game(given, observations, rewards, terminated, truncated, over)
                 if extras is not None:
@@ -158,7 +158,7 @@ def record_parallel(
         require_pictures(env)
     maker = game_maker_of(env, checked_make(make))
     kind = RecordedAec if isinstance(env, Turns) and not env.removes else RecordedParallel
-    return kind(env, Loop(described, options_of(recordings, options), maker, AgentRows), phase)
+    return kind(env, Loop(described, options_of(recordings, options), maker), phase)
 
 
 def record_aec(env: object, recordings: str | os.PathLike[str] | None = None, **options: Any) -> RecordedAec:

@@ -6,38 +6,36 @@ import contextlib
 import sys
 import weakref
 from collections.abc import Iterator, Mapping
-from typing import Any, Generic, Literal, Self, TypeVar
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from runner.environments.gym_types import Info, ResetOptions, ResetResult
 from runner.errors import ConfigError
 from runner.loops.generators import GeneratorWatch
-from runner.loops.loop import Loop, R
+from runner.loops.loop import Loop
 from runner.loops.messages import Messages
 from runner.loops.options import Arguments, Options
-from runner.loops.single_rows import SingleRows
+from runner.loops.step_buffer import StepBuffer
 from runner.recording.episode_log import Flags
 from runner.runs.run import Run
 
-S = TypeVar("S", bound=SingleRows)
 
-
-class Recorded(Generic[R]):
+class Recorded:
     """What every recorded environment has besides the environment; a context manager."""
 
     env: Any
-    _loop: Loop[R]
+    _loop: Loop
     _messages: Messages
     _options: Options
     _return_name = ""
     """The name under which returns before a wrapper changed them are logged; empty if none did."""
     _until_frame = 0
     """Steps up to the next frame."""
-    _owner: Recorded[R] | None = None
+    _owner: Recorded | None = None
     """The recorded environment that closes the recording, if it is another; this one keeps it alive."""
     _phase: str
-    _rows: R
+    _rows: StepBuffer
 
     @property
     def run(self) -> Run:
@@ -201,16 +199,11 @@ class Recorded(Generic[R]):
         self._rows = self._loop.rows(phase)
         self._take_extras = self._loop.extras.taker(phase, self._rows)
 
-    def _record_into(self, loop: Loop[R], is_owner: bool = True) -> None:
+    def _record_into(self, loop: Loop, is_owner: bool = True) -> None:
         """Record into a loop; its owner closes it when the process ends, if not before."""
         self._loop, self._messages, self._options = loop, loop.messages, loop.options
-        loop.views.add(self)
         if is_owner:
             weakref.finalize(self, _close_abandoned, loop)
-
-    def _detach(self) -> None:
-        """Record nothing more: this process was forked from the one that records."""
-        self._enter(self._phase)
 
 
 def ending_of(error: object) -> tuple[str, str]:
@@ -222,7 +215,7 @@ def ending_of(error: object) -> tuple[str, str]:
     return "failed", f"{type(error).__name__}: {error}"
 
 
-def _close_abandoned(loop: Loop[R]) -> None:
+def _close_abandoned(loop: Loop) -> None:
     """Close a recording that was not closed: as failed if an uncaught exception ended the process.
 
     Python keeps such an exception in `sys.last_value`; an interactive session continues after it.
@@ -237,7 +230,7 @@ def without_none(**arguments: object) -> Arguments:
     return {name: value for name, value in arguments.items() if value is not None}
 
 
-class RecordedAlone(Recorded[S]):
+class RecordedAlone(Recorded):
     """What a recorded environment has that steps alone, not in a vector: an environment or a game."""
 
     _watch: GeneratorWatch
@@ -265,8 +258,10 @@ class RecordedAlone(Recorded[S]):
             state = self._watch.after(state, seed)
             observation, info = result
             with self._loop.lock:
-                self._loop.activate(self._rows)
-                self._rows.reset(observation, seed, text, state)
+                if not self._loop.activate(self._rows):
+                    return result
+                states = {} if state is None else {0: state}
+                self._rows.reset(observation, [seed], states=states, options=text)
             if self._options.info:
                 self._messages.info(self._phase, self._info_by_field(info), is_reset=True)
             self._record_frame(is_reset=True)

@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from runner.errors import ConfigError, RecordingError
 from runner.recording import schema
 from runner.recording.chunks import MAX_CHUNK_BYTES
-from runner.recording.gym_values import SCALARS
+from runner.recording.gym_values import SCALARS, only_number
 from runner.recording.spaces import Value
 from runner.util.arrays import Array
 from runner.util.jsonable import as_mapping
@@ -42,23 +42,6 @@ def as_given(action: Value) -> Value:
         return action
 
 
-def lone_number(value: object, what: str) -> float:
-    """Return a number that may stand in an array of one."""
-    return float(_lone(value, what, "iubf", "a number"))
-
-
-def whole_number(value: object, what: str) -> int:
-    """Return a whole number that may stand in an array of one."""
-    return int(_lone(value, what, "iub", "a whole number of its Discrete space"))
-
-
-def _lone(value: object, what: str, kinds: str, expected: str) -> Array:
-    array = np.asarray(value)
-    if array.size != 1 or array.dtype.kind not in kinds:
-        raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
-    return array.reshape(())
-
-
 def logged_number(name: str, value: Any) -> float:
     """Return a logged number, which may stand in an array of one.
 
@@ -68,7 +51,8 @@ def logged_number(name: str, value: Any) -> float:
     try:
         if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch
             value = detach()
-        return lone_number(value, name) if np.size(value) == 1 and np.ndim(value) else float(value)
+        is_array = np.size(value) == 1 and np.ndim(value)
+        return float(only_number(value, name) if is_array else value)
     except (TypeError, ValueError, OverflowError, RuntimeError, RecordingError) as error:
         raise ConfigError(
             f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, "

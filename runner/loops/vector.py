@@ -7,7 +7,6 @@ import os
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -24,7 +23,6 @@ from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures, without_none
 from runner.loops.values import as_given, check_phase
-from runner.loops.vector_rows import VectorRows
 from runner.loops.wrappers import return_name
 from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
@@ -35,7 +33,7 @@ else:
     _Wrapper = VectorWrapper  # it takes no parameters before Gymnasium 1.3
 
 
-class RecordedVector(Recorded[VectorRows], _Wrapper):
+class RecordedVector(Recorded, _Wrapper):
     """A vector environment whose every reset and step is recorded; made by `record_vector`."""
 
     env: AnyVectorEnv
@@ -43,7 +41,7 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
     def __init__(
         self,
         env: AnyVectorEnv,
-        loop: Loop[VectorRows],
+        loop: Loop,
         mode: AutoresetMode,
         watch: VectorWatch,
         phase: str = "train",
@@ -102,10 +100,10 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
             observations, rewards, terminated, truncated, infos = result
             loop, rows = self._loop, self._rows
             with loop.lock:
-                if loop.active is not rows:
-                    loop.activate(rows)
+                if loop.active is not rows and not loop.activate(rows):
+                    return
                 finals = infos if self._resets_within else None
-                rows.take(actions, observations, rewards, terminated, truncated, finals, states)
+                rows.take_vector(actions, observations, rewards, terminated, truncated, finals, states)
                 if extras is not None:
                     try:
                         self._take_extras(extras)
@@ -186,8 +184,10 @@ class RecordedVector(Recorded[VectorRows], _Wrapper):
         """
         which = np.ones(self.env.num_envs, np.bool_) if which is None else which
         with self._loop.lock:
-            self._loop.activate(self._rows)
-            self._rows.reset(observations, seeds, which, states or {}, options)
+            if not self._loop.activate(self._rows):
+                return
+            environments = np.flatnonzero(which).tolist()
+            self._rows.reset(observations, seeds, environments, states or {}, options)
         if self._options.info:
             self._messages.info(self._phase, _by_environment(infos), is_reset=True)
         if self._options.frames_every:
@@ -247,8 +247,7 @@ def record_vector(
             f"frames_of: found {frames_of!r} with frames_every={frames_every}, expected numbers from 0 to "
             f"{envs.num_envs - 1}, and frames_every"
         )
-    rows = partial(VectorRows, next_step=mode == AutoresetMode.NEXT_STEP)
-    loop = Loop(described, options_of(recordings, options, chosen), maker, rows, (described.environments,))
+    loop = Loop(described, options_of(recordings, options, chosen), maker, mode)
     return RecordedVector(envs, loop, mode, watch, phase)
 
 

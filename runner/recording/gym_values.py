@@ -1,16 +1,15 @@
-"""Values of Gymnasium's spaces on their way into a recording: checked, and put into columns of records."""
+"""Values of Gymnasium's spaces on their way into a recording: checked, and put into columns of rows."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Mapping, Sequence
+import struct
+from collections.abc import Callable, Mapping
 from functools import cache
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from runner.environments.gym_types import Space
 from runner.errors import RecordingError
 from runner.recording.gym_leaves import Part
 from runner.recording.gym_spaces import parts_of
@@ -18,15 +17,15 @@ from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
 from runner.util.arrays import Array, zeros
 
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
+NO_VALUE: Final = (struct.error, TypeError, ValueError, LookupError, OverflowError)
+"""The errors of Python and NumPy for something that is no value of its space."""
 
 OnRounded = Callable[[str], None]
 """Called with a warning: values are recorded rounded."""
-Put = Callable[[int, Value], None]
-"""Puts a value into a row of a column."""
 
 
 class Leaf:
-    """A part of a space, with the checks that its values pass before they are recorded.
+    """A part of a space without parts of its own, with the checks that its values pass.
 
     Args:
         what: `observation` or `action`. An action may have another shape with as many numbers, because only
@@ -49,8 +48,8 @@ class Leaf:
         """Classes whose values are all recorded exactly, or refused by NumPy."""
         self._is_rounded = False
 
-    def fit(self, value: object, batch: tuple[int, ...] = ()) -> Array:
-        """Return a value as an array that can be recorded.
+    def fit(self, value: object, batch: tuple[int, ...] = ()) -> Any:
+        """Return a value as an array of the leaf's dtype.
 
         Args:
             batch: the shape of the batch that it is, if it is one.
@@ -69,7 +68,7 @@ class Leaf:
                 )
             array = array.reshape(shape)
         if array.dtype is self.base or np.can_cast(array.dtype, self.base):
-            return array
+            return array.astype(self.base, copy=False)
         with np.errstate(all="ignore"):
             rounded = array.astype(self.base)
         if not np.array_equal(rounded, array, equal_nan=array.dtype.kind == "f"):
@@ -97,12 +96,102 @@ class Leaf:
             return [piece for value in values for piece in self.pieces(value, batch[1:])]
         if self.part.text is not None:
             return [encode_text(self.part.text(values))]
-        return [np.asarray(self.fit(values), self.base, order="C").tobytes()]
+        return [self.fit(values).tobytes()]
 
     def refused(self, reason: object) -> RecordingError:
         """Return the error for a value that is not of the space."""
         what = self._what
         return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
+
+
+class StateLeaf(Leaf):
+    """A `Discrete` space with the states or the actions of one environment: any whole number is exact."""
+
+    def fit(self, value: object, batch: tuple[int, ...] = ()) -> int:  # noqa: ARG002
+        """Return a whole number, which may stand in an array of one.
+
+        Raises:
+            RecordingError: it is something else.
+        """
+        return int(only_number(value, self._what, "iub", "a whole number of its Discrete space"))
+
+
+class SpaceValues:
+    """The values of a space, with the checks that they pass before they are recorded.
+
+    Args:
+        what: `observation` or `action`.
+        on_rounded: as for `Leaf`.
+        leaf: the class of the leaves.
+        is_game: whether the space is the `Dict` of the agents of a game, of whom some may have no value.
+    """
+
+    def __init__(
+        self,
+        space: Any,
+        what: str,
+        on_rounded: OnRounded = lambda _: None,
+        leaf: type[Leaf] = Leaf,
+        is_game: bool = False,
+    ) -> None:
+        parts = parts_of(space, "the agents' spaces" if is_game else f"the {what} space")
+        self.leaves = [leaf(part, what, on_rounded) for part in parts]
+        self.agents: tuple[object, ...] = tuple(space.spaces) if is_game else ()
+        """All agents of a game."""
+
+    def check_agents(self, values: Mapping[object, object]) -> None:
+        """Refuse values of agents that the game does not have.
+
+        Raises:
+            RecordingError: there is such an agent.
+        """
+        for agent in values:
+            if agent not in self.agents:
+                names = ", ".join(map(str, self.agents))
+                raise RecordingError(f"found the agent {agent!r}, expected one of possible_agents: {names}")
+
+    def fitted(self, value: Value, batch: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+        """Return a batch of values as they stand in a column of this dtype, [*batch, ...].
+
+        Raises:
+            RecordingError: it is no batch of values of the space.
+        """
+        if dtype.hasobject:
+            return np.array(self.to_bytes(value, batch), object).reshape(batch)
+        column = zeros(batch, dtype)
+        for leaf in self.leaves:
+            try:
+                leaf_column(leaf, column)[...] = leaf.fit(leaf.part.of(value), batch)
+            except NO_VALUE as error:
+                raise leaf.refused(error) from error
+        return column
+
+    def unknown(self, dtype: np.dtype[Any]) -> Array:
+        """Return an unknown value as it stands in a column of this dtype: NaN, and 0 for whole numbers."""
+        value = zeros((), dtype)
+        for leaf in self.leaves:
+            leaf_column(leaf, value)[...] = np.nan if leaf.base.kind == "f" else 0
+        return value
+
+    def to_bytes(self, value: Value, batch: tuple[int, ...] = ()) -> list[bytes]:
+        """Return the values of a batch, nested as the space, each as its bytes in a recording.
+
+        Raises:
+            RecordingError: one is no value of the space, or takes too many bytes.
+        """
+        columns = []
+        for leaf in self.leaves:
+            try:
+                if self.agents and leaf.part.keys[0] not in value:
+                    columns.append([leaf.blank])
+                else:
+                    columns.append(leaf.pieces(leaf.part.of(value), batch))
+            except (*NO_VALUE, AttributeError, RecursionError) as error:
+                raise leaf.refused(error) from error
+        whole = [b"".join(pieces[k] for pieces in columns) for k in range(math.prod(batch))]
+        if (size := max(map(len, whole), default=0)) > MAX_VALUE_BYTES:
+            raise self.leaves[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
+        return whole
 
 
 @cache
@@ -113,135 +202,27 @@ def _exact_scalars(base: np.dtype[np.generic]) -> frozenset[type]:
     )
 
 
-def leaves_of(space: Space, what: str, where: str = "", on_rounded: OnRounded = lambda _: None) -> list[Leaf]:
-    """Return the leaves of a space; `what` is `observation` or `action`."""
-    return [Leaf(part, what, on_rounded) for part in parts_of(space, where or f"the {what} space")]
-
-
-def filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...] = ()) -> Put:
-    """Return a function that puts a value of a space into a row of a column.
-
-    Args:
-        column: [rows, *batch] values of the space; objects where they vary in size, which hold their bytes.
-        batch: the shape of the batch that each value is, if it is one.
-    """
-    if column.dtype.hasobject:
-        return _bytes_filler(leaves, column, batch)
-    if len(leaves) == 1 and not leaves[0].part.keys:
-        return _leaf_filler(leaves[0], column, batch)
-    fillers = [(leaf, leaf.part.keys, _leaf_filler(leaf, _column_of(leaf, column), batch)) for leaf in leaves]
-
-    def put(row: int, value: Value) -> None:
-        for leaf, keys, put_leaf in fillers:
-            inside = value
-            try:
-                for key in keys:
-                    inside = inside[key]
-            except (TypeError, LookupError) as error:
-                raise leaf.refused(error) from error
-            put_leaf(row, inside)
-
-    return put
-
-
-def _bytes_filler(leaves: Sequence[Leaf], column: Array, batch: tuple[int, ...]) -> Put:
-    places = column.reshape(len(column), -1)
-
-    def put(row: int, value: Value) -> None:
-        places[row] = bytes_of(leaves, value, batch)
-
-    return put
-
-
-def _leaf_filler(leaf: Leaf, column: Array, batch: tuple[int, ...]) -> Put:
-    base, shape, array = leaf.base, batch + leaf.shape, np.ndarray
-    scalars = frozenset() if batch else leaf.exact_scalars
-
-    def put(row: int, value: Value) -> None:
-        kind = value.__class__
-        try:
-            if kind is array:  # the usual case costs two comparisons
-                if value.dtype is not base or value.shape != shape:
-                    value = leaf.fit(value, batch)
-            elif kind not in scalars:
-                value = leaf.fit(value, batch)
-            column[row] = value
-        except (TypeError, ValueError, OverflowError) as error:
-            raise leaf.refused(error) from error
-
-    return put
-
-
-def _column_of(leaf: Leaf, column: NDArray[Any]) -> NDArray[Any]:
+def leaf_column(leaf: Leaf, column: Any) -> Any:
+    """Return the part of a column of whole values that holds those of a leaf."""
     for name in leaf.part.fields:
         column = column[name]
     return column
 
 
-def fitted(
-    leaves: Sequence[Leaf], value: object, batch: tuple[int, ...], dtype: np.dtype[np.generic]
-) -> Array:
-    """Return a batch of values of a space as they stand in a column of this dtype, [*batch, ...]."""
-    column = zeros((1, *batch), dtype)
-    filler(leaves, column, batch)(0, value)
-    return np.asarray(column[0])
-
-
-def put_unknown(leaves: Sequence[Leaf], column: Array) -> None:
-    """Fill a column of values of the space with NaN, and with 0 where they are whole numbers."""
-    for leaf in leaves:
-        _column_of(leaf, column)[...] = np.nan if leaf.base.kind == "f" else 0
-
-
-def leaves_by_agent(space: Any, what: str, on_rounded: OnRounded = lambda _: None) -> dict[str, list[Leaf]]:
-    """Return the leaves of each agent's space in the `Dict` of all of them."""
-    leaves = leaves_of(space, what, "the agents' spaces", on_rounded)
-    return {agent: [leaf for leaf in leaves if leaf.part.keys[0] == agent] for agent in space.spaces}
-
-
-def filler_by_agent(
-    leaves: Mapping[str, Sequence[Leaf]], column: Array
-) -> Callable[[int, Mapping[str, Value]], None]:
-    """Return a function that puts the values of some agents into a row, and zeros for the others."""
-    fillers = {} if column.dtype.hasobject else {agent: filler(own, column) for agent, own in leaves.items()}
-    every, zeros = [leaf for own in leaves.values() for leaf in own], np.zeros((), column.dtype)
-
-    def put(row: int, values: Mapping[str, object]) -> None:
-        for agent in values:
-            if agent not in leaves:
-                names = ", ".join(map(str, leaves))
-                raise RecordingError(f"found the agent {agent!r}, expected one of possible_agents: {names}")
-        column[row] = zeros if fillers else bytes_of(every, values, agents=values)[0]
-        for agent in values if fillers else ():
-            fillers[agent](row, {agent: values[agent]})
-
-    return put
-
-
-def bytes_of(
-    leaves: Sequence[Leaf],
-    value: object,
-    batch: tuple[int, ...] = (),
-    agents: Container[object] | None = None,
-) -> list[bytes]:
-    """Return the values of a batch, nested as their space, each as its bytes in a recording.
+def only_number(value: object, what: str, kinds: str = "iubf", expected: str = "a number") -> Array:
+    """Return a number that may stand in an array of one.
 
     Args:
-        agents: of a game, those that have a value; None for other spaces.
+        kinds: the kinds of dtypes that it may have.
+        expected: what it is, for the error.
+
+    Raises:
+        RecordingError: it is something else.
     """
-    columns = []
-    for leaf in leaves:
-        try:
-            if agents is None or leaf.part.keys[0] in agents:
-                columns.append(leaf.pieces(leaf.part.of(value), batch))
-            else:
-                columns.append([leaf.blank])
-        except (TypeError, ValueError, LookupError, AttributeError, OverflowError, RecursionError) as error:
-            raise leaf.refused(error) from error
-    whole = [b"".join(pieces[k] for pieces in columns) for k in range(math.prod(batch))]
-    if (size := max(map(len, whole), default=0)) > MAX_VALUE_BYTES:
-        raise leaves[0].refused(f"it takes {size:,} bytes, expected at most {MAX_VALUE_BYTES:,}")
-    return whole
+    array = np.asarray(value)
+    if array.size != 1 or array.dtype.kind not in kinds:
+        raise RecordingError(f"found the {what} {value!r}, expected {expected}.")
+    return array.reshape(())
 
 
 def element_of(values: Value, i: int | slice) -> Value:

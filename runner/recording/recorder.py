@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,7 +215,7 @@ class Recorder:
         """Record messages of a fixed-width topic, given by field; `positions` are as for `take`."""
         for block, part in self.fill(topic, positions.astype(np.uint64)):
             for name, values in columns.items():
-                block[name] = values[part]
+                _assign(block[name], values[part])
 
     def capacity(self, topic: Topic) -> int:
         """Return how many records a whole block of a fixed-width topic has."""
@@ -424,6 +424,14 @@ def _offsets(count: int, size: int) -> NDArray[np.uint64]:
     offsets = np.arange(count, dtype=np.uint64) * np.uint64(size)
     offsets.flags.writeable = False
     return offsets
+
+
+def _assign(column: Any, values: Any) -> None:
+    """Assign values to a column: of structured ones part by part, which takes less time."""
+    for name in values.dtype.names or ():
+        _assign(column[name], values[name])
+    if values.dtype.names is None:
+        column[...] = values
 
 
 def capacity_of(topic: Topic, message: MessageType, chunk_steps: int) -> int:

@@ -17,16 +17,9 @@ from runner.environments.games import game_spaces
 from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
+from runner.recording.fillers import Put, filler
 from runner.recording.gym_spaces import describe_space, value_of
-from runner.recording.gym_values import (
-    Put,
-    element_of,
-    filler,
-    filler_by_agent,
-    fitted,
-    leaves_by_agent,
-    leaves_of,
-)
+from runner.recording.gym_values import SpaceValues, element_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
@@ -150,7 +143,7 @@ class Stepper:
     def _putter(self, column: Array) -> Put:
         """Return a function that puts an observation into a row of a column."""
         if not self._has_states:
-            return filler(leaves_of(self.observation_space, "observation"), column)
+            return filler(SpaceValues(self.observation_space, "observation"), column)
 
         def put_state(row: int, observation: object) -> None:
             if observation.__class__ is not int:
@@ -258,7 +251,7 @@ class GameStepper(Stepper):
         return game_spaces(self.env)
 
     def _putter(self, column: Array) -> Put:
-        return filler_by_agent(leaves_by_agent(self.observation_space, "observation"), column)
+        return filler(SpaceValues(self.observation_space, "observation", is_game=True), column)
 
     def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:
         put, agents = self._putter(seen), self.env.possible_agents
@@ -306,7 +299,7 @@ class VectorStepper(Stepper):
         if env.num_envs != self.n:
             raise CannotRedo(f"The vector has {env.num_envs} environments, and the recording {self.n}.")
         self._autoreset, self._drawn = autoreset, drawn
-        self._leaves = leaves_of(self.observation_space, "observation")
+        self._values = SpaceValues(self.observation_space, "observation")
         self._over = np.zeros(self.n, np.bool_)
         """The environments whose episode ended with the last step."""
         self._last: Array = np.zeros(self.n, self._first_dtype)
@@ -333,7 +326,7 @@ class VectorStepper(Stepper):
                 explicit.append(reset)
         for call in calls(explicit):
             observations = self.env.reset(**self._arguments(call))[0]
-            self._last = fitted(self._leaves, observations, (self.n,), self._first_dtype)
+            self._last = self._values.fitted(observations, (self.n,), self._first_dtype)
             for reset in call:
                 add(reset)
         if automatic:
@@ -362,7 +355,7 @@ class VectorStepper(Stepper):
 
     def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
         rows = seen.reshape(len(seen) // self.n, self.n, *seen.shape[1:])
-        put, put_last = filler(self._leaves, rows, (self.n,)), filler(self._leaves, seen)
+        put, put_last = filler(self._values, rows, (self.n,)), filler(self._values, seen)
         columns = [ends[name].reshape(-1, self.n) for name in _ENDS]
 
         def fill(step: int, result: Any) -> None:

@@ -12,8 +12,8 @@ import pytest
 import runner
 from runner.errors import RunnerError
 from runner.execution.verify import verify
-from runner.loops.copied_rows import CopiedRows
 from runner.loops.fold import fold_if_over
+from runner.loops.step_buffer import StepBuffer
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
@@ -137,14 +137,14 @@ def test_closing_the_last_process_warns_of_what_was_left_out(unfolded, tmp_path)
 
 
 def test_nothing_is_removed_if_the_folded_steps_are_not_those_of_the_shards(run, monkeypatch):
-    real = CopiedRows.put
+    real = StepBuffer.copy
 
-    def put(self, rows: np.ndarray) -> None:
+    def copy(self, rows: np.ndarray, environment: int) -> None:
         changed = rows.copy()
         changed["rewards"] += 1
-        real(self, changed)
+        real(self, changed, environment)
 
-    monkeypatch.setattr(CopiedRows, "put", put)
+    monkeypatch.setattr(StepBuffer, "copy", copy)
     before = run.recording.read_bytes()
     with pytest.raises(RunnerError, match="rewards: found other values"):
         fold_if_over(run)
