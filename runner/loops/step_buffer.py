@@ -314,34 +314,24 @@ class StepBuffer:
         ends = np.stack([rows["terminated"], rows["truncated"]], axis=1)[..., np.newaxis]
         self._extend(action[:, np.newaxis], after[:, np.newaxis], rows["rewards"], ends, marks)
 
-    def _extend(
-        self,
-        actions: Array,
-        observations: Array,
-        rewards: Array,
-        ends: Array,
-        marks: Array | None = None,
-        firsts: Array | None = None,
-    ) -> None:
-        """Put down T steps of all environments, [T, N, ...].
+    def _extend(self, *arrays: Array, firsts: Array | None = None) -> None:
+        """Put down T steps of all environments.
 
         Args:
-            ends: [T, 2, N].
+            arrays: what `_block` holds, [T, ...]; of one environment alone with the marks.
             firsts: the observations after resets by the steps that ended episodes, where there were such.
         """
-        done = 0
-        while done < len(rewards):
-            row, count = self._filled, min(self._room - self._filled, len(rewards) - done)
+        steps, done = len(arrays[0]), 0
+        while done < steps:
+            row, count = self._filled, min(self._room - self._filled, steps - done)
             rows, part = slice(row, row + count), slice(done, done + count)
-            self._actions[rows], self._observations[rows] = actions[part], observations[part]
-            self._rewards[rows], self._ends[rows] = rewards[part], ends[part]
-            if marks is not None:
-                self._marks[rows] = marks[part]
+            for column, values in zip(self._block, arrays, strict=False):
+                column[rows] = values[part]
             if firsts is not None:
-                at, which = np.nonzero(ends[part].any(axis=1))
+                at, which = np.nonzero(self._ends[rows].any(axis=1))
                 self._add_resets(row + at + 1, which, firsts[done + at, which])
             if self._are_bytes:
-                self._hold(*actions[part].ravel(), *observations[part].ravel())
+                self._hold(*self._actions[rows].ravel(), *self._observations[rows].ravel())
             done += count
             self._filled += count
             if self._filled >= self._room:
@@ -458,12 +448,13 @@ class StepBuffer:
             rows: Records = np.zeros(room, [*dtypes.items(), *ends])
             self._actions, self._observations = (rows[name][:, np.newaxis] for name in dtypes)
             self._rewards, self._ends = rows["rewards"], rows["ends"]
+        self._block = self._actions, self._observations, self._rewards, self._ends, self._marks
         if self._is_copied:
             return
         self._put_action = self._filler(self._action, self._actions)
         self._put_observation = self._filler(self._observation, self._observations)
         if not (self._batch or self._is_game or self._are_bytes):
-            self._bytes = rows.view(np.uint8).data
+            self._bytes = None if self._starts else rows.view(np.uint8).data
             self._put, self.keep = step_filler(
                 self._action, self._observation, rows, self._put_parts, self._copied
             )
@@ -471,7 +462,8 @@ class StepBuffer:
     def _copied(self, action: Value) -> Value:
         """Return a copy of an action; not as bytes, which are what `step_filler` makes of actions."""
         given = as_given(action)
-        return np.array(given) if given.__class__ is bytes and not self._are_bytes else given
+        is_taken_for_those = given.__class__ is bytes and not (self._are_bytes or self._starts)
+        return np.array(given) if is_taken_for_those else given
 
     def _put_parts(
         self,
@@ -482,18 +474,18 @@ class StepBuffer:
         terminated: object,
         truncated: object,
     ) -> None:
-        """Put down a step part by part: of one environment alone one that is not as expected."""
+        """Put down a step of a game; of one environment alone, one that is not as expected."""
         if self._bytes is not None and action.__class__ is bytes:
             start = row * (len(self._bytes) // len(self._ends))
             self._bytes[start : start + len(action)] = action
         else:
             self._put_action(row, action)
         self._put_observation(row, observation)
-        if not (self._batch or self._is_game):
-            rewards = only_number(rewards, "reward")
-        self._rewards[row] = rewards
-        ends = self._ends[row]
-        ends[0], ends[1] = terminated, truncated
+        try:
+            self._rewards[row] = rewards if self._is_game else float(rewards)
+        except (TypeError, ValueError):
+            self._rewards[row] = only_number(rewards, "reward")
+        self._ends[row] = [[bool(terminated)], [bool(truncated)]]
         if self._are_bytes:
             self._hold(*self._actions[row], *self._observations[row])
 

@@ -107,6 +107,10 @@ class Leaf:
 class StateLeaf(Leaf):
     """A `Discrete` space with the states or the actions of one environment: any whole number is exact."""
 
+    def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:
+        super().__init__(part, what, on_rounded)
+        self.exact_scalars = frozenset()
+
     def fit(self, value: object, batch: tuple[int, ...] = ()) -> int:  # noqa: ARG002
         """Return a whole number, which may stand in an array of one.
 

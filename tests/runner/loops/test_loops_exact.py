@@ -69,6 +69,37 @@ def test_an_observation_of_another_shape_is_refused(tmp_path, observation):
             rec.step(0)
 
 
+NAN = np.array([0x7FA00001], np.uint32).view(np.float32)[0]
+"""A signaling NaN with a payload, which a conversion to another float would change."""
+
+
+@pytest.mark.parametrize("value", [NAN, np.array(NAN), np.float32(-0.0)])
+def test_a_single_number_keeps_every_bit(tmp_path, value, monkeypatch):
+    env = Sensor(value)
+    env.observation_space = env.action_space = spaces.Box(-1, 1, (), np.float32)
+    monkeypatch.setattr(env, "reset", lambda **_: (value, {}))
+    with runner.record(env, tmp_path) as rec:
+        rec.reset()
+        rec.step(value)
+    step = steps_of(rec.run)[0]
+    assert step["action"].tobytes() == step["next_observation"].tobytes() == np.float32(value).tobytes()
+
+
+@pytest.mark.parametrize("observation", [np.zeros(2, np.float32), [0.0, 0.0]])
+def test_bytes_are_no_action_though_actions_are_kept_as_bytes(tmp_path, observation):
+    env = Sensor(observation)
+    env.action_space = spaces.Box(-1, 1, (2,), np.float32)
+    with runner.record(env, tmp_path) as rec:
+        rec.reset()
+        for action in (bytes(8), np.ones(2, np.float32), bytes(8)):
+            if isinstance(action, bytes):
+                with pytest.raises(RecordingError, match=r"not of the environment's action space"):
+                    rec.step(action)
+            else:
+                rec.step(action)
+    assert steps_of(rec.run)["action"].tolist() == [[1.0, 1.0]]
+
+
 def pendulum_actions(n: int) -> list[Any]:
     return list(np.random.default_rng(0).uniform(-2, 2, (n, 1)))
 
