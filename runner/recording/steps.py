@@ -32,7 +32,7 @@ class Steps(TopicChunks):
         """Whether any step was recorded, whole or by its action."""
         return bool(self or self.actions)
 
-    @property
+    @cached_property
     def have_turns(self) -> bool:
         """Whether environments take turns, so that a row has `environment` and `taken`."""
         return "taken" in (self.row_dtype.names or ())
@@ -132,12 +132,13 @@ class EpisodeSteps:
             return
         # An environment takes at most one step a row, so t = start is not before this row.
         for block in self.table.numbered(range(self.first + start, self.last + 1 if start < stop else 0)):
-            rows = block[is_of_environment(block, self.environment)]
-            inside = rows[(rows["t"] >= start) & (rows["t"] < stop)]
-            if len(inside):
-                yield inside
-            if len(rows) and rows["t"][-1] >= stop - 1:
-                return
+            is_inside = is_of_environment(block, self.environment)
+            if stop - start < self.length:
+                is_inside &= (block["t"] >= start) & (block["t"] < stop)
+            if len(rows := block[is_inside]):
+                yield rows
+                if rows["t"][-1] == stop - 1:
+                    return
 
     def one(self, t: int) -> np.void:
         """Return the step at t.

@@ -31,7 +31,9 @@ def is_of_environment(rows: NDArray[np.void], environment: int) -> NDArray[np.bo
     """Return which rows are steps that an environment took: all where only one was recorded."""
     if "environment" not in (rows.dtype.names or ()):
         return is_taken(rows)
-    return np.asarray(is_taken(rows) & (rows["environment"] == environment))
+    is_own: NDArray[np.bool_] = rows["environment"] == environment
+    is_own &= is_taken(rows)
+    return is_own
 
 
 def turns_of(rows: NDArray[np.void]) -> Iterator[tuple[int, Ints]]:
