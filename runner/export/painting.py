@@ -59,8 +59,8 @@ def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
         yield shown
 
 
-def decoded(data: bytes, where: str) -> Image.Image:
-    """Return a recorded frame as an RGB image.
+def decoded(data: bytes, where: str, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Image.Image:
+    """Return a recorded picture as an RGB image; of a film the first frame.
 
     Raises:
         RecordingError: it is no picture, or too large; `where` names it.
@@ -68,7 +68,7 @@ def decoded(data: bytes, where: str) -> Image.Image:
     from PIL import Image, UnidentifiedImageError
 
     try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+        with Image.open(io.BytesIO(data), formats=formats) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise RecordingError(f"{where} has {image.width}x{image.height} pixels, too many to show.")
             return image.convert("RGB")

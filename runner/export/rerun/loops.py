@@ -5,7 +5,6 @@ Entities of a vector environment are below `train/env_3`, those of a game's agen
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import reduce
@@ -16,24 +15,21 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from runner.errors import CannotRedo
+from runner.drawing.raster import image_bytes
+from runner.errors import CannotRedo, RecordingError
 from runner.export import pictures
 from runner.export.encoded import encoded_picture
-from runner.export.painting import redrawn
-from runner.export.rerun.labels import Labels
+from runner.export.painting import decoded, redrawn
 from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
-from runner.export.rerun.scene import background, scene_of
 from runner.export.rerun.selection import MAX_MEMBERS, Selection
-from runner.export.rerun.steps import Batch, StepTracks, grid_view
 from runner.export.rerun.tracks import (
     MAX_ROWS,
     Row,
-    Source,
     Times,
     Track,
     View,
-    cleared,
+    Writer,
     grouped,
     rows_of,
     scalars,
@@ -44,10 +40,8 @@ from runner.recording import schema
 from runner.recording.messages import frame_place, media_type
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
-from runner.recording.turns import taken
-from runner.replay.steps import check_steps, frames_every, log_times_of
+from runner.replay.steps import frames_every, log_times_of
 from runner.util.arrays import Array, MaskedArray, Records
-from runner.util.extras import require
 
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
@@ -56,7 +50,8 @@ MAX_LINES: Final = 24
 FRAMES_SENT: Final = 64
 """Pictures sent at once."""
 LOG: Final = View("log", "Log", rrb.TextLogView)
-_BATCH_BYTES: Final = 64 << 20
+_NAMED: Final = {"picture": ("pictures", rrb.Spatial2DView), "array": ("array", rrb.TensorView)}
+"""Entities of what is logged by name: the group and the kind of their views."""
 OBSERVED: Final = {"observation": observed, "action": acted}
 Part = tuple[list[tuple[str, ...]], list[str]]
 """Paths into the values of a space, and the names of all numbers there."""
@@ -76,16 +71,15 @@ class Member(NamedTuple):
     """The agent's name in the recording of a game."""
 
 
-class LoopReader:
-    """Reads a loop as tracks: an overview, then the selected steps, and pictures that are drawn of them."""
+class LoopTracks:
+    """Makes the tracks of a loop: an overview, lines of its steps, and pictures that are drawn of them."""
 
     def __init__(
-        self, source: Source, selection: Selection, trust: bool, stage: Callable[[str], None]
+        self, writer: Writer, selection: Selection, trust: bool, stage: Callable[[str], None]
     ) -> None:
-        recording = self._recording = source.recording
-        self._source, self._root, self._selection = source, source.root, selection
+        recording = self._recording = writer.source.recording
+        self._writer, self._root, self._selection = writer, writer.source.root, selection
         self._trust, self._stage = trust, stage
-        self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._is_game, n = len(recording.agents) > 1, recording.environments
         self._environments = [f"env_{i}" if n > 1 else "" for i in range(n)]
         self._alone = n == 1
@@ -94,74 +88,43 @@ class LoopReader:
             agents = enumerate(recording.agents)
             self._members = [Member(i, entity_name(a), i, _parts(recording, a), a) for i, a in agents]
         else:
-            parts = {} if self._scene else _parts(recording)
+            parts = _parts(recording)
             self._members = [Member(i, name, 0, parts) for i, name in enumerate(self._environments)]
-        self._described: set[str] = set()
-        """Entities that are lines."""
         self._pictured: dict[tuple[str, int], int] = {}
         """The step of the last picture, by phase and environment."""
-        self.last = 0
-        """The last step that was read."""
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but the steps."""
-        recording, root = self._recording, self._root
+        recording = self._recording
         for phase in schema.PHASES:
             yield from self._episodes(phase)
             for environment, frames in grouped(self._recorded_frames(phase), FRAMES_SENT):
                 yield self._frames(phase, environment, frames)
         for image in recording.table(schema.IMAGE_TOPIC).decoded():
-            name, data = entity_name(image["frame_id"]), image["data"]
-            if media_type(data) not in ("image/png", "image/jpeg"):
-                data = _first_frame(data)
-            if data:
-                view = View("pictures", name, rrb.Spatial2DView)
-                yield rows_of(f"{root}/picture/{name}", [(_step(image["log_time"]), _picture(data))], view)
-        values = (
-            (entity_name(scalar["name"]), scalar) for scalar in recording.table(schema.SCALAR_TOPIC).decoded()
-        )
-        for name, rows in grouped(values, MAX_ROWS):
-            log_times, episodes, numbers = (
-                np.array([row[field] for row in rows]) for field in ("log_time", "episode", "value")
-            )
-            times, view = times_of(log_times, episode=episodes), View("logged", name.replace("_", " "))
-            static = [series_lines([name])]
-            yield Track(f"{root}/logged/{name}", times, scalars(numbers[:, np.newaxis]), static, view)
+            if data := _still(image["data"]):
+                yield self._named("picture", image["frame_id"], image["log_time"], _picture(data))
+        for series, rows in recording.scalars():
+            names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
+            for name in dict.fromkeys(names.tolist()):
+                own = rows[names == name]
+                times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
+                values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
+                yield Track(f"{self._root}/logged/{name}", times, values, style, View("logged", view))
         texts = (
             ("log", (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")))
             for text in recording.table(schema.LOG_TOPIC).decoded()
         )
         for name, lines in grouped(texts, MAX_ROWS):
-            yield rows_of(f"{root}/{name}", lines, LOG)
+            yield rows_of(f"{self._root}/{name}", lines, LOG)
         arrays = recording.table(schema.ARRAY_TOPIC).messages()
         for (time, _), array in zip(arrays, recording.arrays(), strict=True):
-            name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
-            view = View("array", name, rrb.TensorView)
-            yield rows_of(f"{root}/array/{name}", [(_step(time), tensor)], view)
+            yield self._named("array", array.name, time, rr.Tensor(np.atleast_1d(array.values)))
 
-    def steps(self) -> Iterator[Track]:
-        """Yield the selected steps of every environment and agent, and pictures that are drawn of them."""
-        recording, root, scene, title = self._recording, self._root, self._scene, self._source.title
-        for phase, spans in self._selection.by_phase.items():
-            grid = None
-            if scene and spans:
-                labels = Labels(recording.mdp, scene, recording.agents)
-                grid = StepTracks(root, phase, title, labels)
-                yield labels.track(root)
-                yield from background(root, scene, grid_view(title, scene))
-                yield from grid.still
-            trained = recording.train.episodes.array()["log_time"] if scene else ()
-            for steps in self._batches(phase, spans):
-                yield from self._lines_of(phase, steps)
-                if grid:
-                    number = episode = steps["episode"].astype(np.int64)
-                    if phase == "eval":  # shown by the training episodes before it
-                        episode = np.searchsorted(trained, steps["log_time"])
-                    yield from grid.of(Batch(steps, episode, number))
-            if grid:
-                yield from cleared([f"{grid.path}/grid"], [stop for _, stop in grid.covered])
-        for phase, episodes in self._selection.drawn.items():
-            yield from self._drawn_frames(phase, episodes)
+    def _named(self, folder: str, name: str, log_time: int, shown: rr.AsComponents) -> Track:
+        """Return a track of what was logged once under a name, in a view of its own."""
+        group, kind = _NAMED[folder]
+        name = entity_name(name)
+        return rows_of(f"{self._root}/{folder}/{name}", [(_step(log_time), shown)], View(group, name, kind))
 
     def _episodes(self, phase: str) -> Iterator[Track]:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
@@ -169,13 +132,13 @@ class LoopReader:
             for member in self._members:
                 own = block if self._alone else block[block["environment"] == member.number]
                 if len(own):
-                    times = self._times(own)
+                    times = times_of(own["log_time"], episode=own["episode"])
                     yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
                     if member.column == 0:
                         named = member._replace(name="") if member.agent else member
                         yield self._line(phase, named, "length", times, own["length"][:, np.newaxis])
 
-    def _lines_of(self, phase: str, steps: Records) -> Iterator[Track]:
+    def lines(self, phase: str, steps: Records) -> Iterator[Track]:
         """Yield rewards, observations, actions and extras of steps."""
         recording = self._recording
         extras = recording.phase(phase).extras.at(steps["step"])
@@ -188,7 +151,7 @@ class LoopReader:
             if not is_own.any():
                 continue
             own = steps[is_own]
-            times = self._times(own, t=own["t"])
+            times = times_of(own["log_time"], episode=own["episode"], t=own["t"])
             yield self._line(phase, member, "reward", times, own["rewards"][:, [member.column]])
             for quantity, (paths, names) in member.parts.items():
                 values = OBSERVED[quantity](recording, own)
@@ -230,9 +193,8 @@ class LoopReader:
         A view shows a quantity of all environments; one of several numbers those of one environment.
         """
         entity = self._entity(phase, member.name, quantity)
-        if entity in self._described:
+        if entity in self._writer.entities:
             return Track(entity, times, scalars(values))
-        self._described.add(entity)
         colours, lines = phase_colours(phase, len(names)), names
         if len(names) == 1:
             lines = [f"{phase} {member.name}".strip()]
@@ -264,6 +226,11 @@ class LoopReader:
                 if self._is_later(phase, environment, step) or not is_each_step:
                     yield environment, (step, _picture(frame["data"]))
 
+    def drawn_frames(self) -> Iterator[Track]:
+        """Yield pictures of the selected episodes, as far as the environment draws them."""
+        for phase, episodes in self._selection.drawn.items():
+            yield from self._drawn_frames(phase, episodes)
+
     def _drawn_frames(self, phase: str, episodes: Sequence[int]) -> Iterator[Track]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
         recording = self._recording
@@ -293,7 +260,7 @@ class LoopReader:
             yield self._frames(phase, environment, rows)
         for note in notes:
             self._selection.warnings.append(note)
-            yield rows_of(f"{self._root}/log", [(self.last, rr.TextLog(note, level="WARN"))], LOG)
+            yield rows_of(f"{self._root}/log", [(self._writer.last, rr.TextLog(note, level="WARN"))], LOG)
 
     def _is_later(self, phase: str, environment: int, step: int) -> bool:
         """Return whether a picture is later than the one before.
@@ -311,33 +278,12 @@ class LoopReader:
     def _entity(self, *parts: str) -> str:
         return "/".join([self._root, *filter(None, parts)])
 
-    def _batches(self, phase: str, spans: Sequence[range]) -> Iterator[Records]:
-        """Yield the steps of all environments, at most a batch of each at a time."""
-        recording, table = self._recording, self._recording.phase(phase).steps
-        if table.dtype is None:
-            for span in spans:
-                yield from map(taken, table.numbered(span))
-            return
-        limit = max(1, min(MAX_ROWS * len(self._environments), _BATCH_BYTES // table.dtype.itemsize))
-        for span in spans:
-            for start in range(span.start, span.stop, limit):
-                blocks = table.blocks(start, min(start + limit, span.stop))
-                steps = taken(np.concatenate([np.empty(0, table.row_dtype), *blocks]))
-                if len(steps):
-                    if self._scene:
-                        check_steps(steps, recording.mdp, str(recording.path), "recorded")
-                    yield steps
-
-    def _times(self, records: Records, **timelines: Array) -> Times:
-        times = times_of(records["log_time"], episode=records["episode"], **timelines)
-        self.last = max(self.last, int(times["step"].max()))
-        return times
-
 
 def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:
     """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
     parts = {}
-    for quantity in OBSERVED if recording.train.steps.dtype is not None else ():
+    has_grid = recording.tabular and recording.mdp.scene is not None
+    for quantity in () if has_grid or recording.train.steps.dtype is None else OBSERVED:
         leaves = [
             leaf
             for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
@@ -358,15 +304,14 @@ def _picture(data: bytes) -> rr.EncodedImage:
     return rr.EncodedImage(contents=data, media_type=media_type(data) or "image/jpeg")
 
 
-def _first_frame(data: bytes) -> bytes:
-    """Return the first frame of a film as PNG; empty if it is none."""
-    image = require("PIL.Image", extra="plots", purpose="logged films in Rerun")
+def _still(data: bytes) -> bytes:
+    """Return a picture, of a film its first frame as PNG; empty if it is neither."""
+    if media_type(data) in ("image/png", "image/jpeg"):
+        return data
     try:
-        with image.open(io.BytesIO(data), formats=["WEBP"]) as film:
-            film.convert("RGB").save(buffer := io.BytesIO(), "png")
-    except (OSError, ValueError, image.DecompressionBombError):
+        return image_bytes(np.asarray(decoded(data, "A film", ("WEBP",))), "png")
+    except RecordingError:
         return b""
-    return buffer.getvalue()
 
 
 def _step(log_time: int) -> int:

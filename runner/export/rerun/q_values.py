@@ -7,13 +7,13 @@ lost steps, the values after them are unknown up to the next snapshot, and are l
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from runner.analysis.evaluations import Evaluation
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
@@ -33,9 +33,9 @@ from runner.export.rerun.tracks import (
     repeated,
     scalars,
     text_track,
+    times_of,
 )
 from runner.recording.reader import Recording
-from runner.recording.schema import STEP_NANOSECONDS
 from runner.replay.step_replay import StateProbe
 from runner.replay.tables import TableReplay, known_steps
 from runner.util.arrays import Ints, Records
@@ -73,49 +73,48 @@ class ValueReader:
         self._states = placements.states if placements else np.empty((1, 0), np.int32)
         self._known_ranges = known_steps(recording)
         self._replay: TableReplay | None = None
-        self._last = (0, -1)
+        self._last = (-1, -1)
         """Time and context of the step before."""
 
-    def batches(self, block: Records, evaluation: Evaluation | None) -> Iterator[Batch]:
-        """Yield a block of an evaluation's steps, or of training in parts with known or unknown values."""
-        if evaluation:
-            trials = int(self._recording.config["evaluation"]["trials"])
-            after, number = np.full(len(block), evaluation.after), block["episode"].astype(np.int64) % trials
-            yield Batch(block, after, number, *self._values(block, evaluation.train_step))
-            return
-        first = int(block["step"][0])
-        edges = [edge - first for start, last in self._known_ranges for edge in (start, last + 1)]
-        for part in np.split(block, [edge for edge in edges if 0 < edge < len(block)]):
-            episode = part["episode"].astype(np.int64)
-            yield Batch(part, episode, episode, *self._values(part))
+    def batches(self, phase: str, steps: Records, *numbers: Ints) -> Iterator[Batch]:
+        """Yield steps in parts with known or unknown values, as they were before the update of each step.
 
-    def _values(self, block: Records, train_step: int | None = None) -> tuple[Any, ...]:
-        """Return the values of a `Batch` before the update of each step; nothing if they are unknown.
-
-        `train_step` is the number of training steps before steps of an evaluation.
+        The numbers are those of a `Batch`, and the training steps before each step.
         """
-        step = int(block["step"][0]) if train_step is None else train_step
-        if not any(first <= step <= last for first, last in self._known_ranges):
-            return ()
-        if self._replay is None:
-            self._replay = TableReplay(self._recording, step)
-        elif self._replay.step != step:
-            self._replay.seek(step)
-        context = self._context[block["state"]]
-        has_map = block["t"] == 0  # and where the context changes
-        has_map[1:] |= context[1:] != context[:-1]
-        has_map[0] |= (int(block["log_time"][0]) - STEP_NANOSECONDS, int(context[0])) != self._last
-        self._last = (int(block["log_time"][-1]), int(context[-1]))
+        trained = numbers[-1]
+        is_known = np.zeros(len(steps), np.bool_)
+        for first, last in self._known_ranges:
+            is_known |= (first <= trained) & (trained <= last)
+        edges = np.flatnonzero(np.diff(is_known)) + 1
+        for part, *own, before, known in zip(
+            *(np.split(rows, edges) for rows in (steps, *numbers, is_known)), strict=True
+        ):
+            values = self._values(part, before, int(phase == "train")) if known[:1].any() else ()
+            yield Batch(part, *own, *values)
+
+    def _values(self, steps: Records, trained: Ints, stride: int) -> tuple[Any, ...]:
+        """Return the values of a `Batch`; `stride` is the number of updates that a step makes."""
+        context, times = self._context[steps["state"]], times_of(steps["log_time"])["step"]
+        # Maps where an episode begins, the context changes, or steps are left out.
+        has_map = (steps["t"] == 0) | (np.diff(context, prepend=self._last[1]) != 0)
+        has_map |= np.diff(times, prepend=self._last[0]) != 1
+        self._last = int(times[-1]), int(context[-1])
         rows = np.flatnonzero(has_map)
         shape = len(rows), len(self._recording.agents), self._states.shape[1]
         maps = np.empty(shape, np.float32), np.empty(shape, np.int32)
         probe = StateProbe(rows, self._states[context[rows]], *maps)
-        if train_step is None:
-            tables = self._replay.empty_rows(len(block))
-            self._replay.apply(block, tables, probe)
-        else:
-            self._replay.read(probe)
-            tables = self._replay.values_in(block["state"])
+        replay = self._replay = self._replay or TableReplay(self._recording, int(trained[0]))
+        tables = replay.empty_rows(len(steps))
+        edges = [0, *np.flatnonzero(np.diff(trained) != stride) + 1, len(steps)]
+        for start, stop in pairwise(edges):
+            if replay.step != trained[start]:
+                replay.seek(int(trained[start]))
+            own = probe.between(start, stop)
+            if stride:
+                replay.apply(steps[start:stop], tables[start:stop], own)
+            else:
+                replay.read(own)
+                tables[start:stop] = replay.values_in(steps["state"][start:stop])
         return *self._by_agent(tables), has_map, *maps
 
     def _by_agent(self, tables: Floats) -> tuple[Floats, Ints]:

@@ -1,120 +1,162 @@
-"""A run trained here as tracks: its metrics, the selected steps, and the Q-values at each of them."""
+"""A run as tracks: an overview, then the selected steps, with the Q-values of a job at each of them."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 import rerun as rr
 
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import Labels
+from runner.export.rerun.loops import LoopTracks
 from runner.export.rerun.metrics import EVENTS, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
-from runner.export.rerun.selection import Selection
+from runner.export.rerun.selection import Selection, episodes_of
 from runner.export.rerun.steps import Batch, StepTracks, grid_view
-from runner.export.rerun.tracks import (
-    GREY,
-    MAX_ROWS,
-    Source,
-    Track,
-    cleared,
-    scalars,
-    text_track,
-)
+from runner.export.rerun.tracks import GREY, MAX_ROWS, Track, Writer, cleared, scalars, text_track
 from runner.recording import schema
+from runner.recording.turns import taken
 from runner.replay.steps import check_steps
+from runner.util.arrays import Records
 
 T = TypeVar("T")
+_BATCH_BYTES: Final = 64 << 20
 
 
-class JobReader:
-    """Reads a job as tracks: an overview, of which all views follow, then its steps."""
+class RunReader:
+    """Reads a run as tracks: an overview, of which all views of a job follow, then its steps."""
 
-    def __init__(self, source: Source, selection: Selection) -> None:
-        self._source, self._selection = source, selection
+    def __init__(
+        self, writer: Writer, selection: Selection, trust: bool, stage: Callable[[str], None]
+    ) -> None:
+        source, root = writer.source, writer.source.root
+        self._writer, self._source, self._root, self._selection = writer, source, root, selection
         recording = self._recording = source.recording
-        self._mdp, self._scene = recording.mdp, scene_of(recording.mdp)
-        steps = sum(recording.table(topic).count() for topic in (schema.TRAIN_STEP, schema.EVAL_STEP))
-        reports = [*recording.train.all_metrics()[-1:], *recording.eval.all_metrics()[-1:]]
-        self.last = max([steps, *(row["log_time"] // schema.STEP_NANOSECONDS for row in reports)])
-        """Steps executed in the whole run."""
-        low = high = 0.0
-        for snapshot in recording.snapshots() if selection.steps else ():
-            low, high = min(low, float(snapshot.values.min())), max(high, float(snapshot.values.max()))
-        labels = self._labels = Labels(self._mdp, self._scene, recording.agents, (low, high))
-        self._phases: dict[str, tuple[StepTracks, list[ValueTracks | MapTracks]]] = {}
-        """What makes the tracks of the steps, and of the values at them."""
-        maps = range(len(recording.agents) if self._scene and self._scene.placements else 0)
-        for phase in (phase for phase, spans in selection.by_phase.items() if spans):
-            values: list[ValueTracks | MapTracks] = [ValueTracks(source.root, phase, labels)]
-            values += [MapTracks(source.root, phase, labels, i) for i in maps]
-            self._phases[phase] = StepTracks(source.root, phase, source.title, labels), values
+        self._is_job = recording.has_tables
+        self._loop = None if self._is_job else LoopTracks(writer, selection, trust, stage)
+        scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
+        self._steps: dict[str, StepTracks] = {}
+        self._values: dict[str, list[ValueTracks | MapTracks]] = {}
+        """Makers of the tracks of each phase: of the steps, and of the Q-values at them."""
+        if self._is_job:
+            reports = [*recording.train.all_metrics()[-1:], *recording.eval.all_metrics()[-1:]]
+            steps = sum(phase.steps.count() for phase in recording.phases)
+            writer.last = max([steps, *(row["log_time"] // schema.STEP_NANOSECONDS for row in reports)])
+        if not (selection.steps and (scene or self._is_job)):
+            return
+        bounds = [0.0, *(b for q in recording.snapshots() for b in (q.values.min(), q.values.max()))]
+        labels = self._labels = Labels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
+        for phase, spans in selection.by_phase.items():
+            if spans:
+                self._steps[phase] = StepTracks(root, phase, source.title, labels)
+            if spans and self._is_job:
+                maps = range(len(recording.agents) if scene and scene.placements else 0)
+                self._values[phase] = [
+                    ValueTracks(root, phase, labels),
+                    *(MapTracks(root, phase, labels, learner) for learner in maps),
+                ]
 
     def overview(self) -> Iterator[Track]:
-        """Yield all metrics, and what never changes of the steps."""
-        root = self._source.root
-        yield from metric_tracks(self._source)
-        if not self._phases:
+        """Yield everything but steps, and what never changes of them."""
+        root = self._root
+        yield from self._loop.overview() if self._loop else metric_tracks(self._source)
+        if not self._steps:
             return
         yield self._labels.track(root)
         if self._scene:
             view = grid_view(self._source.title, self._scene)
             yield from background(root, self._scene, view)
-            text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
-            yield Track(f"{root}/notice/text", static=[text], view=view)
-        for steps, values in self._phases.values():
-            yield Track(f"{steps.path}/events", view=EVENTS)
-            for maker in (steps, *values):
+            if self._is_job:
+                text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
+                yield Track(f"{root}/notice/text", static=[text], view=view)
+        for phase, steps in self._steps.items():
+            if self._is_job:
+                yield Track(f"{root}/{phase}/events", view=EVENTS)
+            for maker in (steps, *self._values.get(phase, ())):
                 yield from maker.still
 
     def steps(self) -> Iterator[Track]:
-        """Yield the selected steps."""
-        if not self._phases:
-            return
-        covered, reader = [], ValueReader(self._recording, self._scene)
-        for phase, (steps, values) in self._phases.items():
-            parts = [f"{steps.path}/{part}" for part in ("q", "map", "grid")]
-            names = [f"reward {spoken(name)}" for name in self._recording.agents]
+        """Yield the selected steps, then pictures that are drawn of them."""
+        covered, names = [], [f"reward {spoken(name)}" for name in self._recording.agents]
+        values = ValueReader(self._recording, self._scene) if self._values else None
+        for phase, spans in self._selection.by_phase.items():
+            path = f"{self._root}/{phase}"
             style, are_values_shown = [series_lines(names, phase_colours(phase, len(names)))], False
-            for batch in _prefetched(_batches(self._pieces(phase, reader))):
-                yield Track(f"{steps.path}/reward", batch.times(), scalars(batch.records["rewards"]), style)
-                yield from steps.of(batch)
+            batches = self._batches(phase, spans, values)
+            for batch in _prefetched(batches) if self._is_job else batches:
+                if self._loop:
+                    yield from self._loop.lines(phase, batch.records)
+                else:
+                    yield Track(f"{path}/reward", batch.times(), scalars(batch.records["rewards"]), style)
+                if phase in self._steps:
+                    yield from self._steps[phase].of(batch)
                 if len(batch.values):
-                    for shown in values:
-                        yield from shown.of(batch)
+                    for maker in self._values[phase]:
+                        yield from maker.of(batch)
                 elif are_values_shown:
-                    yield from cleared(parts[:2], [int(batch.times()["step"][0])])
+                    yield from cleared([f"{path}/q", f"{path}/map"], [int(batch.times()["step"][0])])
                 are_values_shown = len(batch.values) > 0
-            # the run's last step stays in view
-            yield from cleared(parts, [stop for _, stop in steps.covered if stop <= self.last])
-            covered += steps.covered
-        yield from self._notice(sorted(covered))
+            if phase in self._steps:
+                parts = ("q", "map", "grid") if self._is_job else ("grid",)
+                stretches = self._steps[phase].covered
+                # A job's last step stays in view.
+                stops = [stop for _, stop in stretches if not self._is_job or stop <= self._writer.last]
+                yield from cleared([f"{path}/{part}" for part in parts], stops)
+                covered += stretches
+        if self._loop:
+            yield from self._loop.drawn_frames()
+        else:
+            yield from self._notice(sorted(covered))
 
-    def _pieces(self, phase: str, reader: ValueReader) -> Iterator[Batch]:
-        """Yield the steps of a phase, at most a batch at a time, after checking them."""
-        recording, selection = self._recording, self._selection
-        spans = [(None, span) for span in selection.train] if phase == "train" else selection.evaluations
-        for evaluation, span in spans:
-            for block in recording.phase(phase).steps.blocks(span.start, span.stop):
-                for start in range(0, len(block), MAX_ROWS):
-                    part = block[start : start + MAX_ROWS]
-                    check_steps(part, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
-                    yield from reader.batches(part, evaluation)
+    def _batches(self, phase: str, spans: Sequence[range], values: ValueReader | None) -> Iterator[Batch]:
+        """Yield the steps of a phase after checking them, at most a batch of each environment at a time."""
+        recording, train = self._recording, episodes_of(self._recording, "train")
+        trials = int(recording.config["evaluation"]["trials"]) if self._is_job else 2**63 - 1
+        for steps in self._blocks(phase, spans):
+            if self._steps:
+                check_steps(steps, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
+            trained, episode = (steps[name].astype(np.int64) for name in ("step", "episode"))
+            number = episode
+            if phase == "eval":  # shown by the training episodes before it
+                number = episode % trials
+                trained = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS - 1 - trained
+                episode = np.searchsorted(train.stop[: train.ended], trained, side="right")
+            if values is None:
+                yield Batch(steps, episode, number)
+            else:
+                yield from values.batches(phase, steps, episode, number, trained)
 
-    def _notice(self, covered: list[tuple[int, int]]) -> Iterator[Track]:
+    def _blocks(self, phase: str, spans: Sequence[range]) -> Iterator[Records]:
+        """Yield the steps of a phase in blocks of bounded size; values that vary in size as they are read."""
+        table, n = self._recording.phase(phase).steps, self._recording.environments
+        limit = max(1, min(MAX_ROWS * n, _BATCH_BYTES // table.row_dtype.itemsize))
+        waiting: list[Records] = []
+        for block in (block for span in spans for block in table.numbered(span)):
+            steps = taken(block)
+            for start in range(0, len(steps), limit):
+                part = steps[start : start + limit]
+                if waiting and (table.dtype is None or sum(map(len, waiting)) + len(part) > limit):
+                    yield np.concatenate(waiting)
+                    waiting = []
+                waiting.append(part)
+        if waiting:
+            yield np.concatenate(waiting)
+
+    def _notice(self, covered: Sequence[tuple[int, int]]) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""
-        starts, stops = [0, *(stop for _, stop in covered)], [*(start for start, _ in covered), self.last + 1]
+        last = self._writer.last
+        starts, stops = [0, *(stop for _, stop in covered)], [*(start for start, _ in covered), last + 1]
         gaps = [(start, stop) for start, stop in zip(starts, stops, strict=True) if max(start, 1) < stop]
-        if self._scene is None or not gaps:
+        if self._scene is None or not self._steps or not gaps:
             return
-        entity, begins = f"{self._source.root}/notice/text", {"step": np.array([start for start, _ in gaps])}
+        entity, begins = f"{self._root}/notice/text", {"step": np.array([start for start, _ in gaps])}
         words = ["no steps of this time were exported"] * len(gaps)
         yield text_track(entity, begins, (self._scene.columns / 2, self._scene.rows / 2), words)
-        yield from cleared([entity], [stop for _, stop in gaps if stop <= self.last])
+        yield from cleared([entity], [stop for _, stop in gaps if stop <= last])
 
 
 def _prefetched(items: Iterable[T]) -> Iterator[T]:
@@ -125,16 +167,3 @@ def _prefetched(items: Iterable[T]) -> Iterator[T]:
         while (item := following.result()) is not None:
             following = executor.submit(next, iterator, None)
             yield item
-
-
-def _batches(pieces: Iterable[Batch]) -> Iterator[Batch]:
-    """Yield the pieces combined to larger batches, in each of which all values are known or none are."""
-    waiting: list[Batch] = []
-    for piece in pieces:
-        is_full = sum(len(one.records) for one in waiting) + len(piece.records) > MAX_ROWS
-        if waiting and (is_full or bool(len(waiting[-1].values)) != bool(len(piece.values))):
-            yield Batch(*map(np.concatenate, zip(*waiting, strict=True)))
-            waiting = []
-        waiting.append(piece)
-    if waiting:
-        yield Batch(*map(np.concatenate, zip(*waiting, strict=True)))

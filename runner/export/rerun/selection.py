@@ -76,12 +76,14 @@ class Episodes:
     def steps_of(self, numbers: Ints) -> list[range]:
         """Return the steps of these episodes; those that follow each other, or overlap, are one range."""
         joined: list[range] = []
-        starts, stops = self.start[numbers], self.stop[numbers]
-        for k in np.argsort(starts, kind="stable").tolist():
-            start, stop = int(starts[k]), int(stops[k])
+        for start, stop in sorted(
+            zip(self.start[numbers].tolist(), self.stop[numbers].tolist(), strict=True)
+        ):
             if joined and start <= joined[-1].stop:
-                start, stop = joined[-1].start, max(stop, joined.pop().stop)
-            joined.append(range(start, stop))
+                before = joined.pop()
+                joined.append(range(before.start, max(stop, before.stop)))
+            else:
+                joined.append(range(start, stop))
         return joined
 
 
@@ -89,10 +91,8 @@ class Episodes:
 class Selection:
     """The selected steps, and the messages for the user about them."""
 
-    train: list[range] = field(default_factory=list)
-    """The numbers of the steps of successive whole episodes."""
-    evaluations: list[tuple[Evaluation, range]] = field(default_factory=list)
-    """Evaluations with their steps; the last steps of a loop's are one, whose other fields are 0."""
+    by_phase: dict[str, list[range]] = field(default_factory=lambda: {phase: [] for phase in schema.PHASES})
+    """The numbers of the steps, of successive whole episodes as far as they are one range."""
     drawn: dict[str, list[int]] = field(default_factory=dict)
     """Episodes of a loop of which pictures are drawn, by phase."""
     focus: tuple[int, int] | None = None
@@ -100,11 +100,6 @@ class Selection:
     exported: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-
-    @property
-    def by_phase(self) -> dict[str, list[range]]:
-        """The selected steps of each phase."""
-        return {"train": self.train, "eval": [steps for _, steps in self.evaluations]}
 
     @property
     def steps(self) -> int:
@@ -135,27 +130,23 @@ def select(recording: Recording, request: Request) -> Selection:
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     available = evaluations_with_steps(recording, train, evals)
     asked = {"train": _asked_episodes(recording, request, train.count), "eval": np.array(request.trials, int)}
-    evaluations = [
+    chosen = [
         evaluation_after(available, after, str(recording.path)) for after in sorted(set(request.evaluations))
     ]
     if not request.everything:
-        trials = [asked["eval"]] if request.trials else [one.episodes for one in evaluations]
-        shown = {
-            "train": train.steps_of(asked["train"]),
-            "eval": evals.steps_of(np.concatenate([_NONE, *trials])),
-        }
+        trials = asked["eval"] if request.trials else _trials(chosen)
+        shown = {"train": train.steps_of(asked["train"]), "eval": evals.steps_of(trials)}
         selection.focus = _focus(recording, shown)
     numbers = asked["train"]
     if request.is_default:
         numbers = np.union1d(numbers, _default_episodes(train.lengths))
-    selection.train = train.steps_of(numbers)
     if is_job:
-        evaluations += available if request.everything else available[-1:] if request.is_default else []
-        evaluations = [one for one in available if one in evaluations]
-    selection.evaluations = [(one, steps) for one in evaluations for steps in evals.steps_of(one.episodes)]
+        chosen += available if request.everything else available[-1:] if request.is_default else []
+        chosen = [evaluation for evaluation in available if evaluation in chosen]
+    selection.by_phase = {"train": train.steps_of(numbers), "eval": evals.steps_of(_trials(chosen))}
     if is_job:
-        _describe_job(selection, request, numbers, train.count, available, evaluations)
-        if unknown := _steps_without_values(recording, selection.train):
+        _describe_job(selection, request, numbers, train.count, available, chosen)
+        if unknown := _steps_without_values(recording, selection.by_phase["train"]):
             selection.warnings.append(
                 f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
                 "lost, and the Q-tables are unknown until the next snapshot."
@@ -206,6 +197,11 @@ def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episode
 def time_of(recording: Recording, phase: str, step: int) -> int:
     """Return where a step of a phase is on the timeline."""
     return int(recording.phase(phase).steps.one(step)["log_time"]) // schema.STEP_NANOSECONDS
+
+
+def _trials(evaluations: Sequence[Evaluation]) -> Ints:
+    """Return the numbers of the trials of some evaluations."""
+    return np.concatenate([_NONE, *(evaluation.episodes for evaluation in evaluations)])
 
 
 def _focus(recording: Recording, shown: Mapping[str, Sequence[range]]) -> tuple[int, int] | None:
@@ -285,15 +281,13 @@ def _complete_loop(
 ) -> None:
     """Add all steps of a loop if there are few, its last steps of evaluation, and episodes to draw."""
     total, tested = (phase.steps.count() if phase.steps else 0 for phase in recording.phases)
-    limit = total if request.everything else DEFAULT_STEPS
-    if request.everything or (request.is_default and total <= limit):
-        selection.train = [range(min(total, limit))] if total else []
+    if total and (request.everything or (request.is_default and total <= DEFAULT_STEPS)):
+        selection.by_phase["train"] = [range(total)]
     if request.frames:
         _select_drawn(recording, request, selection, asked)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
-    earlier = [(one, range(steps.start, min(steps.stop, first))) for one, steps in selection.evaluations]
-    spans = [*earlier, (Evaluation(0, 0, 0, 0), range(first, tested))]
-    selection.evaluations = [(one, steps) for one, steps in spans if steps]
+    earlier = [range(steps.start, min(steps.stop, first)) for steps in selection.by_phase["eval"]]
+    selection.by_phase["eval"] = [steps for steps in (*earlier, range(first, tested)) if steps]
     trained, evaluated = (sum(map(len, spans)) for spans in selection.by_phase.values())
     environments = f" in {recording.environments} environments" if recording.environments > 1 else ""
     of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""

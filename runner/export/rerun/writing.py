@@ -12,8 +12,7 @@ import rerun as rr
 
 from runner.drawing import palette
 from runner.export.rerun.layout import blueprint
-from runner.export.rerun.loops import LoopReader
-from runner.export.rerun.runs import JobReader
+from runner.export.rerun.runs import RunReader
 from runner.export.rerun.selection import Request, Selection, select
 from runner.export.rerun.tracks import Source, Writer, new_stream
 from runner.recording.reader import Recording
@@ -29,14 +28,10 @@ def export(
     stream = new_stream("-".join(source.recording.run_id for source in sources))
     with _saved(stream, path):
         stream.send_recording_name(" and ".join(source.title for source in sources))
-        readers: list[tuple[Writer, JobReader | LoopReader]] = []
+        readers = []
         for source, selection in zip(sources, selections, strict=True):
-            reader = (
-                JobReader(source, selection)
-                if source.recording.has_tables
-                else LoopReader(source, selection, request.trust, stage)
-            )
-            readers.append((Writer(stream, source, selection.focus, reader.last), reader))
+            writer = Writer(stream, source, selection.focus)
+            readers.append((writer, RunReader(writer, selection, request.trust, stage)))
         for writer, reader in readers:
             writer.send(reader.overview())
         writers = [writer for writer, _ in readers]

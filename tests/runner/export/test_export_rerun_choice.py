@@ -37,10 +37,11 @@ class TestSelection:
 
     def test_default_is_a_spread_and_the_last_evaluation(self, rivals):
         selection = select(rivals, Request())
-        assert selection.train[0].start == 0
-        last = selection.train[-1]
+        train = selection.by_phase["train"]
+        assert train[0].start == 0
+        last = train[-1]
         assert last.stop == rivals.train.steps.count()
-        assert [one.after for one, _ in selection.evaluations] == [40]
+        assert "(after 40 episodes)" in selection.exported[1]
         assert "20 of 40 training episodes, evenly spread from 0 to 39" in selection.exported[0]
         assert any("--all" in left and "20 training episodes" in left for left in selection.left_out)
         assert any("--evaluations 20" in left for left in selection.left_out)
@@ -56,8 +57,8 @@ class TestSelection:
         selection = select(rivals, request)
         lengths = episodes_of(rivals, "train").lengths
         wanted = [0, 1, 15, 30, 38, 39]
-        assert sum(s.stop - s.start for s in selection.train) == lengths[wanted].sum()
-        assert [one.after for one, _ in selection.evaluations] == [20]
+        assert sum(s.stop - s.start for s in selection.by_phase["train"]) == lengths[wanted].sum()
+        assert "(after 20 episodes)" in selection.exported[1]
 
     @pytest.mark.parametrize("ranges", [((40, 41),), ((3, 3),), ((0, 41),), ((50, None),)])
     def test_episodes_that_do_not_exist(self, rivals, ranges):
@@ -75,7 +76,7 @@ class TestSelection:
         location = locate(run, Request(), EpisodeRef(7, 2))
         with open_recording(run.recording) as recording:
             step = recording.train.episode_steps(7)[2]
-            spans = select(recording, location.request).train
+            spans = select(recording, location.request).by_phase["train"]
         assert location.time == step["log_time"] // schema.STEP_NANOSECONDS
         assert any(span.start <= step["step"] < span.stop for span in spans)
         with pytest.raises(RecordingError, match="no t = 999"):

@@ -13,9 +13,9 @@ from runner.drawing.palette import COMPARED
 from runner.environments.mdp import events_of
 from runner.export.rerun.labels import Labels
 from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.runs import Source
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Request
+from runner.export.rerun.tracks import Source
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import export
 from runner.recording import schema

@@ -20,8 +20,8 @@ from runner.export.pictures import Pictures
 from runner.export.pictures import Source as PictureSource
 from runner.export.rerun import selection
 from runner.export.rerun.location import locate
-from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request, select
+from runner.export.rerun.tracks import Source
 from runner.export.rerun.writing import export, export_runs
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
@@ -148,7 +148,7 @@ def test_episodes_of_a_vector_are_selected_and_located(tmp_path):
     run = record_poles(tmp_path)
     with open_recording(run.recording) as recording:
         span = recording.train.episode(4).numbers()
-        (chosen,) = select(recording, Request(episodes=((4, 5),))).train
+        (chosen,) = select(recording, Request(episodes=((4, 5),))).by_phase["train"]
         assert chosen.start <= span[0] < span[-1] < chosen.stop
         assert chosen.start % N == chosen.stop % N == 0
         assert chosen.stop - chosen.start < len(span) * N + N
@@ -289,8 +289,8 @@ def test_evaluations_of_a_loop_are_selected_by_number(tmp_path, monkeypatch):
     with open_recording(env.run.recording) as recording:
         spans = [recording.eval.episode(number).numbers() for number in range(3)]
         chosen = select(recording, Request(evaluations=(1,)))
-        assert set(spans[1]) <= {step for _, steps in chosen.evaluations for step in steps}
-        assert not set(spans[0]) & {step for _, steps in chosen.evaluations for step in steps}
+        assert set(spans[1]) <= {step for steps in chosen.by_phase["eval"] for step in steps}
+        assert not set(spans[0]) & {step for steps in chosen.by_phase["eval"] for step in steps}
         with pytest.raises(RecordingError, match="found no evaluation after 7 episodes"):
             select(recording, Request(evaluations=(7,)))
     assert locate(env.run, Request(), EpisodeRef(0, 1, 0)).request.evaluations == (0,)

@@ -19,8 +19,8 @@ from rerun.chunk import RrdReader
 import runner
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.execution.verify import verify
-from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request
+from runner.export.rerun.tracks import Source
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record

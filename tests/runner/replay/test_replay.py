@@ -12,8 +12,8 @@ from rerun.chunk import RrdReader
 from runner.archive.writing import write_archive
 from runner.cli import cli
 from runner.errors import RecordingError
-from runner.export.rerun.runs import Source
 from runner.export.rerun.selection import Request
+from runner.export.rerun.tracks import Source
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
