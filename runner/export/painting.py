@@ -1,6 +1,7 @@
 """The pictures of an episode's states, by what they are made from: T + 1 of them for an episode of T steps.
 
 Each function is a generator of pictures, uint8 [height, width, 3] of one size; close it to free what it uses.
+`seen` are the steps of the episode as `observations_of` yields them, one for each picture.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from runner.drawing import svg
 from runner.drawing.bars import BarRaster
 from runner.drawing.raster import Pixels, SceneRaster
 from runner.errors import CannotRedo, RecordingError
-from runner.export.values import Values, observations_of
+from runner.export.values import Seen, Values, observations_of
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
@@ -35,7 +36,7 @@ MAX_PIXELS: Final = 4096 * 4096
 Painted = Generator[Pixels, None, None]
 
 
-def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
+def paint_scene(recording: Recording, seen: Iterator[Seen]) -> Painted:
     """Draw the scene in each state, with the way that led there."""
     mdp = recording.mdp
     drawing = svg.drawing_of(mdp)
@@ -43,16 +44,17 @@ def paint_scene(recording: Recording, phase: str, episode: int) -> Painted:
     raster = SceneRaster(drawing, SCENE_SIZE, SCENE_SIZE)
     places: deque[NDArray[np.int16]] = deque(maxlen=svg.TRAIL)
     first = least_number(recording.spaces["observation"])
-    for observation, _ in observations_of(recording, phase, episode):
+    for observation, _ in seen:
         places.append(drawing.places(mdp, np.array([observation]) - first)[0])
         yield raster.draw(np.stack(places))
 
 
-def paint_recorded(recording: Recording, phase: str, episode: int) -> Painted:
+def paint_recorded(recording: Recording, phase: str, episode: int, seen: Iterator[Seen]) -> Painted:
     """Show the last frame that was recorded up to each step."""
     last: Message = {}
     shown: Pixels | None = None
-    for frame in recorded_frames(recording, phase, episode):
+    steps = (step for _, step in seen if step is not None)
+    for frame in recorded_frames(recording, phase, episode, steps=steps):
         if shown is None or frame is not last:
             where = f"{recording.path}: the frame at {frame['log_time']} ns"
             last, shown = frame, _like(np.asarray(decoded(frame["data"], where)), shown)
@@ -137,10 +139,10 @@ def redrawn(
                 )
 
 
-def paint_observation(recording: Recording, phase: str, episode: int) -> Painted:
+def paint_observation(recording: Recording, seen: Iterator[Seen]) -> Painted:
     """Show the image in each observation; if the first was lost, the second in its place."""
     values, lost = Values(recording.spaces["observation"], "observation"), 0
-    for observation, _ in observations_of(recording, phase, episode):
+    for observation, _ in seen:
         if observation is None:
             lost = 1
             continue
@@ -149,23 +151,26 @@ def paint_observation(recording: Recording, phase: str, episode: int) -> Painted
         lost = 0
 
 
-def paint_values(recording: Recording, phase: str, episode: int) -> Painted:
-    """Draw the numbers of each observation and the rewards as bars, each on a scale of its own."""
+def paint_values(recording: Recording, phase: str, episode: int, seen: Iterator[Seen]) -> Painted:
+    """Draw the numbers of each observation and the rewards as bars, each on a scale of its own.
+
+    The steps are read once more before, for the scales.
+    """
     learners = recording.agents
     values = Values(recording.spaces["observation"], "state" if recording.has_states else "observation")
     names = [*values.names, *([f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"])]
     unknown, unpaid = np.full(len(values.names), np.nan), np.full(len(learners), np.nan)
 
-    def numbers() -> Iterator[NDArray[np.float64]]:
-        for observation, step in observations_of(recording, phase, episode):
+    def numbers(steps: Iterator[Seen]) -> Iterator[NDArray[np.float64]]:
+        for observation, step in steps:
             own = unknown if observation is None else values.numbers_in(observation)
             yield np.append(own, unpaid if step is None else step["rewards"])
 
     low = np.zeros(len(names))
     high = low
-    for now in numbers():
+    for now in numbers(observations_of(recording, phase, episode)):
         finite = np.where(np.isfinite(now), now, np.nan)
         low, high = np.fmin(low, finite), np.fmax(high, finite)
     raster = BarRaster(names, low, high)
-    for now in numbers():
+    for now in numbers(seen):
         yield raster.draw(now)

@@ -11,12 +11,12 @@ observations that are images; or else the numbers of the observations as bars.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import chain, islice
-from typing import Final, NamedTuple
+from itertools import tee
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from runner.export.painting import (
     paint_scene,
     paint_values,
 )
-from runner.export.values import Values, observations_of, observed, step_actions_in_words
+from runner.export.values import Seen, Values, observations_of, observed, step_actions_in_words
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value
 from runner.replay.makers import why_not_rerun
@@ -88,12 +88,17 @@ class Picture(Moment):
     """Why no picture follows although steps do; else empty."""
 
 
-def moments_of(recording: Recording, phase: str, episode: int) -> Iterator[Moment]:
-    """Yield T + 1 moments of an episode of T steps: after the reset, and after each step."""
+def moments_of(
+    recording: Recording, phase: str, episode: int, seen: Iterator[Seen] | None = None
+) -> Iterator[Moment]:
+    """Yield T + 1 moments of an episode of T steps: after the reset, and after each step.
+
+    `seen` are the steps of the episode as `observations_of` yields them, if they are read already.
+    """
     describe, steps = describer(recording, phase), len(recording.phase(phase).episode(episode))
     returns = np.zeros(len(recording.agents))
     unpaid = tuple(returns.tolist())
-    for t, (observation, step) in enumerate(observations_of(recording, phase, episode)):
+    for t, (observation, step) in enumerate(seen or observations_of(recording, phase, episode)):
         if step is None:
             yield Moment(t, observation, "", unpaid, unpaid, "", "")
             continue
@@ -130,12 +135,13 @@ class Pictures:
     def __init__(self, recording: Recording, phase: str, episode: int, trust: bool = False) -> None:
         require_packages()
         require_steps(recording, "show", may_redo=True)
-        self._recording, self._phase, self._episode = recording, phase, episode
         self.learners = recording.agents
         self.steps = len(recording.phase(phase).episode(episode))
-        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust)
+        # Read once: what draws the pictures takes the steps at the same time as their descriptions do.
+        seen, shown = tee(observations_of(recording, phase, episode))
+        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust, seen=shown)
         self.note = ""
-        self._pictures = self._generate()
+        self._pictures = self._generate(moments_of(recording, phase, episode, seen))
 
     def __iter__(self) -> Iterator[Picture]:
         return self
@@ -148,9 +154,9 @@ class Pictures:
         self._pictures.close()
         self._painted.close()
 
-    def _generate(self) -> Generator[Picture, None, None]:
+    def _generate(self, moments: Iterator[Moment]) -> Generator[Picture, None, None]:
         pixels = next(self._painted)
-        for moment in moments_of(self._recording, self._phase, self._episode):
+        for moment in moments:
             try:
                 pixels = next(self._painted) if moment.t else pixels
             except CannotRedo as error:
@@ -189,14 +195,6 @@ def source_of_recorded(recording: Recording, phase: str, episode: int | None) ->
     return Source.OBSERVATION if has_image else Source.VALUES
 
 
-_PAINTERS: Final = {
-    Source.SCENE: paint_scene,
-    Source.RECORDED: paint_recorded,
-    Source.OBSERVATION: paint_observation,
-    Source.VALUES: paint_values,
-}
-
-
 class Painting(NamedTuple):
     """The painted states of an episode."""
 
@@ -208,26 +206,45 @@ class Painting(NamedTuple):
     pictures: Painted
 
 
-def paint(recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0) -> Painting:
-    """Return the painted states of an episode from number `first` on, of the best source that works."""
+def paint(
+    recording: Recording,
+    phase: str,
+    episode: int,
+    trust: bool = False,
+    first: int = 0,
+    seen: Iterator[Seen] | None = None,
+) -> Painting:
+    """Return the painted states of an episode from number `first` on, of the best source that works.
+
+    `seen` are the steps from there on as `observations_of` yields them, if they are read already.
+    """
     source, reason = source_of(recording, phase, trust, episode)
     has_failed = False
     if source is Source.REDRAWN:
         redrawn = paint_redrawn(recording, phase, episode, trust, first)
         try:
-            begun = chain([next(redrawn)], redrawn)
-            return Painting(source, "", has_failed, _ending_with(redrawn, begun))
+            return Painting(source, "", has_failed, _continued(next(redrawn), redrawn))
         except CannotRedo as error:
             redrawn.close()
             source, reason, has_failed = source_of_recorded(recording, phase, episode), str(error), True
-    painted = _PAINTERS[source](recording, phase, episode)
-    return Painting(source, reason, has_failed, _ending_with(painted, islice(painted, first, None)))
+    seen = seen or observations_of(recording, phase, episode, first)
+    match source:
+        case Source.SCENE:
+            painted = paint_scene(recording, seen)
+        case Source.RECORDED:
+            painted = paint_recorded(recording, phase, episode, seen)
+        case Source.OBSERVATION:
+            painted = paint_observation(recording, seen)
+        case _:
+            painted = paint_values(recording, phase, episode, seen)
+    return Painting(source, reason, has_failed, painted)
 
 
-def _ending_with(painted: Painted, pictures: Iterable[Pixels]) -> Painted:
-    """Yield pictures taken from painted ones; closing them closes those too."""
+def _continued(first: Pixels, painted: Painted) -> Painted:
+    """Yield a picture and those after it; closing them closes what paints them."""
     with closing(painted):
-        yield from pictures
+        yield first
+        yield from painted
 
 
 def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, str]]:

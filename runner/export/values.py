@@ -21,6 +21,8 @@ from runner.util.arrays import Records
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
+Seen = tuple[Value | None, Step | None]
+"""An observation, and the step that led to it; none for the observation after a reset."""
 FEW: Final = 8
 """Arrays of at most this number of numbers are written out in words."""
 _LEAST_SIDE: Final = 16
@@ -90,23 +92,22 @@ def _decoded(recording: Recording, space: str, values: Value) -> Value:
     return values
 
 
-def observations_of(
-    recording: Recording, phase: str, episode: int
-) -> Iterator[tuple[Value | None, Step | None]]:
-    """Yield the observation before an episode, without a step, then each step's with the step.
+def observations_of(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Seen]:
+    """Yield what was observed after each step of an episode, from the observation after `start` steps on.
 
-    The first one is None if it was lost.
+    The first one, without a step, is None if it was lost.
 
     Raises:
         RecordingError: there is no such episode, or a step has a state that the environment does not have.
     """
-    for t, step in enumerate(transitions_of(recording, phase, episode)):
+    first = max(0, start - 1)
+    for t, step in enumerate(transitions_of(recording, phase, episode, first), first):
         if recording.tabular:
             where, name = str(recording.path), schema.PHASE_NAMES[phase]
             check_steps(np.asarray(step).reshape(1), recording.mdp, where, name)
-        if t == 0 and recording.has_states:
+        if start == 0 and t == 0 and recording.has_states:
             yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None
-        elif t == 0:
+        elif start == 0 and t == 0:
             reset = reset_of(recording, phase, episode)
             yield None if reset is None else reset.value(recording), None
         yield observed(recording, step), step

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,28 +43,31 @@ def step_of_episode(recording: Recording, episode: int) -> int:
     return int(record[0]["last_step"]) + 1
 
 
-def transitions_of(recording: Recording, phase: str, episode: int) -> Iterator[Any]:
-    """Yield an episode's steps one by one, as `Phase.transitions` yields them; memory is bounded."""
+def transitions_of(recording: Recording, phase: str, episode: int, first: int = 0) -> Iterator[Any]:
+    """Yield an episode's steps from number `first` on, as `Phase.transitions` does; memory is bounded."""
     own = recording.phase(phase)
     if own.steps.dtype is not None:
-        for block in episode_blocks(recording, phase, episode):
+        for block in episode_blocks(recording, phase, episode, first):
             yield from block
         return
-    yield from own.transitions(episode)
+    yield from islice(own.transitions(episode), first, None)
 
 
-def episode_blocks(recording: Recording, phase: str, episode: int) -> Iterator[NDArray[np.void]]:
-    """Yield an episode's steps in blocks, where they have one size.
+def episode_blocks(
+    recording: Recording, phase: str, episode: int, first: int = 0
+) -> Iterator[NDArray[np.void]]:
+    """Yield an episode's steps from number `first` on in blocks, where they have one size.
 
     Raises:
         RecordingError: the recording has no such episode, or steps of it were lost.
     """
     own = recording.phase(phase)
     if own.steps.are_actions:
-        yield whole_steps(recording, phase, episode)
+        yield whole_steps(recording, phase, episode)[first:]
         return
-    steps, count = own.episode(episode), 0
-    for rows in steps.rows():
+    steps = own.episode(episode)
+    count = min(first, len(steps))
+    for rows in steps.rows(first):
         count += len(rows)
         yield rows
     if count != len(steps):
@@ -175,32 +179,41 @@ def first_of(recording: Recording, reset: RecordedReset) -> Value:
 # --- beside the steps ---------------------------------------------------------------------------------
 
 
-def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
+def recorded_frames(
+    recording: Recording, phase: str, episode: int, start: int = 0, steps: Iterable[Any] | None = None
+) -> Iterator[Message]:
     """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
 
     Args:
-        start: steps before the first one; 0 for the frame after the reset.
+        recording: the run.
+        phase: `train` or `eval`.
+        episode: its number in the phase.
+        start: steps before the first frame; 0 for the frame after the reset.
+        steps: the steps of the episode, if they are read already; then `start` is 0.
 
     Raises:
         RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
     """
-    steps = recording.phase(phase).episode(episode)
+    own = recording.phase(phase).episode(episode)
     first = max(0, start - frames_every(recording))
-    times = log_times_of(recording, phase, episode)
+    steps = transitions_of(recording, phase, episode, max(0, first - 1)) if steps is None else steps
+    times = (int(step["log_time"]) for step in steps)
     # The frames of a vector come at the end of a round.
-    turns = steps.table.round_of(steps.first)
-    later = (turns[-1] - steps.first) * schema.STEP_NANOSECONDS
+    turns = own.table.round_of(own.first)
+    later = (turns[-1] - own.first) * schema.STEP_NANOSECONDS
     reset = reset_of(recording, phase, episode) if first == 0 else None
-    begin = times[max(0, first - 1)] - len(turns) * schema.STEP_NANOSECONDS if reset is None else reset.time
+    if (earliest := next(times, None)) is None:
+        return
+    begin = earliest - len(turns) * schema.STEP_NANOSECONDS if reset is None else reset.time
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
         for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))
-        if frame_place(frame)[0] == steps.place
+        if frame_place(frame)[0] == own.place
     )
     shown, following = None, next(frames, None)
-    for t in range(first, len(steps) + 1):
+    after_steps = (time + later for time in chain([earliest], times))
+    for t, time in enumerate(after_steps if first else chain([earliest], after_steps), first):
         # After the reset there may be several, of which the last one shows the state; after a step one.
-        time = times[t - 1] + later if t else times[0]
         while following is not None and following[0] < time:
             shown, following = following[2], next(frames, None)
         if t and following is not None and following[0] == time and not following[1]:
