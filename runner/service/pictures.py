@@ -1,4 +1,4 @@
-"""Pictures of episodes for pages: streams of them, each made by a thread a little ahead of what is sent.
+"""Blocks of the pictures of episodes, made by streams: threads that are a little ahead of what is sent.
 
 An environment that is made again for an episode only goes forward, and takes a while to start. So a stream
 is kept for some seconds after a response, and the next request continues it; when nobody comes back, it is
@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import struct
+import math
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Generator, Hashable
+from collections import deque
+from collections.abc import Awaitable, Callable, Generator, Hashable
 from contextlib import closing
-from typing import Final
+from typing import Final, NamedTuple
 
 from runner.errors import RunnerError
 from runner.service.errors import Busy
@@ -28,16 +29,29 @@ AHEAD: Final = 32
 """Pictures that are made before they are requested."""
 _JOIN_SECONDS: Final = 1.0
 """How long the end of the service waits for a stream: an environment may hang."""
-_LENGTH: Final = struct.Struct(">I")
-_FAILED: Final = _LENGTH.pack(2**32 - 1)
-"""In place of a length: what follows is the reason why there are no further pictures."""
-
-_NOTE: Final = _LENGTH.pack(2**32 - 2)
-"""In place of a length: what follows is a note on all further pictures, after its length."""
+BLOCK_SECONDS: Final = 1.0
+"""A block has the pictures that are made this long after its first, so that slow ones are shown, too."""
+_LOOK_SECONDS: Final = 0.2
+"""How often a block that waits for a picture looks whether anybody still waits for the block."""
 _BUSY: Final = "the pictures of too many episodes are being made at the moment; try again."
 
 Make = Callable[[int], Generator[bytes | str, None, None]]
 """Returns the pictures of an episode from a step on, as `encoded_pictures` does."""
+Gone = Callable[[], Awaitable[bool]]
+"""Tells whether nobody waits for a response any more."""
+
+
+class Block(NamedTuple):
+    """Consecutive pictures."""
+
+    pictures: list[bytes]
+    """Without those that are the same as the one before."""
+    shown: list[int]
+    """The number of the picture at each step."""
+    note: str
+    """A sentence on all pictures; empty if they are of the best source."""
+    problem: str
+    """Why there are no further ones; empty if there are, or the episode is over."""
 
 
 class PictureStream:
@@ -50,11 +64,14 @@ class PictureStream:
         self.idle_since: float | None = None
         """None while a response is being sent."""
         self._last = b""
-        self._end: RunnerError | None = None
+        self._note = ""
+        self._problem = ""
+        """Why no pictures follow, unless the episode is over."""
         self._has_ended = False
         self.is_closed = False
         self._loop = asyncio.get_running_loop()
-        self._made: asyncio.Queue[bytes | str | RunnerError | None] = asyncio.Queue()
+        self._made: deque[bytes | str | RunnerError | None] = deque()
+        self._arrived = asyncio.Event()
         self._places = threading.Semaphore(AHEAD)
         self._thread = threading.Thread(target=self._work, args=(make, start), name="pictures", daemon=True)
         self._thread.start()
@@ -78,29 +95,46 @@ class PictureStream:
         """Wait for the thread to end, at most some seconds."""
         self._thread.join(seconds)
 
-    async def records(self, start: int, stop: int) -> AsyncIterator[bytes]:
-        """Yield the pictures from step `start` up to `stop`, as far as there are any, each after its length.
+    async def block(self, start: int, stop: int, is_gone: Gone) -> Block:
+        """Return the pictures from step `start` up to `stop`, as far as there are any.
 
-        One that is the same as the one before it has no bytes. `_FAILED` and the reason take the place of
-        those that cannot be made.
+        Those are left out that take long after the first, and all if nobody waits for them.
         """
-        while self.next < stop and not self._has_ended:
-            made = await self._made.get()
-            if isinstance(made, bytes):
-                self._places.release()
-                self._last = made or self._last
-                number, self.next = self.next, self.next + 1
-                if number >= start:
-                    data = self._last if number == start else made
-                    yield _LENGTH.pack(len(data)) + data
-            elif isinstance(made, str):
-                self._places.release()
-                note = made.encode(errors="replace")
-                yield _NOTE + _LENGTH.pack(len(note)) + note
+        pictures: list[bytes] = []
+        shown: list[int] = []
+        end = math.inf
+        while self.next < stop and not self._has_ended and time.monotonic() < end:
+            if self._made:
+                number = self.next
+                made = self._take()
+                if number >= start and made is not None:
+                    if made or not shown:
+                        pictures.append(self._last)
+                    shown.append(len(pictures) - 1)
+                    end = min(end, time.monotonic() + BLOCK_SECONDS)
+            elif await is_gone():
+                break
             else:
-                self._has_ended, self._end = True, made
-        if self._end is not None:
-            yield _FAILED + str(self._end).encode(errors="replace")
+                self._arrived.clear()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._arrived.wait(), _LOOK_SECONDS)
+        return Block(pictures, shown, self._note, self._problem if self.next < stop else "")
+
+    def _take(self) -> bytes | None:
+        """Take what was made next; return a picture, empty if it is the one before; None if it is none."""
+        made = self._made.popleft()
+        if isinstance(made, bytes | str):
+            self._places.release()
+        if isinstance(made, bytes):
+            self.next += 1
+            is_same = made in (b"", self._last)
+            self._last = made or self._last
+            return b"" if is_same else made
+        if isinstance(made, str):
+            self._note = made
+        else:
+            self._has_ended, self._problem = True, str(made or "")
+        return None
 
     def _work(self, make: Make, start: int) -> None:
         end: RunnerError | None = None
@@ -123,8 +157,9 @@ class PictureStream:
         self._put(end)
 
     def _put(self, made: bytes | str | RunnerError | None) -> None:
+        self._made.append(made)
         if not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._made.put_nowait, made)
+            self._loop.call_soon_threadsafe(self._arrived.set)
 
 
 class PictureStreams:
@@ -165,11 +200,15 @@ class PictureStreams:
         self._streams.append(stream)
         return stream
 
-    async def send(self, stream: PictureStream, start: int, stop: int) -> AsyncIterator[bytes]:
-        """Yield the records of a stream, and keep it for the next request."""
+    async def block(self, key: Hashable, make: Make, start: int, stop: int, is_gone: Gone) -> Block:
+        """Return a block of the pictures of an episode, and keep their stream for the next one.
+
+        Raises:
+            Busy: there are too many.
+        """
+        stream = self.open(key, make, start)
         try:
-            async for record in stream.records(start, stop):
-                yield record
+            return await stream.block(start, stop, is_gone)
         finally:
             self._keep(stream)
 

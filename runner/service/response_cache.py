@@ -58,11 +58,14 @@ class ResponseCache:
 
     def _store(self, key: Hashable, done: asyncio.Future[bytes]) -> None:
         del self._pending[key]
-        if done.cancelled() or done.exception() is not None:
-            return
+        if not done.cancelled() and done.exception() is None:
+            self.keep(key, done.result())
+
+    def keep(self, key: Hashable, body: bytes) -> None:
+        """Keep the response of a key."""
         self._drop(key)
-        self._responses[key] = _Response(done.result(), time.monotonic())
-        self._bytes += len(done.result())
+        self._responses[key] = _Response(body, time.monotonic())
+        self._bytes += len(body)
         while self._bytes > self._max_bytes and self._responses:
             self._drop(next(iter(self._responses)))
 

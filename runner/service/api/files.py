@@ -170,10 +170,15 @@ def tag_of(run: Run) -> str:
     return f"{run.summary.get('content_digest') or 'unfinished'}-{size:x}-{changed:x}"
 
 
+def is_known(tag: str, if_none_match: str | None) -> bool:
+    """Return whether a client has what has this ETag."""
+    tags = [part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")]
+    return f'"{tag}"' in tags or "*" in tags
+
+
 def _file(path: pathlib.Path, name: str, tag: str, if_none_match: str | None) -> Response:
     headers = {"etag": f'"{tag}"', "accept-ranges": "bytes"}
-    tags = [part.strip().removeprefix("W/") for part in (if_none_match or "").split(",")]
-    if f'"{tag}"' in tags or "*" in tags:
+    if is_known(tag, if_none_match):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
     return _File(path, media_type=MEDIA, filename=name, headers=headers)
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Awaitable, Callable, Hashable
 from functools import partial
+from http import HTTPStatus
 from typing import Annotated, Final, NamedTuple
 
-from fastapi import APIRouter, Depends, Query, Response
-from fastapi.responses import StreamingResponse
+from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
@@ -19,9 +20,18 @@ from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import fragments
-from runner.service.dependencies import EPISODES, ComputationOf, PicturesOf, RecordedRun, recording_state
-from runner.service.pictures import Make, PictureStreams
+from runner.service.api.files import IfNoneMatch, is_known, tag_of
+from runner.service.dependencies import (
+    EPISODES,
+    CacheOf,
+    ComputationOf,
+    PicturesOf,
+    RecordedRun,
+    recording_state,
+)
+from runner.service.pictures import Block, Make, PictureStreams
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
+from runner.util import __version__
 
 router = APIRouter(
     prefix="/runs/{run}/replay",
@@ -72,22 +82,35 @@ def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: 
         summary=f"The pictures of a {kind}.",
     )
     async def pictures(
+        request: Request,
         run: RecordedRun,
         streams: PicturesOf,
+        cache: CacheOf,
         at: EpisodeRef = Depends(episode),  # noqa: B008
         start: Start = 0,
         steps: Pictures = PICTURES,
+        if_none_match: IfNoneMatch = None,
     ) -> Response:
-        """Return the pictures from a step on: recorded frames, or drawn by the environment, made again.
+        """Return a block of pictures: recorded frames, or drawn by the environment, made again.
 
-        Each is preceded by its length in bytes, 32 bits, big-endian; length 0 stands for the same as before.
-        The length 2^32 - 1 is followed by the reason, as text, why there are no further pictures; 2^32 - 2 by
-        the length and the text of a note on the pictures.
+        The length of the head (32 bits, big-endian) is followed by the head, JSON, and by the pictures. In
+        the head `sizes` has the bytes of each picture, and `shown` the number of the picture at each step
+        from `start` on; `last` is the last step of the episode, `note` a sentence on all pictures, `problem`
+        the reason why there are no further ones. A block may have fewer pictures than were asked for, if they
+        take long to make. One that has them all has an ETag.
         """
         pictured = await run_in_threadpool(_pictured_episode, run, at)
         stop = min(start + steps, pictured.length + 1)
-        stream = streams.open(pictured.key, pictured.make, start)
-        return StreamingResponse(streams.send(stream, start, stop), media_type=OCTETS)
+        tag = f"{pictured.tag}-{start}-{stop}"
+        if is_known(tag, if_none_match):
+            return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={"etag": f'"{tag}"'})
+        if (body := cache.get(tag)) is None:
+            block = await streams.block(pictured.key, pictured.make, start, stop, request.is_disconnected)
+            body = _encoded(block, pictured.length)
+            if len(block.shown) < stop - start or block.note:
+                return Response(body, media_type=OCTETS)
+            cache.keep(tag, body)
+        return Response(body, media_type=OCTETS, headers={"etag": f'"{tag}"'})
 
 
 for (_path, _episode), _kind in zip(EPISODES.items(), ("training episode", "trial"), strict=True):
@@ -102,8 +125,17 @@ async def prepare_pictures(run: Run, streams: PictureStreams, at: EpisodeRef) ->
             streams.prepare(episode.key, episode.make, at.t)
 
 
+def _encoded(block: Block, last: int) -> bytes:
+    """Return a block as a page takes it."""
+    head = {"sizes": list(map(len, block.pictures)), "shown": block.shown, "last": last}
+    encoded = json.dumps(head | {"note": block.note, "problem": block.problem}).encode()
+    return b"".join([len(encoded).to_bytes(4, "big"), encoded, *block.pictures])
+
+
 class _PicturedEpisode(NamedTuple):
     key: Hashable
+    tag: str
+    """Changes with what its pictures depend on."""
     make: Make
     length: int
     """Steps of the episode."""
@@ -114,4 +146,5 @@ def _pictured_episode(run: Run, at: EpisodeRef) -> _PicturedEpisode:
         number = at.number_in(recording)
         length = len(recording.phase(at.phase).episode(number))
     make = partial(encoded_pictures, run.recording, at.phase, number)
-    return _PicturedEpisode((recording_state(run), at.phase, number), make, length)
+    tag = f"{tag_of(run)}-{at.phase}-{number}-{__version__}"
+    return _PicturedEpisode((recording_state(run), at.phase, number), tag, make, length)

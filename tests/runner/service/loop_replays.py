@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -79,24 +81,31 @@ def part(client, address, **query):
     return answer.json()["episode"]
 
 
-def pictures(client, address, notes=None, **query):
-    """Return the pictures of a stream, and the reason why there are no more; collect its notes."""
-    notes = [] if notes is None else notes
-    answer = client.get(f"/api/v1/runs/{address}/pictures", params=query)
-    assert answer.status_code == 200, answer.text
-    data, found = answer.content, []
-    while data:
-        (length,) = struct.unpack_from(">I", data)
-        if length == 2**32 - 1:
-            return found, data[4:].decode()
-        if length == 2**32 - 2:
-            (length,) = struct.unpack_from(">I", data, 4)
-            notes.append(data[8 : 8 + length].decode())
-            data = data[8 + length :]
-            continue
-        found.append(data[4 : 4 + length])
-        data = data[4 + length :]
-    return found, ""
+def pictures(client, address, notes=None, start=0, steps=64):
+    """Return the pictures of steps, empty where one stays, and why there are no more; collect notes."""
+    found = []
+    while True:
+        query = {"start": start + len(found), "steps": steps - len(found)}
+        answer = client.get(f"/api/v1/runs/{address}/pictures", params=query)
+        assert answer.status_code == 200, answer.text
+        head, own = block_of(answer.content)
+        before = -1
+        for number in head["shown"]:
+            found.append(own[number] if number != before else b"")
+            before = number
+        if head["note"] and notes is not None:
+            notes.append(head["note"])
+        if head["problem"] or start + len(found) > head["last"] or len(found) == steps:
+            return found, head["problem"]
+
+
+def block_of(data):
+    """Return the head and the pictures of a block."""
+    (length,) = struct.unpack_from(">I", data)
+    head, data = json.loads(data[4 : 4 + length]), data[4 + length :]
+    ends = list(itertools.accumulate(head["sizes"]))
+    assert len(data) == (ends[-1] if ends else 0)
+    return head, [data[end - size : end] for end, size in zip(ends, head["sizes"], strict=True)]
 
 
 def page(client, address, status=200):

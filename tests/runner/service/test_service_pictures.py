@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import io
+import itertools
 import time
 
 import gymnasium
 import numpy as np
 import pytest
-from loop_replays import pictures, serving, steps_of
+from loop_replays import block_of, pictures, serving, steps_of
 from PIL import Image
 
 from runner.recording.reader import open_recording
+from runner.replay.steps import recorded_frames
 from runner.runs.resolve import find_run
 from runner.service.errors import Busy
 from runner.service.pictures import MAX_STREAMS, PictureStreams
@@ -22,15 +24,19 @@ def test_recorded_frames_are_passed_on_as_they_are(loops_client, loops, monkeypa
     monkeypatch.setattr("runner.export.pictures.why_not_rerun", lambda *_: "It is not installed.")
     length = len(steps_of(loops, "framed", "train", 1))
     with open_recording(find_run("framed", loops).recording) as recording:
-        recorded = [frame["data"] for frame in recording.train.frames.decoded()]
+        recorded = [frame["data"] for frame in recorded_frames(recording, "train", 1)]
     found, problem = pictures(loops_client, "framed/replay/train/1", steps=1000)
     assert problem == ""
     assert len(found) == length + 1
-    assert {data for data in found if data} <= set(recorded)
-    due = [k % 3 == 0 or k == length for k in range(length + 1)]
-    assert [bool(data) for data in found] == due
+    assert filled(found) == recorded
+    assert not any(data for k, data in enumerate(found) if k % 3 and k < length), "a frame every 3 steps"
     later, _ = pictures(loops_client, "framed/replay/train/1", start=4, steps=3)
-    assert later == [found[3], b"", found[6]]
+    assert filled(later) == recorded[4:7]
+
+
+def filled(found):
+    """Return the picture at each step."""
+    return list(itertools.accumulate(found, lambda before, data: data or before))
 
 
 def test_pictures_that_were_not_recorded_are_those_that_the_environment_draws(loops_client, loops):
@@ -43,12 +49,12 @@ def test_pictures_that_were_not_recorded_are_those_that_the_environment_draws(lo
     found, problem = pictures(loops_client, "pole/replay/eval/4/2", steps=1000)
     assert problem == ""
     assert len(found) == len(drawn)
-    for data, expected in zip(found, drawn, strict=True):
+    for data, expected in zip(filled(found), drawn, strict=True):
         shown = np.asarray(Image.open(io.BytesIO(data)), np.float64)
         assert np.abs(shown - expected).mean() < 2
     for start in (1, 5, len(drawn) - 1):
         again, _ = pictures(loops_client, "pole/replay/eval/4/2", start=start, steps=2)
-        assert again == found[start : start + 2]
+        assert filled(again) == filled(found)[start : start + 2]
 
 
 def test_pictures_after_the_end_are_none(loops_client):
@@ -106,21 +112,28 @@ def endless(closed, begins=0.0):
     return make
 
 
-async def read(streams, stream, start, stop):
-    return [record[4:] async for record in streams.send(stream, start, stop)]
+async def read(streams, key, make, start, stop):
+    block = await streams.block(key, make, start, stop, here)
+    return [block.pictures[number] for number in block.shown]
+
+
+async def here():
+    return False
 
 
 def test_a_stream_continues_for_the_next_request_and_begins_again_for_an_earlier_step():
     async def run():
-        streams, closed = PictureStreams(), []
-        first = streams.open("a", endless(closed), 3)
-        assert await read(streams, first, 3, 5) == [b"3", b"4"]
-        second = streams.open("a", endless(closed), 7)
-        assert second is first
-        assert await read(streams, second, 7, 9) == [b"7", b"8"]
-        third = streams.open("a", endless(closed), 2)
-        assert third is not first
-        assert await read(streams, third, 2, 3) == [b"2"]
+        streams, closed, begun = PictureStreams(), [], []
+
+        def make(start):
+            begun.append(start)
+            return endless(closed)(start)
+
+        assert await read(streams, "a", make, 3, 5) == [b"3", b"4"]
+        assert await read(streams, "a", make, 7, 9) == [b"7", b"8"]
+        assert begun == [3]
+        assert await read(streams, "a", make, 2, 3) == [b"2"]
+        assert begun == [3, 2]
         await until(lambda: len(closed) == 1)
         streams.close()
         await until(lambda: len(closed) == 2)
@@ -133,17 +146,59 @@ def test_streams_are_limited_kept_ones_give_way_and_are_closed_when_nobody_comes
 
     async def run():
         streams, closed = PictureStreams(), []
-        opened = [streams.open(number, endless(closed), 0) for number in range(MAX_STREAMS)]
+        for number in range(MAX_STREAMS):
+            streams.open(number, endless(closed), 0)
         with pytest.raises(Busy):
-            streams.open("another", endless(closed), 0)
-        await read(streams, opened[0], 0, 1)
-        opened.append(streams.open("another", endless(closed), 0))
+            await read(streams, "another", endless(closed), 0, 1)
+        streams._keep(streams._streams[0])
+        assert await read(streams, "another", endless(closed), 0, 1) == [b"0"]
         await until(lambda: len(closed) == 1)
-        for stream in opened[1:]:
-            await read(streams, stream, 0, 1)
+        for stream in streams._streams:
+            streams._keep(stream)
         await until(lambda: len(closed) == MAX_STREAMS + 1)
 
     asyncio.run(run())
+
+
+def test_a_block_has_each_picture_once_and_ends_when_they_take_long_or_nobody_waits(monkeypatch):
+    monkeypatch.setattr("runner.service.pictures.BLOCK_SECONDS", 0.3)
+
+    def slow(start):
+        yield "a note"
+        yield from (b"a", b"a", b"", b"b", b"a")
+        time.sleep(1)
+        while True:
+            yield b"c"
+            time.sleep(5)
+
+    async def run():
+        streams, begun = PictureStreams(), time.monotonic()
+        block = await streams.block("a", slow, 0, 64, here)
+        assert (block.pictures, block.shown, block.note) == ([b"a", b"b", b"a"], [0, 0, 0, 1, 2], "a note")
+        assert time.monotonic() - begun < 1
+        block = await streams.block("a", slow, 5, 64, here)
+        assert (block.pictures, block.shown, block.note) == ([b"c"], [0], "a note")
+        gone = time.monotonic() + 0.5
+
+        async def is_gone():
+            return time.monotonic() > gone
+
+        assert (await streams.block("a", slow, 6, 64, is_gone)).shown == []
+        assert time.monotonic() < gone + 2
+        streams.close()
+
+    asyncio.run(run())
+
+
+def test_a_whole_block_has_a_tag_by_which_it_is_not_sent_again(loops_client, monkeypatch):
+    address = "/api/v1/runs/pole/replay/train/1/pictures?start=0&steps=4"
+    first = loops_client.get(address)
+    tag = first.headers["etag"]
+    assert len(block_of(first.content)[0]["shown"]) == 4
+    monkeypatch.setattr("runner.service.pictures.PictureStreams.block", None)  # nothing is made again
+    assert loops_client.get(address).content == first.content
+    again = loops_client.get(address, headers={"If-None-Match": tag})
+    assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
 
 
 async def until(holds):

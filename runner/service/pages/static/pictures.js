@@ -1,13 +1,14 @@
-// The pictures of an episode, fetched in pieces as they are made: of those around the step shown, a limited number.
-const PIECE = 64,
+// The pictures of an episode, fetched in blocks as they are made: of those around the step shown, a limited number.
+const BLOCK = 64,
   KEPT = 1500,
   AHEAD = 256;
 
 // Return the function that `Replay` requests pictures with, or null where a replay has none.
 //
-// A piece is a stream of pictures: for each its length (32 bits, big-endian) and its bytes. Without bytes it is the
-// same as the one before it. The length 2^32 - 1 begins a message in place of the pictures that cannot be had;
-// 2^32 - 2 a note on all of them, after its length.
+// A block is the length of its head (32 bits, big-endian), the head as JSON, and the pictures: `sizes` has their bytes,
+// `shown` the number of the picture at each step, `last` the last step of the episode, `note` a sentence on all
+// pictures, `problem` the reason why there are no further ones. Blocks end at multiples of 64 steps, so that a browser
+// finds them in its cache; the first has only the picture that is shown.
 export function picturesOf(root, at = 0) {
   const source = root.dataset.pictures;
   if (!source) return null;
@@ -41,17 +42,11 @@ export function picturesOf(root, at = 0) {
   }
 
   async function read(start) {
-    const own = { start, next: start, stop: start + PIECE, control: new AbortController() };
+    const steps = kept.size ? BLOCK - (start % BLOCK) : 1;
+    const own = { start, next: start, stop: start + steps, control: new AbortController() };
     reading = own;
-    let before = null;
-    const take = (k, bytes) => {
-      if (bytes.length) before = URL.createObjectURL(new Blob([bytes]));
-      if (before !== null) keep(k, before);
-      own.next = k + 1;
-      if (k === wanted) tell();
-    };
     try {
-      const response = await fetch(`${source}?start=${start}&steps=${PIECE}`, { signal: own.control.signal });
+      const response = await fetch(`${source}?start=${start}&steps=${steps}`, { signal: own.control.signal });
       if (response.status === 503)
         retry = setTimeout(() => {
           messages.clear();
@@ -62,15 +57,16 @@ export function picturesOf(root, at = 0) {
           (await response.json().catch(() => null))?.error.message ??
             `The service responded with status ${response.status}.`,
         );
-      const failed = await records(
-        response.body.getReader(),
-        (bytes, number) => take(start + number, bytes),
-        (text) => {
-          note = text;
-        },
-      );
-      if (failed !== null) throw new Error(failed);
-      if (own.next < own.stop) last = Math.min(last, own.next - 1);
+      const body = await response.arrayBuffer(),
+        begin = 4 + new DataView(body).getUint32(0),
+        head = JSON.parse(new TextDecoder().decode(body.slice(4, begin)));
+      let end = begin;
+      const addresses = head.sizes.map((size) => URL.createObjectURL(new Blob([body.slice(end, (end += size))])));
+      note = head.note || note;
+      last = head.last;
+      for (const number of head.shown) keep(own.next++, addresses[number]);
+      if (wanted >= start && wanted < own.next) tell();
+      if (head.problem) throw new Error(head.problem);
     } catch (error) {
       if (error.name === "AbortError") return;
       for (let k = own.next; k < own.stop; k++) messages.set(k, error.message);
@@ -82,7 +78,7 @@ export function picturesOf(root, at = 0) {
     }
   }
 
-  // Read the piece of the step shown, then those after it.
+  // Read the block of the step shown, then those after it.
   function more() {
     clearTimeout(waiting);
     if (closed) return;
@@ -118,38 +114,4 @@ export function picturesOf(root, at = 0) {
     for (const address of new Set(kept.values())) if (address.startsWith("blob:")) URL.revokeObjectURL(address);
   };
   return pictures;
-}
-
-// Call `take` with the bytes and the number of each picture, and `noted` with a note; return the message that ends
-// the stream, or null.
-async function records(reader, take, noted) {
-  let bytes = new Uint8Array(0),
-    number = 0;
-  for (;;) {
-    const { value, done } = await reader.read();
-    if (done) return null;
-    const joined = new Uint8Array(bytes.length + value.length);
-    joined.set(bytes);
-    joined.set(value, bytes.length);
-    bytes = joined;
-    while (bytes.length >= 4) {
-      const view = new DataView(bytes.buffer, bytes.byteOffset),
-        length = view.getUint32(0);
-      if (length === 0xfffffffe) {
-        if (bytes.length < 8 || bytes.length < 8 + view.getUint32(4)) break;
-        const end = 8 + view.getUint32(4);
-        noted(new TextDecoder().decode(bytes.subarray(8, end)));
-        bytes = bytes.subarray(end);
-        continue;
-      }
-      if (length === 0xffffffff) {
-        const rest = [bytes.slice(4)];
-        for (let part = await reader.read(); !part.done; part = await reader.read()) rest.push(part.value);
-        return new Blob(rest).text();
-      }
-      if (bytes.length < 4 + length) break;
-      take(bytes.slice(4, 4 + length), number++);
-      bytes = bytes.subarray(4 + length);
-    }
-  }
 }
