@@ -13,7 +13,7 @@ import runner
 from benchmarks.figures import Figure, figure, seconds
 from runner.export.encoder import FORMATS
 from runner.export.film import Shot, captioned, write_film
-from runner.export.pictures import pictures
+from runner.export.pictures import Pictures
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 
@@ -62,13 +62,13 @@ def film(recording: Recording, path: Path, name: str, repetitions: int) -> list[
     """Return the time of a film of the first episode, and in its detail those of drawing and captions."""
 
     def shot() -> Shot:
-        return Shot("training episode 0", pictures(recording, "train", 0))
+        return Shot("training episode 0", Pictures(recording, "train", 0))
 
     whole, drawn, captions = [], [], []
     for _ in range(repetitions):
         drawn.append(seconds(lambda: deque(shot().pictures, maxlen=0)))
-        captions.append(seconds(lambda: deque(captioned(shot(), None, []), maxlen=0)) - drawn[-1])
-        whole.append(seconds(lambda: write_film(path, shot(), fps=30)))
+        captions.append(seconds(lambda: deque(captioned(shot(), None), maxlen=0)) - drawn[-1])
+        whole.append(seconds(lambda: write_film(path, shot(), 30, None, lambda _: None)))
     detail = f"pictures {statistics.median(drawn):.2f} s, captions {statistics.median(captions):.2f} s"
     what = f"{path.suffix[1:]} of {STEPS} steps, {name}"
     return [figure(what, whole, "s", (10, 4), higher_is_better=False, detail=detail)]
