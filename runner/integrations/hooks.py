@@ -1,7 +1,8 @@
 """The environments of a script, recorded without being handed over: the first one that it resets.
 
-Every class of environments of Gymnasium gets a `reset` that first looks for a run that waits for one. The
-outermost environment that the script resets is then stepped through its recorded twin.
+While a run waits for an environment, every class of environments of Gymnasium has a `reset` that first looks
+for such a run. The outermost environment that the script resets is then stepped through its recorded twin.
+The classes get their own `reset` back as soon as no run has to see which environments are reset.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from gymnasium.vector import VectorEnv
 
 from runner.loops.recorded import Recorded
 
+OTHERS: Final = "other environments"
+"""What the one warning of environments that a run does not record is about."""
 _VECTORS_OF_OTHERS: Final = {
     "stable_baselines3": "runner.integrations.sb3.Recording",
     "torchrl": "runner.integrations.torchrl.record",
@@ -40,6 +43,10 @@ class WaitingRun(Protocol):
     @property
     def has_environment(self) -> bool:
         """Whether it records one that the script did not hand over."""
+
+    @property
+    def looks_at_resets(self) -> bool:
+        """Whether it waits for an environment, or has to warn of others than its own."""
 
     def begin_with(self, env: object) -> None:
         """Begin to record an environment that is about to be reset."""
@@ -63,7 +70,8 @@ class WatchedEnvironment:
         self.is_inside = False
         """Whether the twin is being called, so that calls of the environment are its own."""
         _watched[id(env)] = self
-        object.__setattr__(env, "step", MethodType(_step, env))
+        for name, method in _METHODS.items():
+            object.__setattr__(env, name, MethodType(method, env))
 
     def call(
         self,
@@ -84,38 +92,44 @@ class WatchedEnvironment:
     def release(self) -> None:
         """Record nothing more."""
         _watched.pop(id(self._env), None)
-        with contextlib.suppress(AttributeError):
-            object.__delattr__(self._env, "step")
+        for name in _METHODS:
+            with contextlib.suppress(AttributeError):
+                object.__delattr__(self._env, name)
 
 
 open_runs: list[WaitingRun] = []
 """The runs of scripts that are not closed, the oldest first."""
 _watched: dict[int, WatchedEnvironment] = {}
 """By the id of the environment; a copy of it is not one of them."""
-_hooked: weakref.WeakSet[object] = weakref.WeakSet()
-"""The classes whose `reset` looks for a run that waits."""
+_hooked: weakref.WeakKeyDictionary[Any, tuple[Callable[..., object], bool]] = weakref.WeakKeyDictionary()
+"""The classes whose `reset` looks for a run that waits, with that function, and whether they had one."""
 
 
-def _step(env: Any, *arguments: object, **named: object) -> object:
-    """Take a step in an environment that is recorded; in a copy of it, which is not, just take it."""
-    original = MethodType(type(env).step, env)
-    watched = _watched.get(id(env))
-    return (
-        original(*arguments, **named) if watched is None else watched.call("step", original, arguments, named)
-    )
+def _own(name: str) -> Callable[..., object]:
+    """Return a method of an environment that is recorded; a copy of it, which is not, just does it."""
+
+    def call(env: Any, *arguments: object, **named: object) -> object:
+        original = MethodType(getattr(type(env), name), env)
+        watched = _watched.get(id(env))
+        if watched is None:
+            return original(*arguments, **named)
+        return watched.call(name, original, arguments, named)
+
+    call.__name__ = name  # by which a pickled environment finds its own
+    return call
 
 
-_step.__name__ = "step"  # by which a pickled environment finds its own
+_METHODS: Final = {"step": _own("step"), "reset": _own("reset")}
 
 
 def _reset(
     env: object, original: Callable[..., object], arguments: Sequence[object], named: Mapping[str, object]
 ) -> object:
     """Reset an environment; begin to record it if a run waits for one."""
+    if id(env) in _watched or any(each.is_inside for each in _watched.values()):
+        return original(env, *arguments, **named)
+    _find_run(env)
     watched = _watched.get(id(env))
-    if watched is None and not any(each.is_inside for each in _watched.values()):
-        _find_run(env)
-        watched = _watched.get(id(env))
     if watched is None:
         return original(env, *arguments, **named)
     return watched.call("reset", MethodType(original, env), arguments, named)
@@ -139,8 +153,9 @@ def _find_run(env: object) -> None:
                 run.warn_once(
                     f"run {run.run_id} records the environment that was reset first, and no other: "
                     f"{env} is not recorded. runner.record(env) records it in a run of its own.",
-                    about="other environments",
+                    about=OTHERS,
                 )
+        update_hooks()
 
 
 def _library_that_resets() -> str | None:
@@ -156,17 +171,28 @@ def _library_that_resets() -> str | None:
     return None
 
 
-def hook_environments() -> None:
-    """Let every class of environments look for a run that waits when one is reset."""
-    if _hooked:
+def update_hooks() -> None:
+    """Let every class of environments look for a run when one is reset, as long as a run needs it."""
+    bases: tuple[Any, ...] = (gymnasium.Env, VectorEnv)
+    is_needed = any(run.looks_at_resets for run in open_runs)
+    if is_needed == bool(_hooked):
         return
-    for base in (gymnasium.Env, VectorEnv):
+    for base in bases:
+        if not is_needed:
+            del base.__init_subclass__
+            continue
         classes = [base]
         while classes:
             cls = classes.pop()
             _hook(cls)
             classes += cls.__subclasses__()
         _hook_subclasses(base)
+    for cls, (reset, has_own) in list(_hooked.items()) if not is_needed else ():
+        if vars(cls).get("reset") is reset:  # nobody else replaced it meanwhile
+            del cls.reset
+            if has_own:
+                cls.reset = reset.__wrapped__
+        del _hooked[cls]
 
 
 def _hook_subclasses(base: Any) -> None:
@@ -182,14 +208,12 @@ def _hook(cls: Any) -> None:
     if owner is None or owner in _hooked:
         return
     original = vars(owner)["reset"]  # of EnvPool's classes that of one that is none of Gymnasium's
-    _hooked.add(cls)
 
     @functools.wraps(original)
     def reset(self: object, *arguments: object, **named: object) -> object:
-        if not open_runs:
-            return original(self, *arguments, **named)
         return _reset(self, original, arguments, named)
 
+    _hooked[cls] = reset, owner is cls
     cls.reset = reset
 
 
@@ -199,6 +223,7 @@ def _after_fork() -> None:
         run.disown()
     open_runs.clear()
     _watched.clear()
+    update_hooks()
 
 
 if hasattr(os, "register_at_fork"):

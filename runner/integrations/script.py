@@ -23,7 +23,7 @@ from typing import Any, Final, Protocol
 from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError, nearest
-from runner.integrations.hooks import WatchedEnvironment, hook_environments, open_runs
+from runner.integrations.hooks import OTHERS, WatchedEnvironment, open_runs, update_hooks
 from runner.integrations.values import ValueRows, begin_values
 from runner.loops.env import record
 from runner.loops.flushing import open_loops
@@ -117,9 +117,9 @@ class ScriptRun:
         """Name to the number of its values without a step."""
         self._step: int | None = None
         self._is_foreign = False
-        hook_environments()
         atexit.register(self._close_at_exit)
         open_runs.append(self)
+        update_hooks()
 
     def _new_run_id(self) -> str:
         is_folder = "://" not in str(self._recordings or "")
@@ -209,6 +209,7 @@ class ScriptRun:
             self._is_own, self._has_environment = False, False
             self.run_id, before = self._new_run_id(), self.run_id
             self.warn_once(f"run {before} has ended: further values go into run {self.run_id}.")
+        update_hooks()
 
     def _record(
         self, loop: Loop, method: str, name: str, value: Any, step: int | None, call: int | None
@@ -268,6 +269,11 @@ class ScriptRun:
         """Whether the next environment that is reset is this run's."""
         return self.is_waiting and self._has_environment
 
+    @property
+    def looks_at_resets(self) -> bool:
+        """Whether it waits for an environment, or has to warn of others than its own."""
+        return self.waits_for_environment or (self.has_environment and OTHERS not in self._warnings)
+
     def _join_loop(self) -> bool:
         """Log into the newest loop that the script records itself, if there is one."""
         own = {id(other._loop) for other in open_runs if isinstance(other, ScriptRun) and other._is_own}
@@ -279,6 +285,7 @@ class ScriptRun:
 
     def _begin(self, loop: Loop) -> None:
         self._loop = loop
+        update_hooks()
         waiting, self._waiting = self._waiting, []
         for each in waiting:
             self._record(loop, *each)
@@ -389,6 +396,7 @@ class ScriptRun:
             return
         self.closed = True
         open_runs.remove(self)
+        update_hooks()
         atexit.unregister(self._close_at_exit)
 
     def _close_at_exit(self) -> None:

@@ -24,7 +24,7 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 
 from runner.errors import ConfigError
-from runner.integrations.hooks import hook_environments, open_runs
+from runner.integrations.hooks import open_runs
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import WithoutEffect, as_run_name, forgiving, without_effect
 from runner.loops.media import film_of, grid_of, histogram_of, picture_of
@@ -298,9 +298,13 @@ def _settings(table: str) -> dict[str, object]:
 # --- other writers ------------------------------------------------------------------------------------------
 
 
-_forwarded: SummaryWriter | None = None
-"""Takes what the script writes with another library's writer."""
 _left_out: weakref.WeakSet[object] = weakref.WeakSet()
+
+
+def _other_writers() -> list[Any]:
+    """Return the writers of other libraries that are loaded."""
+    loaded = (getattr(sys.modules.get(module), "SummaryWriter", None) for module in _WRITERS)
+    return [writer for writer in loaded if writer is not None]
 
 
 def forward() -> bool:
@@ -308,18 +312,21 @@ def forward() -> bool:
 
     Returns whether such a writer is loaded.
     """
-    global _forwarded
-    _forwarded, has_writers = SummaryWriter(), False
-    for module in _WRITERS:
-        writer = getattr(sys.modules.get(module), "SummaryWriter", None)
-        if writer is None:
-            continue
-        has_writers = True
+    own = SummaryWriter()
+    for writer in _other_writers():
         for name in [name for name in vars(SummaryWriter) if name.startswith("add_")]:
             method = getattr(writer, name, None)
             if method is not None and not hasattr(method, "forwards"):
-                setattr(writer, name, _forwarding(name, method))
-    return has_writers
+                setattr(writer, name, _forwarding(name, method, own))
+    return bool(_other_writers())
+
+
+def end_forwarding() -> None:
+    """Give the writers of other libraries their own methods back."""
+    for writer in _other_writers():
+        for name, method in list(vars(writer).items()):
+            if hasattr(method, "forwards"):
+                setattr(writer, name, method.__wrapped__)
 
 
 def do_not_forward(writer: object) -> None:
@@ -327,15 +334,12 @@ def do_not_forward(writer: object) -> None:
     _left_out.add(writer)
 
 
-def _forwarding(name: str, method: Callable[..., object]) -> Callable[..., object]:
+def _forwarding(name: str, method: Callable[..., object], own: SummaryWriter) -> Callable[..., object]:
     @wraps(method)
     def both(self: object, *arguments: object, **named: object) -> object:
-        if _forwarded is not None and not _forwarded.script.closed and self not in _left_out:
-            getattr(_forwarded, name)(*arguments, **named)
+        if not own.script.closed and self not in _left_out:
+            getattr(own, name)(*arguments, **named)
         return method(self, *arguments, **named)
 
     both.forwards = True  # type: ignore[attr-defined]
     return both
-
-
-hook_environments()

@@ -24,10 +24,9 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 
 from runner.errors import ConfigError, RunnerError
-from runner.integrations.hooks import hook_environments
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import WithoutEffect, as_run_name, forgiving, warn_once, without_effect
-from runner.integrations.tensorboard import as_number, forward
+from runner.integrations.tensorboard import as_number, end_forwarding, forward
 from runner.integrations.wandb.settings import Config, Summary
 from runner.loops.media import Histogram, Image
 from runner.loops.options import settings_in
@@ -186,6 +185,8 @@ class Tracked:
                 "expected it to be imported before."
             )
         self.script.close(status, error)
+        if self.script.has_writer:
+            end_forwarding()
         if run is self:
             run = None
 
@@ -324,6 +325,3 @@ def _tag(text: str) -> str:
 
 def __getattr__(name: str) -> Any:
     return getattr(_open_run(name), name) if name in ("config", "summary") else without_effect("wandb", name)
-
-
-hook_environments()

@@ -106,6 +106,36 @@ def test_environments_that_are_not_recorded_give_one_warning_in_all():
     assert len(found) == 1
 
 
+def test_classes_have_their_own_reset_unless_a_run_has_to_see_which_environments_are_reset():
+    classes = (gymnasium.Env, gymnasium.Wrapper, gymnasium.wrappers.TimeLimit, SyncVectorEnv)
+    own = [vars(cls)["reset"] for cls in classes]
+
+    def are_own():
+        assert ("__init_subclass__" in vars(gymnasium.Env)) is (vars(gymnasium.Env)["reset"] is not own[0])
+        return [vars(cls)["reset"] for cls in classes] == own
+
+    first = make()
+    with SummaryWriter():
+        assert not are_own()
+        first.reset(seed=1)
+        first.step(1)
+        with pytest.warns(RuntimeWarning, match="and no other"):
+            make().reset(seed=2)
+        assert are_own()
+        first.reset()
+        first.step(1)
+    assert the_run().summary["train_steps"] == 2
+    with runner.open_recording(the_run().recording) as recording:
+        assert recording.train.resets.count() == 2
+    assert not {"reset", "step"} & set(vars(first))
+    with SummaryWriter("runs/values", monitor_gym=False) as writer:
+        writer.add_scalar("a", 1.0, 1)
+        assert are_own()
+    with SummaryWriter("runs/again"):
+        make().reset(seed=1)
+    assert are_own()
+
+
 def test_steps_before_the_writer_was_made_give_a_warning():
     env = make()
     env.reset(seed=1)

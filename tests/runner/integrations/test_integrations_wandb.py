@@ -259,11 +259,13 @@ def test_disabled_records_nothing(folder):
 def test_another_writer_is_followed(monkeypatch):
     tensorboard = pytest.importorskip("tensorboardX")
     assert sys.modules["tensorboardX.writer"]
+    own = tensorboard.SummaryWriter.add_scalar
     wandb.init(project="synced", sync_tensorboard=True, monitor_gym=False)
     with tensorboard.SummaryWriter("runs/x") as writer:
         writer.add_scalar("loss", 0.5, 7)
     wandb.finish()
     assert scalars(the_run()) == [("loss", 0.5, 7)]
+    assert tensorboard.SummaryWriter.add_scalar is own
     with tensorboard.SummaryWriter("runs/x") as writer:
         writer.add_scalar("loss", 0.5, 8)
     assert len(runner.list_runs()) == 1
