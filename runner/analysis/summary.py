@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
@@ -20,6 +22,7 @@ from runner.recording.maker import Shard
 from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
+from runner.recording.spaces import Description
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
 from runner.util.values import JsonView
@@ -46,8 +49,8 @@ class RecordedExtras:
 
     steps: int
     """The number of steps with such values."""
-    names: Mapping[str, tuple[str, tuple[int, ...]]]
-    """Name to dtype and shape."""
+    names: Mapping[str, tuple[str, tuple[int | None, ...]]]
+    """Name to dtype, or `str`, and shape, which begins with None where the first axis varies in length."""
 
     def as_json(self) -> dict[str, object]:
         """Return it as JSON can hold it."""
@@ -160,12 +163,17 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
 
 def _extras(recording: Recording) -> dict[str, RecordedExtras]:
     return {
-        phase: RecordedExtras(
-            extras.count, {name: (dtype.base.name, dtype.shape) for name, dtype in extras.items()}
-        )
+        phase: RecordedExtras(extras.count, {name: _kind(column) for name, column in extras.columns.items()})
         for phase in schema.PHASES
         if (extras := recording.phase(phase).extras)
     }
+
+
+def _kind(column: Description) -> tuple[str, tuple[int | None, ...]]:
+    """Return dtype and shape of an extra."""
+    if column["type"] == "Text":
+        return "str", ()
+    return np.dtype(column["dtype"]).name, tuple(column["shape"])
 
 
 def brief_provenance(provenance: Mapping[str, str]) -> dict[str, str]:

@@ -17,6 +17,7 @@ from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.reader import Recording, extra_layouts
 from runner.recording.schema import Topic
+from runner.recording.topic_chunks import TopicChunks
 from runner.util.arrays import Records
 
 _ROWS_AT_ONCE: Final = 1024
@@ -52,7 +53,7 @@ class Batches:
 
     def blocks(self, table: Table) -> Iterator[tuple[Topic, Records, pa.RecordBatch]]:
         """Yield the messages of a table by time: their topic, as records and as columns."""
-        sources = {topic: self.records(topic) for topic in table.topics}
+        sources = {topic: self.records(topic) for topic in self.shape.topics_of(table)}
         heads = {
             topic: block for topic, blocks in sources.items() if (block := next(blocks, None)) is not None
         }
@@ -70,13 +71,14 @@ class Batches:
 
     def records(self, topic: Topic) -> Iterator[Records]:
         """Yield the messages of a topic as records, `WHOLE` ones if they vary in size."""
-        if topic.message is schema.EXTRA:
-            yield from self._recording.phase(topic.phase).extras.blocks()
-        elif not self.shape.dtypes[topic].hasobject:
-            yield from self._recording.table(topic).stored()
+        chunks = self._chunks_of(topic)
+        if chunks is None:
+            return
+        if not self.shape.dtypes[topic].hasobject:
+            yield from chunks.stored()
         else:
             messages, size = [], 0
-            for time, payload in self._recording.table(topic).messages():
+            for time, payload in chunks.messages():
                 messages.append((time, message_record(topic, time, payload)))
                 size += len(payload)
                 if len(messages) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
@@ -84,6 +86,13 @@ class Batches:
                     messages, size = [], 0
             if messages:
                 yield self._records_of(topic, messages)
+
+    def _chunks_of(self, topic: Topic) -> TopicChunks | None:
+        """Return the chunks of a topic; None for a layout of extras without any."""
+        if topic.message is not schema.EXTRA:
+            return self._recording.table(topic)
+        parts = self._recording.phase(topic.phase).extras.parts
+        return next((chunks for _, chunks in parts if chunks.topic is topic), None)
 
     def _records_of(self, topic: Topic, messages: list[tuple[int, bytes]]) -> Records:
         """Return records that have times and message records only."""
@@ -109,8 +118,8 @@ class Batches:
         try:
             batch = batch_of(table, topic, records, self.shape)
             restored = list(records_of(table, topic, batch, self.shape))
-            if [part.dtype for part in restored] == [records.dtype]:
-                differs = whole(records) != whole(restored[0])
+            if [(source, part.dtype) for source, part in restored] == [(topic, records.dtype)]:
+                differs = whole(records) != whole(restored[0][1])
                 if not differs.any():
                     return batch
                 number += int(differs.argmax())

@@ -21,6 +21,7 @@ from runner.recording.description import RunDescription
 from runner.recording.extras import ExtraLayout
 from runner.recording.layout import NUMBERS
 from runner.recording.schema import Field, MessageType, Topic
+from runner.recording.space_fields import row_dtype
 from runner.util.arrays import Array, Records
 
 _INT32, _FLOAT, _FLAG = pa.int32(), pa.float64(), pa.bool_()
@@ -70,32 +71,46 @@ class Shape:
         self._topics = run.topics
         self._mdp = run.mdp if run.tabular else None
         self._events = self._mdp.event_names if self._mdp else ()
-        where = str(run.path)
+        where = self._where = str(run.path)
         if len(self._events) != int(run.run["events"]):
             raise RecordingError(f"{where}: found {len(self._events)} events, expected {run.run['events']}.")
         self.spaces: dict[str, SpaceColumns] = {}
-        """The spaces of a loop by the field of their values; those of extras have all names."""
-        if extras:
-            self.spaces["values"] = SpaceColumns(extras[-1].description, "values", where, "extra", "given")
+        """The spaces of a loop by the field of their values."""
+        self._extras = [
+            (schema.extra_topic(phase, names.number), names) for names in extras for phase in schema.PHASES
+        ]
+        self._varying = {
+            topic: SpaceColumns(names.varying, "varying", where) for topic, names in self._extras
+        }
+        """The names of extras with values of varying size, by the topic of each layout."""
         if not run.can_train_again:
             for name in ("action", "next_observation", "observation"):
                 self.spaces[name] = SpaceColumns(run.spaces[name.removeprefix("next_")], name, where)
         self.messages = {topic: run.layout.message(topic) for topic in run.topics}
-        """The type of each topic's messages; of extras, the last one."""
-        if extras:
-            self.messages |= dict.fromkeys(schema.EXTRA_TOPICS, extras[-1].message)
+        """The type of each topic's messages; extras have a topic for each layout."""
+        self.messages |= {topic: names.message for topic, names in self._extras}
         self.dtypes = {
-            topic: dtype if (dtype := record_dtype(message)) is not None else self._varying(message)
+            topic: dtype if (dtype := record_dtype(message)) is not None else self._dtype(topic, message)
             for topic, message in self.messages.items()
         }
-        """The dtype of each topic's records: message records, or those of `_varying`."""
+        """The dtype of each topic's records: message records, or those of `_dtype`."""
 
-    def _varying(self, message: MessageType) -> np.dtype[np.void]:
+    def topics_of(self, table: Table) -> list[Topic]:
+        """Return the topics whose records a table holds: of extras, those of each layout."""
+        return [topic for topic, _ in self._extras] if table.name == layout.EXTRAS else [*table.topics]
+
+    def space(self, topic: Topic, field: str) -> SpaceColumns | None:
+        """Return the space of a field's values; None for another field."""
+        return self._varying.get(topic) if field == "varying" else self.spaces.get(field)
+
+    def _dtype(self, topic: Topic, message: MessageType) -> np.dtype[np.void]:
         """Return the dtype of messages of varying size: time, bytes of the message record, and fields."""
 
         def held(field: Field) -> object:
-            if field.name in self.spaces:
-                return self.spaces[field.name].dtype
+            if (space := self.space(topic, field.name)) is not None:
+                return space.dtype
+            if field.parts is not None:
+                return row_dtype(field)
             if field.dtype is not None:
                 return field.dtype
             return object if field.repeated else NUMBERS.get(field.kind, object)
@@ -109,8 +124,13 @@ class Shape:
         tables = {}
         for name, topic_names in layout.TOPICS.items():
             topics = tuple(topic for topic in self._topics if topic.name in topic_names)
-            if topics and (name != layout.EXTRAS or self.extras):
+            if topics and name != layout.EXTRAS:
                 tables[name] = Table(name, topics, tuple(self._columns_of(topics[0])))
+            elif topics and self.extras:
+                space = {"type": "Dict", "spaces": self.extras[-1].columns}
+                columns = SpaceColumns(space, "values", self._where, "extra", "given").columns
+                step = stored("step", pa.int64(), lambda records: records["step"])
+                tables[name] = Table(name, topics, (step, *columns))
         return tables
 
     def per_learner(self, name: str) -> list[str]:
@@ -144,7 +164,7 @@ class Shape:
             return [stored(event, _INT32, _item(name, i)) for i, event in enumerate(self.event_columns)]
         if name == "explored":
             return self._explored()
-        if field.is_value or (message is schema.EXTRA and name in self.spaces):
+        if field.is_value:
             return self.spaces[name].columns
         column = stored(name, _type_of(field), lambda records: records[name])
         if name == "seed":

@@ -101,7 +101,6 @@ FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
         "events",
     ),
     schema.RESET: ("reset", "episode", "step", "environment", "seed", "observation"),
-    schema.EXTRA: ("step", "values"),
     schema.LOG: ("name", "level", "message"),
     schema.SCALAR: ("phase", "name", "step", "episode", "value"),
     schema.IMAGE: ("format", "data", "frame_id"),

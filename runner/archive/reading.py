@@ -21,10 +21,10 @@ from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_o
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.description import RunDescription
-from runner.recording.extras import MAX_NAMES, ExtraLayout, read_layouts
+from runner.recording.extras import ExtraLayout, read_layouts
 from runner.recording.metadata import check_run, json_object
 from runner.recording.records import MAX_UNPACKED_RATIO
-from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.schema import MAX_LAYOUTS, STEP_NANOSECONDS, Topic
 from runner.util.files import open_regular
 from runner.util.stored import stored_as
 
@@ -129,8 +129,8 @@ class Archive(RunDescription):
             return []
         table = Shape(self).tables[layout.EXTRA_COLUMNS]
         columns = [
-            (row["position"] * STEP_NANOSECONDS, row["json"])
-            for batch in self.batches(table.name, table.columns, count, MAX_NAMES)
+            (row["position"] * STEP_NANOSECONDS, row)
+            for batch in self.batches(table.name, table.columns, count, MAX_LAYOUTS)
             for row in batch.to_pylist()
         ]
         return read_layouts(columns, str(self.folder / table.name))

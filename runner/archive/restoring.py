@@ -36,6 +36,8 @@ from runner.util.files import storage_errors
 from runner.util.values import Json
 
 _ROWS_AT_ONCE: Final = 1024
+_EXTRAS_AT_ONCE: Final = 64
+"""Of extras of varying size, which may take 1 MB a step."""
 _MAX_PENDING: Final = 8
 """Blocks in the pipeline: as many as the recorder has of a topic."""
 
@@ -87,6 +89,8 @@ class _Restorer:
         """Restore everything, and compare its hashes with those of the manifest."""
         try:
             if self._file is not None:
+                for extras in self._shape.extras:
+                    self._file.declare(extras.beginning)
                 for name in self._archive.metadata_names:
                     if name != "result":
                         self._file.add_metadata(name, self._archive.metadata(name))
@@ -127,14 +131,16 @@ class _Restorer:
     def _records(self, table: Table) -> Iterator[tuple[Topic, Records]]:
         """Yield the rows of a table as records, at most as many as a chunk has."""
         archive, topics = self._archive, table.topics
-        rows = capacity_of(topics[0], self._shape.messages[topics[0]], self._chunk_steps)
-        if self._shape.dtypes[topics[0]].hasobject:
+        sources = self._shape.topics_of(table)
+        rows = min(capacity_of(topic, self._shape.messages[topic], self._chunk_steps) for topic in sources)
+        if any(self._shape.dtypes[topic].hasobject for topic in sources):
             has_bytes = any(map(pa.types.is_binary, table.columns.types))
-            rows = 1 if has_bytes else min(rows, _ROWS_AT_ONCE)
+            most = _EXTRAS_AT_ONCE if table.name == layout.EXTRAS else _ROWS_AT_ONCE
+            rows = 1 if has_bytes else min(rows, most)
         for batch in archive.batches(table.name, table.columns, archive.count(*topics), rows):
             for topic, mine in self._by_topic(table, batch):
                 try:
-                    yield from ((topic, records) for records in records_of(table, topic, mine, self._shape))
+                    yield from records_of(table, topic, mine, self._shape)
                 except (TypeError, ValueError, OverflowError) as error:
                     raise RecordingError(
                         f"{self._where}: {table.name}: {topic.name}: is invalid ({error})."

@@ -44,8 +44,12 @@ def batch_of(table: Table, topic: Topic, records: Records, shape: Shape) -> pa.R
     return pa.record_batch([columns[name] for name in table.columns.names], schema=table.columns)
 
 
-def records_of(table: Table, topic: Topic, batch: pa.RecordBatch, shape: Shape) -> Iterator[Records]:
-    """Yield the message records of rows that are all of one topic; extras in parts of one layout each.
+def records_of(
+    table: Table, topic: Topic, batch: pa.RecordBatch, shape: Shape
+) -> Iterator[tuple[Topic, Records]]:
+    """Yield the message records of rows that are all of one topic, with their topic.
+
+    Extras come in parts of one layout each, with its topic.
 
     Raises:
         ValueError: a row has a value that no message has.
@@ -54,27 +58,29 @@ def records_of(table: Table, topic: Topic, batch: pa.RecordBatch, shape: Shape) 
     if len(positions) and not 0 <= positions.min() <= positions.max() < _MAX_POSITION:
         raise ValueError(f"after {positions.min()} to {positions.max()} steps")
     times = positions.astype(np.uint64) * _TICK
-    layouts = [(0, shape.messages[topic])]
+    layouts = [(0, topic)]
     if topic.message is schema.EXTRA:
-        layouts = [(layout.start_time, layout.message) for layout in shape.extras]
+        layouts = [
+            (names.start_time, schema.extra_topic(topic.phase, names.number)) for names in shape.extras
+        ]
     starts = np.array([start for start, _ in layouts], np.uint64)
     numbers_of_layouts = np.searchsorted(starts, times, "right") - 1
     for k in np.unique(numbers_of_layouts).tolist():
-        mine = numbers_of_layouts == k
+        mine, own_topic = numbers_of_layouts == k, layouts[k][1]
         rows = batch if mine.all() else batch.filter(pa.array(mine))
-        dtype = shape.dtypes[topic]
+        dtype = shape.dtypes[own_topic]
         records = (
             np.zeros(rows.num_rows, dtype)
             if dtype.hasobject
-            else blank_records(topic, layouts[k][1], rows.num_rows)
+            else blank_records(own_topic, shape.messages[own_topic], rows.num_rows)
         )
         records["log_time"] = records["publish_time"] = times[mine]
         for column in table.messages:
             if column.write is not None:
                 column.write(records, rows.column(column.name))
         if records.dtype.hasobject:
-            _encode(topic, records, shape)
-        yield records
+            _encode(own_topic, records, shape)
+        yield own_topic, records
 
 
 def whole(records: Records) -> NDArray[Any]:
@@ -98,8 +104,9 @@ def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
         values = decode(shape.messages[topic], record[HEADER_BYTES:])
         if topic.message is schema.LOG:
             values["level"] = log_level(values["level"])
-        for name in values.keys() & shape.spaces.keys():
-            values[name] = shape.spaces[name].unpack(values[name])
+        for name, value in values.items():
+            if (space := shape.space(topic, name)) is not None:
+                values[name] = space.unpack(value)
         rows.append((time, time, record, *values.values()))
     return np.array(rows, records.dtype)
 
@@ -107,8 +114,9 @@ def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
 def _encode(topic: Topic, records: Records, shape: Shape) -> None:
     """Set the messages of records to those of their fields."""
     columns = {field.name: records[field.name].tolist() for field in shape.messages[topic].fields}
-    for name in columns.keys() & shape.spaces.keys():
-        columns[name] = shape.spaces[name].pack(records[name])
+    for name in columns:
+        if (space := shape.space(topic, name)) is not None:
+            columns[name] = space.pack(records[name])
     rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
     records["record"] = [
         message_record(topic, time, _payload(topic, shape.messages[topic], time, row))

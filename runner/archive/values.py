@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from runner.recording.spaces import Leaf, Value, decode, encode_text, leaves_of, row_dtype
+from runner.recording.spaces import Leaf, Value, decode, encode_bytes, encode_text, leaves_of, row_dtype
 from runner.util.arrays import Array, Records
 
 MAX_NUMBERS: Final = 64
@@ -138,7 +138,10 @@ class SpaceColumns:
         parts: list[list[bytes]] = [[b""] * len(values)]
         for leaf in self._leaves:
             own = _inside(values, leaf)
-            parts.append([encode_text(v) if leaf.dtype is None else v.tobytes() for v in own])
+            if leaf.item is not None:
+                parts.append([encode_bytes(v.tobytes()) for v in own])
+            else:
+                parts.append([encode_text(v) if leaf.dtype is None else v.tobytes() for v in own])
         return [b"".join(pieces) for pieces in zip(*parts, strict=True)]
 
 
@@ -162,14 +165,14 @@ def _spreadable(leaf: Leaf) -> int:
 
 def _column(name: str, field: str, given: str, leaf: Leaf, at: tuple[int, ...] | None) -> Column:
     """Return the column of one number of a leaf, or of all of it."""
+    if leaf.dtype is None and given:
+        return _varying(name, field, given, leaf)
     if leaf.dtype is None:
         kind = pa.string()
     elif at is None:
         kind = pa.binary(leaf.dtype.itemsize)
-    elif leaf.dtype.base == np.float16:
-        kind = pa.float32()  # for programs that read tables
     else:
-        kind = pa.from_numpy_dtype(leaf.dtype.base.newbyteorder("="))
+        kind = _number(leaf.dtype.base)
     place: Any = (..., *(at or ()))
 
     def given_in(records: Records) -> Array | None:
@@ -178,6 +181,52 @@ def _column(name: str, field: str, given: str, leaf: Leaf, at: tuple[int, ...] |
 
     column = stored(name, kind, lambda records: _inside(records[field], leaf)[place])
     return nullable(column, given_in) if given else column
+
+
+def _number(dtype: np.dtype[np.generic]) -> pa.DataType:
+    """Return the type of a column of numbers; programs that read tables take float32 for float16."""
+    return pa.float32() if dtype == np.float16 else pa.from_numpy_dtype(dtype.newbyteorder("="))
+
+
+def _varying(name: str, field: str, given: str, leaf: Leaf) -> Column:
+    """Return the column of an extra of varying size: of texts, or of lists, which hold arrays row by row."""
+    (key,), item = leaf.path, leaf.item
+    kind = pa.string() if item is None else pa.list_(_number(item.base))
+
+    def values_in(records: Records) -> Array | None:
+        """Return a view of the values; None if the records do not have them."""
+        if key not in (records.dtype[given].names or ()):
+            return None
+        fields = records.dtype.names or ()
+        is_object = "varying" in fields and key in (records.dtype["varying"].names or ())
+        return records["varying" if is_object else field][key]  # some records have arrays of one shape
+
+    def read(records: Records) -> pa.Array:
+        values = values_in(records)
+        if values is None:
+            return pa.nulls(len(records), kind)
+        flags = records[given][key].tolist()
+        if item is None:
+            plain = values.tolist()
+        else:
+            plain = [value.ravel().astype(kind.value_type.to_pandas_dtype()) for value in values]
+        return pa.array(
+            [value if is_given else None for value, is_given in zip(plain, flags, strict=True)], kind
+        )
+
+    def write(records: Records, column: pa.Array) -> None:
+        values = values_in(records)
+        if values is None:
+            return
+        records[given][key] = numbers(column.is_valid())
+        for k, value in enumerate(numbers(column).tolist()):
+            if item is None:
+                values[k] = value or ""
+            elif values.dtype.hasobject or value is not None:
+                flat = np.array([] if value is None else value, item.base)
+                values[k] = flat.reshape(-1, *item.shape)
+
+    return Column(name, kind, read, write)
 
 
 def _inside(values: NDArray[Any], leaf: Leaf) -> NDArray[Any]:

@@ -84,15 +84,20 @@ def write_tables(
 
 
 def left_out(recording: Recording) -> list[str]:
-    """Return the columns of a recording that CSV cannot hold: arrays of many numbers."""
+    """Return the columns that CSV cannot hold: arrays of many numbers, or of varying length."""
     names = [
         column.name
         for name, table in Batches(recording).shape.tables.items()
         if name in _TABLES.values()
         for column in table.columns
-        if pa.types.is_fixed_size_binary(column.type)
+        if not _is_plain(column)
     ]
     return list(dict.fromkeys(names))
+
+
+def _is_plain(column: pa.Field) -> bool:
+    """Return whether a column holds a number or a text in each row."""
+    return not (pa.types.is_fixed_size_binary(column.type) or pa.types.is_list(column.type))
 
 
 def _episode_count(recording: Recording, phase: str) -> int:
@@ -155,7 +160,7 @@ def _write(path: Path, form: str, batches: Iterator[pa.RecordBatch], report: Cal
                 [
                     (column.name, pa.string() if pa.types.is_dictionary(column.type) else column.type)
                     for column in columns
-                    if not pa.types.is_fixed_size_binary(column.type)
+                    if _is_plain(column)
                 ]
             )
             target = stack.enter_context(pa.output_stream(str(path)))  # compressed if its name ends in .gz

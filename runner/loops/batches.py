@@ -133,7 +133,7 @@ class RecordedBatches(Recorded):
             truncated: [T, N] likewise; nowhere unless given.
             final_observations: [T, N, ...], with `autoreset_mode="SameStep"`: the last observations of
                 episodes that ended, wherever `observations` are those of the next ones.
-            extras: values of your own by name, [T, N, ...].
+            extras: values of your own by name, [T, N, ...]; texts, and arrays of any length, in T lists of N.
 
         Raises:
             ConfigError: the arrays do not fit together, or extras cannot be recorded.

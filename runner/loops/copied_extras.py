@@ -1,4 +1,4 @@
-"""The extras of recordings that are folded into another: as recorded, with new numbers."""
+"""The extras of a recording that others are folded into: as recorded, with new numbers."""
 
 from __future__ import annotations
 
@@ -8,10 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError
-from runner.loops.extras import TOPICS, begin_layout
+from runner.loops.extras import begin_layout, blank_extras, put_extras
 from runner.loops.shard_sources import PHASES, Source
-from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
+from runner.recording.extras import (
+    MAX_EXTRA_BYTES,
+    MAX_NAME_LENGTH,
+    MAX_NAMES,
+    ExtraLayout,
+    encoded,
+    united,
+)
 from runner.recording.recorder import Recorder
+from runner.recording.spaces import Description, leaf_dtype
 
 
 class CopiedExtras:
@@ -24,22 +32,22 @@ class CopiedExtras:
             for source in sources
             for phase in PHASES
         }
-        dtypes: dict[str, np.dtype[np.generic]] = {}
+        columns: dict[str, Description] = {}
         self._names: dict[tuple[int, str], str] = {}
         """The names in the run, by number of the process and its own name."""
         for (number, _), own in self._own.items():
-            for name, dtype in own.items():
-                new = name
-                if dtypes.get(name, dtype).shape != dtype.shape:
+            for name, column in own.columns.items():
+                new, before = name, columns.get(name, column)
+                both = united(before, column)
+                if both is None or before["type"] == column["type"] != both["type"]:
                     new = f"{name} ({sources[number].name})"[:MAX_NAME_LENGTH]
-                before = dtypes.get(new, dtype)
-                dtypes[new] = np.dtype((np.promote_types(before.base, dtype.base), dtype.shape))
-                self._names[number, name] = new
-        self._layout = ExtraLayout(0, np.dtype(list(dtypes.items())))
-        if len(dtypes) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
+                    both = united(columns.get(new, column), column) or column
+                columns[new], self._names[number, name] = both, new
+        self._layout = ExtraLayout(0, 0, columns)
+        if len(columns) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
             raise ConfigError(
-                f"extras: found {len(dtypes)} names and {self._layout.values.itemsize:,} bytes a step in all "
-                f"shards, expected at most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
+                f"extras: found {len(columns)} names and {self._layout.values.itemsize:,} bytes a step in "
+                f"all shards, expected at most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
             )
         self._is_described = False
 
@@ -56,20 +64,27 @@ class CopiedExtras:
         own = self._own[source.number, phase]
         if not own:
             return 0
-        values = {self._names[source.number, name]: each for name, each in own.at(numbers).items()}
-        given = {
-            name: ~np.ma.getmaskarray(each).reshape(len(numbers), -1)[:, 0] for name, each in values.items()
-        }
-        rows = np.flatnonzero(np.logical_or.reduce(list(given.values())))
+        n = len(numbers)
+        named = {self._names[source.number, name]: values for name, values in own.at(numbers).items()}
+        flags = {name: ~np.ma.getmaskarray(values).reshape(n, -1)[:, 0] for name, values in named.items()}
+        rows = np.flatnonzero(np.logical_or.reduce(list(flags.values())))
         if not len(rows):
             return 0
         if not self._is_described:
-            begin_layout(self._recorder, self._layout, new_position + int(rows[0]) + 1)
+            begin_layout(self._recorder, 0, self._layout.columns, new_position + int(rows[0]) + 1)
             self._is_described = True
+        columns, given = {}, {}
+        for name, column in self._layout.columns.items():
+            given[name] = flags.get(name, np.zeros(n, np.bool_))[rows]
+            columns[name] = blank_extras(column, len(rows))
+            if name not in named:
+                continue
+            values = named[name].data[rows]
+            if leaf_dtype(column) is not None:
+                columns[name][:] = values
+                continue
+            for k in np.flatnonzero(given[name]).tolist():
+                columns[name][k] = encoded(column, values[k])
         positions = (new_position + rows + 1).astype(np.uint64)
-        for block, part in self._recorder.fill(TOPICS[phase], positions):
-            block["step"] = new_step + rows[part]
-            for name in self._layout.names:
-                block["given"][name] = given[name][rows[part]] if name in given else False
-                block["values"][name] = values[name].data[rows[part]] if name in given else 0
+        put_extras(self._recorder, phase, self._layout, new_step + rows, positions, columns, given)
         return len(rows)

@@ -42,7 +42,9 @@ class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, objec
     def step(self, action: object, extras: Mapping[str, object] | None = None) -> StepResult:
         """Take a step, and record it, with values of your own: `extras={"value": v, "logits": logits}`.
 
-        A name keeps the dtype and the shape of its first value; a step need not have all names.
+        A name keeps the dtype and the shape of its first value, but for the length of the first axis: once it
+        is another one, such as that of token ids, the name varies in length. Texts are recorded too. A step
+        need not have all names.
         """
         rows = self._rows
         given = action if action.__class__ in UNCHANGEABLE else rows.keep(action)

@@ -1,26 +1,38 @@
 """The values that a loop records with its steps: `rec.step(action, extras={"value": value})`.
 
 They are put into columns, a row for each step, and handed to the recorder some thousands at a time. The last
-row waits for `note_step` until the next step is taken.
+row waits for `note_step` until the next step is taken. Values of varying size, which are texts, and arrays
+with a first axis of varying length, are put down as bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RunnerError
 from runner.loops.step_buffer import StepBuffer
-from runner.loops.values import numbers_of
+from runner.loops.values import as_array, numbers_of
 from runner.recording import schema
-from runner.recording.extras import MAX_EXTRA_BYTES, MAX_NAME_LENGTH, MAX_NAMES, ExtraLayout
+from runner.recording.extras import (
+    MAX_EXTRA_BYTES,
+    MAX_NAME_LENGTH,
+    MAX_NAMES,
+    NOTHING,
+    ExtraLayout,
+    box_of,
+    encoded,
+    lengthened,
+    united,
+)
 from runner.recording.gym_values import SCALARS
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
-from runner.recording.spaces import Value
+from runner.recording.spaces import Description, Value, item_dtype, leaf_dtype, row_dtype
 from runner.util.arrays import Array
 from runner.util.values import is_utf8
 
@@ -29,19 +41,28 @@ _MAX_BYTES: Final = 4 << 20
 """The most rows, and bytes of them, that wait for the recorder."""
 _MAX_DIMENSIONS: Final = 8
 _PYTHON: Final = {bool: "?", int: "<i8", float: "<f8"}
-TOPICS: Final = {"train": schema.TRAIN_EXTRA, "eval": schema.EVAL_EXTRA}
+_Values = Array | list[Any]
+"""Values of a name: numbers as an array, else a list of texts, or of arrays of different lengths."""
+
+
+class _OtherValues(KeyError):
+    """A value that does not fit into its column."""
 
 
 class _Column(NamedTuple):
     """The values of one name that the recorder does not have yet."""
 
-    dtype: np.dtype[np.generic]
+    dtype: np.dtype[np.generic] | None
+    """Of a number; None where values vary in size, which are bytes then."""
     shape: tuple[int, ...]
     """The shape of a row: [*batch, ...]."""
     scalars: frozenset[type]
     """The classes of single numbers that it holds exactly."""
     values: Array
     """[rows, *shape]."""
+    fit: Callable[[int, object], Any]
+    """Returns a value of another class or dtype, as it is put into a row given by its number; raises
+    `_OtherValues` if it has another shape or dtype."""
 
 
 class Extras:
@@ -55,17 +76,24 @@ class Extras:
         self._recorder, self._batch = recorder, batch
         self._n = batch[0] if batch else 1
         self._taken = recorder.steps
-        self._dtypes: dict[str, np.dtype[np.generic]] = {}
-        """The dtype of each name's values of one environment, with their shape."""
-        self._is_described = False
-        """Whether the recording has the names and dtypes."""
+        self._described: dict[str, Description] = {}
+        """The description of each name's values of one environment."""
+        self._layout = ExtraLayout(-1, 0, {})
+        """The last layout that the recording has."""
         self._columns: dict[str, _Column] = {}
-        self._max_rows = 0
+        self._room, self._max_rows = 0, 0
+        """The most rows of the columns, and those that may wait now."""
         self._phase = ""
         self._steps: list[int] = []
         """The number of the step of each row; of several environments, that of the first."""
         self._partial: dict[int, set[str]] = {}
         """The names that were given, in rows that do not have all."""
+        self._fixed_bytes = 0
+        """Bytes of a step's values of one size."""
+        self._held, self._held_row = 0, -1
+        """Bytes of all values of varying size, and the last row that has some."""
+        self._row_bytes: dict[str, int] = {}
+        """The most bytes of an environment in that row, by name."""
         self._final = dict.fromkeys(schema.PHASES, -1)
         """The last step of each phase that cannot be extended any more."""
 
@@ -82,12 +110,12 @@ class Extras:
             row = len(steps)
             try:
                 for name, value in values.items():
-                    dtype, shape, scalars, cells = columns[name]
+                    dtype, shape, scalars, cells, fit = columns[name]
                     is_fitting = value.__class__ in scalars or (
                         value.__class__ is array and value.dtype is dtype and value.shape == shape
                     )
-                    cells[row] = value if is_fitting else _fitting(name, value, dtype, shape)
-            except (AttributeError, KeyError):  # no mapping, or a new name
+                    cells[row] = value if is_fitting else fit(row, value)
+            except (AttributeError, KeyError):  # no mapping, a new name, or values of another length
                 self._grow(row, values)
                 take(values)
                 return
@@ -120,10 +148,9 @@ class Extras:
             return
         self._grow(len(self._steps) - 1, values)
         row = len(self._steps) - 1
-        columns = {name: self._columns[name] for name in values}
-        fitting = {name: _fitting(name, values[name], own.dtype, own.shape) for name, own in columns.items()}
+        fitting = {name: self._columns[name].fit(row, value) for name, value in values.items()}
         for name, value in fitting.items():
-            columns[name].values[row] = value
+            self._columns[name].values[row] = value
         if row in self._partial:
             self._partial[row].update(values)
 
@@ -131,25 +158,26 @@ class Extras:
         """Return the values of T steps of N environments, by name, as `put_batch` takes them.
 
         Args:
-            values: [T, N, ...] each.
+            values: [T, N, ...] each; values of varying size in lists of T lists of N.
             shape: T and N.
 
         Raises:
             ConfigError: a name or a value cannot be recorded.
         """
-        if not isinstance(values, Mapping):
-            raise ConfigError(f"extras: found {type(values).__name__}, expected arrays by name")
-        arrays = {name: _numbers(name, value) for name, value in values.items()}
-        for name, array in arrays.items():
-            if array.shape[:2] != shape:
-                raise ConfigError(
-                    f"extras: found shape {array.shape} for {name!r}, expected {(*shape, '...')}"
-                )
-        self._grow(len(self._steps), {name: array[0] for name, array in arrays.items()})
-        return {
-            name: _fitting(name, array, self._columns[name].dtype, shape[:1] + self._columns[name].shape)
-            for name, array in arrays.items()
-        }
+        self._grow(len(self._steps), values, shape)
+        sizes = np.full(shape[0] * self._n, self._fixed_bytes)
+        flat = {}
+        for name, value in values.items():
+            column, whole = self._described[name], _values(name, value, shape)
+            if leaf_dtype(column) is None:
+                flat[name] = _objects([encoded(column, item) for item in _listed(whole, shape)])
+                sizes += [len(item) for item in flat[name].tolist()]
+            else:
+                assert isinstance(whole, np.ndarray)
+                flat[name] = whole.reshape(len(sizes), *whole.shape[2:])
+        if sizes.max() > MAX_EXTRA_BYTES:
+            raise _too_large(int(sizes.max()))
+        return flat
 
     def put_batch(self, phase: str, rows: StepBuffer, values: Mapping[str, Array]) -> None:
         """Hand the values of the T steps of all environments that were just taken to the recorder.
@@ -159,65 +187,106 @@ class Extras:
         """
         self._write(len(self._steps))
         self._phase = phase
-        count = len(next(iter(values.values()))) * self._n
+        count = len(next(iter(values.values())))
         first = self._taken[phase] + rows.filled - count
         columns = {
-            name: values[name].reshape(count, *own.shape) if name in values else np.zeros(count, own)
-            for name, own in self._dtypes.items()
+            name: values.get(name, blank_extras(column, count)) for name, column in self._described.items()
         }
-        given = {name: np.full(count, name in values) for name in self._dtypes}
+        given = {name: np.full(count, name in values) for name in self._columns}
         self._send(np.arange(first, first + count), columns, given)
 
-    def _grow(self, row: int, values: Mapping[str, object]) -> None:
-        """Add the names that are new, of which rows before this one have no values."""
+    def _grow(self, row: int, values: Mapping[str, object], lead: tuple[int, ...] | None = None) -> None:
+        """Add the names that are new, and let arrays vary in length that have another one for the first time.
+
+        Args:
+            row: the first row that may have them.
+            values: [*lead, ...] each; by default those of one step.
+
+        Raises:
+            ConfigError: a name or a value cannot be recorded.
+        """
         if not isinstance(values, Mapping):
             raise ConfigError(f"extras: found {type(values).__name__}, expected values by name")
-        fresh = {
-            name: self._dtype_of(name, value) for name, value in values.items() if name not in self._columns
+        lead = self._batch if lead is None else lead
+        described = self._described | {
+            name: _needed(name, self._described.get(name), value, lead) for name, value in values.items()
         }
-        if not fresh:
+        if described == self._described:
             return
-        dtypes = self._dtypes | fresh
-        if len(dtypes) > MAX_NAMES:
-            raise ConfigError(f"extras: found more than {MAX_NAMES} names, the last {list(dtypes)[-1]!r}")
-        if (size := sum(dtype.itemsize for dtype in dtypes.values())) > MAX_EXTRA_BYTES:
+        if len(described) > MAX_NAMES or self._layout.number + 1 == schema.MAX_LAYOUTS:
             raise ConfigError(
-                f"extras: found {size:,} bytes a step, expected at most {MAX_EXTRA_BYTES:,}; snapshot() "
-                "records a larger array now and then."
+                f"extras: found more than {MAX_NAMES} names, or {schema.MAX_LAYOUTS} steps with names that "
+                f"were new or began to vary in length, the last {list(values)[-1]!r}"
             )
+        size = sum(dtype.itemsize for dtype in map(leaf_dtype, described.values()) if dtype is not None)
+        if size > MAX_EXTRA_BYTES:
+            raise _too_large(size)
         self._write(row)
         if self._steps:
-            self._partial.setdefault(0, set(self._dtypes))
-        self._max_rows = max(1, min(_MAX_ROWS, _MAX_BYTES // (size * self._n)))
-        self._dtypes, self._is_described = dtypes, False
+            self._partial.setdefault(0, set(self._described))
+        self._fixed_bytes, self._described = size, described
+        width = row_dtype({"type": "Dict", "spaces": described}).itemsize * self._n
+        self._room = self._max_rows = max(1, min(_MAX_ROWS, _MAX_BYTES // width))
         left = len(self._steps)
-        for name, dtype in dtypes.items():
-            own = self._columns.get(name)
-            base, shape = np.dtype(dtype.base.str), (*self._batch, *dtype.shape)
-            column = _column(base, shape, self._max_rows + 1)
+        for name, description in described.items():
+            before, column = self._columns.get(name), self._column(name, description)
             self._columns[name] = column
-            if own is not None:
-                column.values[:left] = own.values[:left]
+            if before is None:
+                continue
+            if before.values.dtype == column.values.dtype:
+                column.values[:left] = before.values[:left]
+            else:
+                for k in range(left):
+                    column.values[k] = column.fit(k, before.values[k])
 
-    def _dtype_of(self, name: object, value: object) -> np.dtype[np.generic]:
-        """Return the dtype, with the shape, that a name gets by its first value."""
-        if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or not is_utf8(name):
-            raise ConfigError(
-                f"extras: found the name {str(name)[:80]!r}, expected text of 1 to {MAX_NAME_LENGTH} letters"
-            )
-        array = _numbers(name, value)
-        if array.shape[: len(self._batch)] != self._batch:
-            raise ConfigError(
-                f"extras: found shape {array.shape} for {name!r}, expected an array [{self._n}, ...] with a "
-                "value for each environment"
-            )
-        shape = array.shape[len(self._batch) :]
-        if not array.size or array.ndim > _MAX_DIMENSIONS:
-            raise ConfigError(
-                f"extras: found an array of shape {array.shape} for {name!r}, expected at most "
-                f"{_MAX_DIMENSIONS} dimensions, and a number at least"
-            )
-        return np.dtype((array.dtype.newbyteorder("<").str, shape))
+    def _column(self, name: str, description: Description) -> _Column:
+        """Return a column for values of a description."""
+        dtype, batch = leaf_dtype(description), self._batch
+        if dtype is None:
+            column = np.empty((self._room + 1, *batch), object)
+            column.fill(NOTHING)
+            return _Column(None, (), frozenset(), column, self._varying_fit(name, description))
+        base, shape = np.dtype(dtype.base.str), (*batch, *dtype.shape)
+        exact: set[type] = {
+            kind for kind in SCALARS if np.can_cast(kind, base) and (kind is not np.bool_ or base.kind == "b")
+        }
+        exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
+
+        def fit(_: int, value: object) -> Array:
+            values = _values(name, value, batch)
+            if isinstance(values, list) or values.shape != shape or not np.can_cast(values.dtype, base):
+                raise _OtherValues(name)
+            return values
+
+        cells = np.zeros((self._room + 1, *shape), base)
+        return _Column(base, shape, frozenset(() if shape else exact), cells, fit)
+
+    def _varying_fit(self, name: str, description: Description) -> Callable[[int, object], Any]:
+        """Return the function that returns values of varying size as bytes, and counts these."""
+        batch, item_type = self._batch, item_dtype(description)
+        base = None if item_type is None else item_type.base
+
+        def is_alike(item: Any) -> bool:
+            if item_type is None:
+                return isinstance(item, str)
+            return not isinstance(item, str) and (item.dtype, item.shape[1:]) == (base, item_type.shape)
+
+        def fit(row: int, value: object) -> Any:
+            items = _listed(_values(name, value, batch), batch)
+            if not all(map(is_alike, items)):
+                _needed(name, description, value, batch)
+            data = [encoded(description, item) for item in items]
+            if row != self._held_row:
+                self._held_row, self._row_bytes = row, {}
+            self._row_bytes[name] = max(map(len, data))
+            if (size := self._fixed_bytes + sum(self._row_bytes.values())) > MAX_EXTRA_BYTES:
+                raise _too_large(size)
+            self._held += sum(map(len, data))
+            if self._held > _MAX_BYTES:
+                self._max_rows = min(self._max_rows, row)
+            return _objects(data) if batch else data[0]
+
+        return fit
 
     def commit(self) -> None:
         """Hand all rows to the recorder but the last one, which may be extended."""
@@ -232,11 +301,9 @@ class Extras:
         """Hand the first n rows to the recorder."""
         if n <= 0:
             return
-        given = self._given(n)
-        columns = {
-            name: column.values[:n].reshape(-1, *self._dtypes[name].shape)
-            for name, column in self._columns.items()
-        }
+        given, columns = self._given(n), {}
+        for name, column in self._columns.items():
+            columns[name] = column.values[:n].reshape(-1, *column.shape[len(self._batch) :])
         steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
         self._send(steps, columns, given)
         del self._steps[:n]
@@ -244,62 +311,205 @@ class Extras:
         for column in self._columns.values():
             column.values[:left] = column.values[n : n + left]
         self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
+        self._max_rows, self._held_row = self._room, self._held_row - n
+        self._held = sum(self._row_bytes.values()) * self._n if self._held_row >= 0 else 0
 
     def _send(
         self, steps: NDArray[np.int64], columns: Mapping[str, Array], given: Mapping[str, NDArray[np.bool_]]
     ) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""
-        topic, recorder = TOPICS[self._phase], self._recorder
+        recorder = self._recorder
         # The steps of the other phase came before all of these.
         first = recorder.position - recorder.steps[self._phase] + 1
-        if not self._is_described:
-            layout = ExtraLayout(0, np.dtype(list(self._dtypes.items())))
-            begin_layout(recorder, layout, first + int(steps[0]))
-            self._is_described = True
-        for block, part in recorder.fill(topic, (steps + first).astype(np.uint64)):
-            block["step"] = steps[part]
-            for name, values in columns.items():
-                block["values"][name] = values[part]
-                block["given"][name] = given[name][part]
+        if self._layout.columns != self._described:
+            position = first + int(steps[0])
+            self._layout = begin_layout(recorder, self._layout.number + 1, self._described, position)
+        positions = (steps + first).astype(np.uint64)
+        put_extras(recorder, self._phase, self._layout, steps, positions, columns, given)
         self._final[self._phase] = int(steps[-1])
 
     def _given(self, n: int) -> dict[str, NDArray[np.bool_]]:
-        """Return whether each environment's step has a value, by name, in n rows; zero those without one."""
-        given = {name: np.ones(n, np.bool_) for name in self._dtypes}
+        """Return whether each environment's step has a value, by name, in n rows; blank those without one."""
+        given = {name: np.ones(n, np.bool_) for name in self._columns}
         for row, names in self._partial.items():
             for name in given.keys() - names if row < n else ():
                 given[name][row] = False
-                self._columns[name].values[row] = 0
+                column = self._columns[name]
+                column.values[row : row + 1].fill(NOTHING if column.dtype is None else 0)
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
 
-def begin_layout(recorder: Recorder, layout: ExtraLayout, position: int) -> None:
+def begin_layout(
+    recorder: Recorder, number: int, columns: Mapping[str, Description], position: int
+) -> ExtraLayout:
     """Record the names of extras from a position on."""
-    payload = encode(schema.EXTRA_COLUMNS, {"json": layout.json})
-    recorder.append(schema.EXTRA_COLUMNS_TOPIC, payload, position)
-    recorder.flush_messages()
-    recorder.set_messages(dict.fromkeys(TOPICS.values(), layout.message))
+    layout = ExtraLayout(number, position * schema.STEP_NANOSECONDS, columns)
+    recorder.append(schema.EXTRA_COLUMNS_TOPIC, encode(schema.EXTRA_COLUMNS, layout.fields), position)
+    recorder.begin_extras(number, layout.message)
+    return layout
 
 
-def _column(base: np.dtype[np.generic], shape: tuple[int, ...], rows: int) -> _Column:
-    """Return a column for values of a dtype and a shape."""
-    exact: set[type] = {
-        kind for kind in SCALARS if np.can_cast(kind, base) and (kind is not np.bool_ or base.kind == "b")
-    }
-    exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
-    return _Column(base, shape, frozenset(() if shape else exact), np.zeros((rows, *shape), base))
+def put_extras(
+    recorder: Recorder,
+    phase: str,
+    layout: ExtraLayout,
+    steps: NDArray[np.int64],
+    positions: NDArray[np.uint64],
+    columns: Mapping[str, Array],
+    given: Mapping[str, NDArray[np.bool_]],
+) -> None:
+    """Record the extras of steps, given by number and position.
+
+    Args:
+        columns: the values of each name; those of varying size as bytes.
+    """
+    varying = layout.varying["spaces"]
+    for block, part in recorder.fill(schema.extra_topic(phase, layout.number), positions):
+        block["step"] = steps[part]
+        for name in layout.columns:
+            block["given"][name] = given[name][part]
+            if name not in varying:
+                block["values"][name] = columns[name][part]
+        if varying:
+            parts = zip(*(columns[name][part].tolist() for name in varying), strict=True)
+            block["varying"] = _objects(map(b"".join, parts))
 
 
-def _fitting(name: str, value: object, base: np.dtype[np.generic], shape: tuple[int, ...]) -> Array:
-    """Return a value as an array, of the shape and of a dtype that the column holds exactly."""
-    array = _numbers(name, value)
-    if array.shape != shape or not np.can_cast(array.dtype, base):
+def _objects(items: Iterable[bytes]) -> Array:
+    """Return objects as an array."""
+    return np.fromiter(items, object)
+
+
+def blank_extras(description: Description, count: int) -> Array:
+    """Return values that stand where none are given."""
+    dtype = leaf_dtype(description)
+    return _objects([NOTHING] * count) if dtype is None else np.zeros(count, dtype)
+
+
+def _too_large(size: int) -> ConfigError:
+    return ConfigError(
+        f"extras: found {size:,} bytes a step, expected at most {MAX_EXTRA_BYTES:,}; snapshot() records a "
+        "larger array now and then."
+    )
+
+
+def _values(name: str, value: object, lead: tuple[int, ...]) -> _Values:
+    """Return the values of a name, [*lead, ...]: an array, or a list of texts or arrays, row by row.
+
+    Raises:
+        ConfigError: it holds something else, or not as many.
+    """
+    if not lead:
+        return [value] if isinstance(value, str) else _numbers(name, value)
+    try:
+        array = as_array(value)
+    except (TypeError, ValueError, RuntimeError, OverflowError):
+        array = np.empty(0, object)
+    if array.dtype.kind in "biuf" and (array.size or not isinstance(value, list | tuple)):
+        if array.shape[: len(lead)] != lead:
+            raise _wrong_shape(name, f"shape {array.shape}", lead)
+        return array
+    items: list[Any] = [value]
+    for n in lead:
+        for item in items:
+            is_array = isinstance(item, np.ndarray) and item.ndim > 0
+            if not (is_array or isinstance(item, list | tuple)) or len(item) != n:
+                raise _wrong_shape(name, f"{type(item).__name__} {str(item)[:40]!r}", lead)
+        items = [part for item in items for part in item]
+    items = [item if isinstance(item, str) else _numbers(name, item) for item in items]
+    if len({np.shape(item) for item in items}) == 1 and not isinstance(items[0], str) and items[0].size:
+        return np.stack(items).reshape(*lead, *items[0].shape)
+    return items
+
+
+def _listed(values: _Values, lead: tuple[int, ...]) -> list[Any]:
+    """Return the value of each environment."""
+    if isinstance(values, list):
+        return values
+    return list(values.reshape(math.prod(lead), *values.shape[len(lead) :]))
+
+
+def _needed(name: object, known: Description | None, value: object, lead: tuple[int, ...]) -> Description:
+    """Return the description that a name needs for values, [*lead, ...], besides those that it had before.
+
+    It keeps the dtype and the shape of its first value; only the first axis may get another length.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME_LENGTH or not is_utf8(name):
         raise ConfigError(
-            f"extras: found {array.dtype} of shape {array.shape} for {name!r}, expected {base} of shape "
-            f"{shape} as in its first value: convert it, or record it under another name"
+            f"extras: found the name {str(name)[:80]!r}, expected text of 1 to {MAX_NAME_LENGTH} letters"
         )
-    return array
+    values = _values(name, value, lead)
+    given = _described(name, values, lead)
+    is_empty = given["type"] == "Array" and not any(item.size for item in _listed(values, lead))
+    if known is None:
+        if is_empty and isinstance(value, list | tuple) and given["dtype"] == "|b1":
+            raise ConfigError(
+                f"extras: found an empty list as the first value of {name!r}, expected an array, which has a "
+                "dtype, such as np.zeros(0, np.int64)"
+            )
+        return given
+    if is_empty and known.get("shape"):  # it fits, whatever dtype it has
+        return lengthened(known)
+    both = united(known, given)
+    if both is not None and both.get("dtype") == known.get("dtype"):
+        return both
+    raise ConfigError(
+        f"extras: found {_named(given)} for {name!r}, expected {_named(known)} as in its first value: "
+        "convert it, or record it under another name"
+    )
+
+
+def _described(name: str, values: _Values, lead: tuple[int, ...]) -> Description:
+    """Return the description of the first values of a name."""
+    if isinstance(values, list):
+        if all(isinstance(item, str) for item in values):
+            return {"type": "Text"}
+        if any(isinstance(item, str) or not item.ndim for item in values):
+            raise ConfigError(
+                f"extras: found values of different kinds for {name!r}, expected texts or arrays"
+            )
+        shapes = {item.shape[1:] for item in values if item.shape != (0,)} or {()}
+        if len(shapes) == 1:
+            dtype = np.result_type(*(item.dtype for item in values))
+            return lengthened(box_of(dtype.newbyteorder("<"), (0, *shapes.pop())))
+        raise ConfigError(
+            f"extras: found arrays of other shapes than each other for {name!r}, expected arrays that differ "
+            "in their first axis only"
+        )
+    shape = values.shape[len(lead) :]
+    if 0 in shape[1:] or values.ndim > _MAX_DIMENSIONS:
+        raise ConfigError(
+            f"extras: found an array of shape {values.shape} for {name!r}, expected at most "
+            f"{_MAX_DIMENSIONS} dimensions, and a number at least in all but the first"
+        )
+    box = box_of(values.dtype.newbyteorder("<"), shape)
+    return lengthened(box) if shape[:1] == (0,) else box
+
+
+def _named(description: Description) -> str:
+    """Return what values are, for an error."""
+    if description["type"] == "Text":
+        return "str"
+    lengths = ["T" if n is None else str(n) for n in description["shape"]]
+    shape = f"({', '.join(lengths)}{',' if len(lengths) == 1 else ''})"
+    return f"{np.dtype(description['dtype'])} of shape {shape}"
+
+
+def _wrong_shape(name: str, found: str, lead: tuple[int, ...]) -> ConfigError:
+    if len(lead) > 1:
+        return ConfigError(f"extras: found {found} for {name!r}, expected {(*lead, '...')}")
+    return ConfigError(
+        f"extras: found {found} for {name!r}, expected an array [{lead[0]}, ...] or a list with a value for "
+        "each environment"
+    )
 
 
 def _numbers(name: str, value: object) -> Array:
-    return numbers_of(value, "extras", f"for {name!r}", "a number or an array of numbers")
+    if isinstance(value, list | tuple) and not value:
+        return np.zeros(0, np.bool_)  # which fits into any dtype
+    return numbers_of(
+        value, "extras", f"for {name!r}", "a number or an array of numbers, of one shape, or a text"
+    )

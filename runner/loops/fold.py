@@ -355,7 +355,7 @@ class _Fold:
 
     def _copy_messages(self, topic: Topic, spool: BinaryIO) -> None:
         """Copy the messages of a topic, but those of steps, in the order of the run."""
-        if topic in (*schema.ROW_TOPICS, *schema.EXTRA_TOPICS, schema.EXTRA_COLUMNS_TOPIC):
+        if topic in schema.ROW_TOPICS or topic.message in (schema.EXTRA, schema.EXTRA_COLUMNS):
             return
         spool.seek(0)
         places: list[tuple[int, int, int, int]] = []

@@ -129,8 +129,9 @@ class Recorded:
             rec.note_step(td_error=error)
             rec.note_step({"td error": error})
 
-        A name keeps the dtype and the shape of its first value. In a vector environment a value is an array
-        [N, ...]; with several agents it is a mapping of names for each agent.
+        A name keeps the dtype and the shape of its first value; the first axis of arrays may have another
+        length, and texts are recorded too. In a vector environment a value is an array [N, ...], or a list of
+        N arrays or texts; with several agents it is a mapping of names for each agent.
 
         Raises:
             ConfigError: a name or a value cannot be recorded.

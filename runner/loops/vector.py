@@ -64,7 +64,11 @@ class RecordedVector(Recorded, _Wrapper):
             self._watch.phase_began()
 
     def step(self, actions: object, extras: Mapping[str, object] | None = None) -> VectorStepResult:
-        """Take a step in every environment, and record it, with arrays [N, ...] of your own by name."""
+        """Take a step in every environment, and record it, with values of your own by name.
+
+        Args:
+            extras: arrays [N, ...], or lists of N texts or arrays of any lengths.
+        """
         watch, frames_every = self._watch, self._options.frames_every
         watch.steps += 1
         over = None

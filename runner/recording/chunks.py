@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.schema import ACTIONS, EXTRA, EXTRA_TOPICS, ROW_TOPICS, STEP, TOPIC_OF, Topic
+from runner.recording.schema import ACTIONS, EXTRA, ROW_TOPICS, STEP, TOPIC_OF, Topic
 from runner.util.packing import MAX_CHUNK_STEPS, MAX_LEVEL, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -222,7 +222,9 @@ def _check_message_count(body: memoryview, head: ChunkHead, where: str) -> None:
     """
     length, channel = _first_message(body, head, where)
     messages = head.uncompressed_size // (RECORD_HEAD.size + length)
-    if TOPIC_OF.get(channel) in (*ROW_TOPICS, *EXTRA_TOPICS) and messages > MAX_CHUNK_STEPS:
+    topic = TOPIC_OF.get(channel)
+    is_row = topic in ROW_TOPICS or (topic is not None and topic.message is EXTRA)
+    if is_row and messages > MAX_CHUNK_STEPS:
         raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
 
 

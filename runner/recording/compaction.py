@@ -79,6 +79,8 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
         read[record.topic.name] += len(record.times)
         if record.topic.message is schema.ACTIONS:
             return None
+        if record.topic is schema.EXTRA_COLUMNS_TOPIC:  # before the extras that have these names
+            return record
         if len(record.records) > _SMALL:
             batches.flush_topic(record.topic)
             return record

@@ -100,8 +100,10 @@ def check_extras(recording: Recording, phase: str, complete: bool) -> None:
             raise Inconsistent(f"{where}: found steps out of order, or after the last of {total:,}")
         last = int(numbers[-1])
         for name in block["values"].dtype.names or ():
-            given, values = block["given"][name], block["values"][name].reshape(len(block), -1)
-            if (given.view(np.uint8) > 1).any() or values[~given].any():
+            given, values = block["given"][name], block["values"][name]
+            unknown = values[~given]
+            is_any = any(map(len, unknown)) if values.dtype.hasobject else unknown.any()
+            if (given.view(np.uint8) > 1).any() or is_any:
                 raise Inconsistent(f"{where}: {name}: found values where none were given")
         if steps and steps.dtype is not None:
             parts = steps.blocks(int(numbers[0]), last + 1)

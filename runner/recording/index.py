@@ -7,10 +7,11 @@ in memory is bounded whatever the file declares: 46 bytes a chunk, and few names
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
+from operator import attrgetter, itemgetter
 from typing import BinaryIO, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -45,7 +46,18 @@ from runner.recording.records import (
     most_bytes,
     raw_records,
 )
-from runner.recording.schema import ALL_TOPICS, MESSAGES, PROFILE, Topic
+from runner.recording.schema import (
+    ALL_TOPICS,
+    EXTRA,
+    MAX_LAYOUTS,
+    MESSAGES,
+    PROFILE,
+    TOPIC_OF,
+    MessageType,
+    Topic,
+    extra_topic,
+    schema_id,
+)
 from runner.util.arrays import Records
 
 K = TypeVar("K")
@@ -274,6 +286,18 @@ class Index:
         self.channels = {channel.id: channel for channel in beginning.channels}
         self._written = beginning
 
+    def declare(self, beginning: Beginning) -> None:
+        """Add schemas and channels that are written after the beginning."""
+        before = self.beginning
+        self.schemas |= {schema.id: schema for schema in beginning.schemas}
+        self.channels |= {channel.id: channel for channel in beginning.channels}
+        self._written = Beginning(
+            [*before.schemas, *beginning.schemas],
+            [*before.channels, *beginning.channels],
+            before.schema_records + beginning.schema_records,
+            before.channel_records + beginning.channel_records,
+        )
+
     @property
     def beginning(self) -> Beginning:
         """Its schemas and channels."""
@@ -317,11 +341,10 @@ class Index:
     def count_messages(self) -> dict[int, int]:
         """Return the number of messages of each channel that has any, by the entries of the chunks."""
         chunks = self.chunks.columns
-        counts = {
-            topic.channel: int(chunks["messages"][chunks["channel"] == topic.channel].sum())
-            for topic in ALL_TOPICS
+        return {
+            channel: int(chunks["messages"][chunks["channel"] == channel].sum())
+            for channel in np.unique(chunks["channel"]).tolist()
         }
-        return {channel: n for channel, n in counts.items() if n}
 
     def _statistics(self) -> Statistics:
         chunks, counts = self.chunks.columns, self.count_messages()
@@ -399,23 +422,31 @@ def checksum(stream: BinaryIO, start: int, end: int) -> int:
 
 @lru_cache(64)
 def beginning_of(layout: Layout) -> Beginning:
-    """Return the schemas and channels of a recording, whose records follow its header."""
-    numbers = {message: number for number, message in enumerate(MESSAGES, start=1)}
-    messages = {topic.message: layout.message(topic) for topic in layout.topics}
+    """Return the schemas and channels of a recording, whose records follow its header.
+
+    Those of extras come later, when their names are known.
+    """
+    return _beginning({topic: layout.message(topic) for topic in layout.topics if topic.message is not EXTRA})
+
+
+@lru_cache(64)
+def beginning_of_extras(number: int, message: MessageType) -> Beginning:
+    """Return the schema and the channels of a layout of extras, whose records precede their first chunk."""
+    return _beginning({extra_topic(phase, number): message for phase in ("train", "eval")})
+
+
+def channel_of(topic: Topic) -> Channel:
+    """Return the channel of a topic."""
+    return Channel(topic.channel, topic.name, "protobuf", {}, schema_id(topic))
+
+
+def _beginning(messages: Mapping[Topic, MessageType]) -> Beginning:
+    numbered = {schema_id(topic): message for topic, message in messages.items()}
     schemas = [
-        Schema(
-            id=number,
-            data=file_descriptor_set(messages[message]),
-            encoding="protobuf",
-            name=message.full_name,
-        )
-        for message, number in numbers.items()
-        if message in messages
+        Schema(id=number, data=file_descriptor_set(message), encoding="protobuf", name=message.full_name)
+        for number, message in sorted(numbered.items(), key=itemgetter(0))
     ]
-    channels = [
-        Channel(topic.channel, topic.name, "protobuf", {}, numbers[topic.message])
-        for topic in sorted(layout.topics, key=lambda topic: topic.channel)
-    ]
+    channels = [*map(channel_of, sorted(messages, key=attrgetter("channel")))]
     return Beginning(schemas, channels, bytes_of(*schemas), bytes_of(*channels))
 
 
@@ -494,7 +525,8 @@ def _add_once(known: dict[K, T], key: K, value: T, what: str) -> None:
     """Add an entry; a file may have one of each key, and not too many."""
     if key in known:
         raise RecordingError(f"has {what} {key!r} twice")
-    if len(known) == {"channel": len(ALL_TOPICS), "schema": len(MESSAGES)}.get(what, MAX_NAMED):
+    most = {"channel": len(TOPIC_OF), "schema": len(MESSAGES) + MAX_LAYOUTS}.get(what, MAX_NAMED)
+    if len(known) == most:
         raise RecordingError(
             f"has more than {len(known):,} {what} records, the most that a recording may have"
         )

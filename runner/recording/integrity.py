@@ -14,12 +14,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import CutOff, OtherVersion, RecordingError
-from runner.recording.blocks import RECORD_HEAD, constant_bytes
+from runner.recording import schema
+from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, message_index
+from runner.recording.extras import ExtraNames
 from runner.recording.index import Index, beginning_of, check_beginning, checksum
 from runner.recording.layout import Layout
 from runner.recording.metadata import layout_of_run
@@ -29,6 +30,7 @@ from runner.recording.records import (
     ReadChunk,
     Report,
     asks_for_indexes,
+    check_constants,
     read_record,
     walk,
 )
@@ -143,20 +145,6 @@ def _check_beginning(raw: RawRecord, contents: Index, layout: Layout) -> None:
         raise RecordingError("found other schemas or channels than a recording of its kind begins with")
 
 
-def _check_constants(chunk: ReadChunk, layout: Layout) -> None:
-    """Check the bytes of a loop's messages that are the same in each: retraining compares those of a job.
-
-    Raises:
-        RecordingError: other readers would find other values there.
-    """
-    dtype = layout.dtype(chunk.topic) if chunk.topic in layout.topics and layout.kind != "job" else None
-    if dtype is not None and len(chunk.records) == len(chunk.times) * dtype.itemsize:
-        blank, is_constant = constant_bytes(chunk.topic, layout.message(chunk.topic))
-        rows = np.frombuffer(chunk.records, np.uint8).reshape(-1, dtype.itemsize)
-        if (rows[:, is_constant] != blank[is_constant]).any():
-            raise RecordingError(f"chunk at {chunk.offset}: found tags that no recorder writes")
-
-
 def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: Report, path: str) -> None:
     """Note the good records of the data section.
 
@@ -164,7 +152,7 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
         OtherVersion: the recording has another version of the format.
         RecordingError: a record is damaged, or the file ends before the data section does.
     """
-    indexed = True
+    indexed, names = True, ExtraNames(path)
     layout: Layout | None = None
     chunk: ReadChunk | None = None
     """The record before, if it is a chunk."""
@@ -181,8 +169,12 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
         record = read_record(raw)
         if isinstance(record, ReadChunk):
             _check_times(record)
-            if layout is not None:
-                _check_constants(record, layout)
+            if record.topic is schema.EXTRA_COLUMNS_TOPIC:
+                names.take(record)
+            if record.topic.message is schema.EXTRA:
+                names.check(record, contents)
+            elif layout is not None and layout.kind != "job" and record.topic in layout.topics:
+                check_constants(record, layout.message(record.topic))
             chunk = record._replace(body=b"")
             del record  # memory that is free for the next record makes a survey a third quicker
             continue

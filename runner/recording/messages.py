@@ -17,9 +17,18 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, blank_records, row_dtype
+from runner.recording.blocks import HEADER_BYTES, blank_records, constant_bytes, row_dtype
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, Field, MessageType
-from runner.recording.space_fields import Decoder, Encoder, decoder, encoder, is_text, raw_field, varint
+from runner.recording.space_fields import (
+    Decoder,
+    Encoder,
+    are_exact,
+    decoder,
+    encoder,
+    is_text,
+    raw_field,
+    varint,
+)
 from runner.recording.spaces import NUMBERS
 from runner.util.arrays import Array, Records
 
@@ -151,17 +160,21 @@ def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> 
         RecordingError: one is not as `encode_rows` writes them.
     """
     numbers, decoders = _numbers_of(message), _decoders(message)
-    blank = blank_records(schema.LOG_TOPIC, numbers, len(messages))
-    size = blank.itemsize - HEADER_BYTES
+    dtype = blank_records(schema.LOG_TOPIC, numbers, 0).dtype
+    size = dtype.itemsize - HEADER_BYTES
     head = bytes(HEADER_BYTES)
     joined = b"".join([head + payload[:size].ljust(size, b"\0") for _, payload in messages])
-    records = np.frombuffer(joined, blank.dtype)
+    records = np.frombuffer(joined, dtype)
     rows = np.zeros(len(messages), row_dtype(message))
     rows["log_time"] = rows["publish_time"] = [time for time, _ in messages]
+    expected, is_constant = constant_bytes(schema.LOG_TOPIC, numbers)
+    found = records.view(np.uint8).reshape(len(messages), -1)
+    is_message = bool((found[:, is_constant] == expected[is_constant]).all())
     for field in numbers.fields:
-        if not np.array_equal(records[f"tag_{field.name}"], blank[f"tag_{field.name}"]):
-            raise RecordingError(f"found a payload that is no {message.full_name}")
         rows[field.name] = records[field.name]
+        is_message &= are_exact(field, rows[field.name], records[field.name])
+    if not is_message:
+        raise RecordingError(f"found a payload that is no {message.full_name}")
     for k, (_, payload) in enumerate(messages):
         end = size
         for name, decode_value in decoders.items():

@@ -26,7 +26,7 @@ from runner.environments.mdp import (
 from runner.environments.scene import scene_mistake
 from runner.errors import OtherVersion, RecordingError
 from runner.recording import schema
-from runner.recording.index import Index, beginning_of
+from runner.recording.index import Index, beginning_of, channel_of
 from runner.recording.layout import Layout, layout_of
 from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.packed_arrays import pack_array, unpack_array
@@ -96,8 +96,15 @@ def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
     Raises:
         RecordingError: it is of another version, is damaged, or has another schema or channel.
     """
-    expected = beginning_of(layout_of_run(run, path))
+    layout = layout_of_run(run, path)
+    expected = beginning_of(layout)
     topics = {channel.id: channel for channel in expected.channels}
+    if schema.TRAIN_EXTRA in layout.topics:
+        topics |= {
+            number: channel_of(topic)
+            for number in index.channels
+            if (topic := schema.TOPIC_OF.get(number)) is not None and topic.message is schema.EXTRA
+        }
     for number in sorted(topics.keys() | index.channels.keys()):
         found, channel = index.channels.get(number), topics.get(number)
         if found != channel:

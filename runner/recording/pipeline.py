@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, message_record
 from runner.recording.chunks import Chunk, Packed, encode_chunk
 from runner.recording.digest import ContentHash
-from runner.recording.schema import ACTIONS, RESET, RESET_STATE, STEP, TOPIC_OF, Topic
+from runner.recording.schema import ACTIONS, RESET, RESET_OPTIONS, RESET_STATE, STEP, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.packing import Packing
 
@@ -265,7 +265,7 @@ class Pipeline:
 def _rank(chunk: Chunk) -> int:
     """Return the rank of a chunk in its group: if only a part of it is written, steps have their resets."""
     message = TOPIC_OF[chunk.entry.channel].message
-    return 0 if message in (RESET, RESET_STATE) else 1 if message in (STEP, ACTIONS) else 2
+    return 0 if message in (RESET, RESET_OPTIONS, RESET_STATE) else 1 if message in (STEP, ACTIONS) else 2
 
 
 @dataclass

@@ -48,7 +48,7 @@ from runner.recording.run_file import RecentTraining, run_title
 from runner.recording.schema import Topic, topics_of
 from runner.recording.spaces import decode as decode_value
 from runner.recording.steps import EpisodeSteps, Steps
-from runner.recording.topic_chunks import FOREVER, ChunkFile, TopicChunks, chunks_by_topic
+from runner.recording.topic_chunks import FOREVER, ChunkFile, TopicChunks, channels_of
 from runner.recording.turns import taken
 
 MAX_METRICS: Final = 1 << 17
@@ -131,9 +131,15 @@ class Recording(RunDescription):
         return ChunkFile(str(self.path), self.file.index.chunks, self.file, self.environments)
 
     @cached_property
+    def _channels(self) -> NDArray[np.uint16]:
+        """The channel of each chunk of the file."""
+        return channels_of(self.file.index, self.file, str(self.path))
+
+    @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
-        """The numbers of the chunks of the file that hold each topic."""
-        return chunks_by_topic(self.file.index, self.file, str(self.path))
+        """The numbers of the chunks of the file that hold each topic; of extras, those of all layouts."""
+        channels = self._channels % schema.LAYOUT_STRIDE
+        return {topic: np.flatnonzero(channels == topic.channel) for topic in schema.ALL_TOPICS}
 
     @cached_property
     def train(self) -> Phase:
@@ -389,18 +395,18 @@ class Phase:
             RecordingError: they are damaged.
         """
         table, where = self._recording.table(self.topics.extras), str(self._recording.path)
-        layouts = extra_layouts(self._recording) if table else []
-        # As Python's numbers: a forged chunk may begin at any time
-        starts = [layout.start_time for layout in layouts]
-        times = table.file.chunks.columns["start_time"][table.places].tolist()
-        chosen = np.array([bisect_right(starts, time) - 1 for time in times], np.intp)
-        if (chosen < 0).any():
-            raise RecordingError(f"{where}: {table.topic.name} has values before their names.")
-        parts = [
-            (layout, TopicChunks(table.file, table.topic, table.places[chosen == k], layout.message))
-            for k, layout in enumerate(layouts)
-            if (chosen == k).any()
-        ]
+        layouts = {layout.number: layout for layout in extra_layouts(self._recording)} if table else {}
+        schemas, parts = self._recording.file.index.schemas, []
+        channels = self._recording._channels[table.places]
+        for channel in np.unique(channels).tolist():
+            topic = schema.TOPIC_OF[channel]
+            layout = layouts.get(channel // schema.LAYOUT_STRIDE)
+            if layout is None or schemas.get(schema.schema_id(topic)) != layout.beginning.schemas[0]:
+                raise RecordingError(
+                    f"{where}: the names of extras do not give the schema of channel {channel}."
+                )
+            places = table.places[channels == channel]
+            parts.append((layout, TopicChunks(table.file, topic, places, layout.message)))
         return Extras(parts, lambda episode: self.episode(episode).numbers(), where)
 
     @property
@@ -485,4 +491,4 @@ class Phase:
 def extra_layouts(recording: Recording) -> list[ExtraLayout]:
     """Return the names of extras, from when on; each entry has those of the one before it."""
     columns = recording.table(schema.EXTRA_COLUMNS_TOPIC).decoded()
-    return read_layouts(((fields["log_time"], fields["json"]) for fields in columns), str(recording.path))
+    return read_layouts(((fields["log_time"], fields) for fields in columns), str(recording.path))

@@ -20,6 +20,7 @@ from runner.recording import schema
 from runner.recording.blocks import blank_records, message_record, record_dtype, row_dtype, rows_of
 from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
+from runner.recording.index import beginning_of_extras
 from runner.recording.layout import Layout
 from runner.recording.messages import encode_rows
 from runner.recording.observer import Observer
@@ -153,22 +154,23 @@ class Recorder:
 
     def set_layout(self, layout: Layout) -> None:
         """Change the messages of the run, before there are any of those that change."""
-        self.set_messages({topic: layout.message(topic) for topic in self._lanes})
-
-    def set_messages(self, messages: Mapping[Topic, MessageType]) -> None:
-        """Change the messages of topics whose rows are put down, or add such topics.
-
-        Only those of a topic in `EXTRA_TOPICS` may differ within a recording.
-        """
-        for topic, message in messages.items():
-            lane = self._lanes.get(topic)
-            if lane is None:
-                self._lanes[topic] = self._lane(topic, message, write=True)
-            elif lane.message.fields != message.fields:
-                assert not self.counts[topic.name] or topic in schema.EXTRA_TOPICS
-                if lane.open is not None and lane.open.filled:
-                    self._send_block(lane)
+        for topic, lane in self._lanes.items():
+            message = layout.message(topic)
+            if lane.message.fields != message.fields:
+                assert not self.counts[topic.name]
                 self._lanes[topic] = self._lane(topic, message, lane.write)
+
+    def begin_extras(self, number: int, message: MessageType) -> None:
+        """Record extras in the channels of a layout from now on, as messages of its type."""
+        self._batches.flush()
+        for topic in [topic for topic in self._lanes if topic.message is schema.EXTRA]:
+            if (lane := self._lanes.pop(topic)).open is not None and lane.open.filled:
+                self._send_block(lane)
+        for phase in schema.PHASES:
+            topic = schema.extra_topic(phase, number)
+            self._lanes[topic] = self._lane(topic, message, write=True)
+        if self._file is not None:
+            self._file.declare(beginning_of_extras(number, message))
 
     @property
     def position(self) -> int:
@@ -285,10 +287,6 @@ class Recorder:
         self._pipeline.raise_failure()
         self.counts[topic.name] += 1
         self._pipeline.submit(topic, make, position * STEP_NANOSECONDS)
-
-    def flush_messages(self) -> None:
-        """Write the messages of variable size now; what the caller put into open blocks stays there."""
-        self._batches.flush()
 
     def flush(self) -> None:
         """Write every open block and batch now; records that were not taken must be put down again."""

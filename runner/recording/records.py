@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER, HEADER_BYTES, MESSAGE_HEAD, RECORD_HEAD
+from runner.recording.blocks import (
+    HEADER,
+    HEADER_BYTES,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    constant_bytes,
+    record_dtype,
+)
 from runner.recording.chunks import (
     MAX_CHUNK_BYTES,
     Chunk,
@@ -268,6 +275,20 @@ def checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64
         at = int(offsets[np.argmin(as_written)])
         raise RecordingError(f"{where}: found a message at {at} that no recorder writes")
     return channel, block["log_time"], offsets
+
+
+def check_constants(chunk: ReadChunk, message: schema.MessageType) -> None:
+    """Check the bytes of messages of one size that are the same in each, such as tags.
+
+    Raises:
+        RecordingError: other readers would find other values there.
+    """
+    dtype = record_dtype(message)
+    if dtype is not None and len(chunk.records) == len(chunk.times) * dtype.itemsize:
+        blank, is_constant = constant_bytes(chunk.topic, message)
+        rows = np.frombuffer(chunk.records, np.uint8).reshape(-1, dtype.itemsize)
+        if (rows[:, is_constant] != blank[is_constant]).any():
+            raise RecordingError(f"chunk at {chunk.offset}: found tags that no recorder writes")
 
 
 def read_record(raw: RawRecord) -> Record | RawRecord:

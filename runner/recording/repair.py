@@ -23,7 +23,7 @@ from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype
 from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
-from runner.recording.extras import read_layouts
+from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
 from runner.recording.metadata import REQUIRED_RECORDS, check_run, json_object, layout_of_run
@@ -144,8 +144,11 @@ def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int])
 
 def _stated_counts(recording: Recording) -> dict[str, int]:
     """Return the number of messages of each topic, as the summary of a finished recording states it."""
-    counts = recording.file.index.message_counts
-    return {topic.name: counts.get(topic.channel, 0) for topic in recording.topics}
+    counts = dict.fromkeys((topic.name for topic in recording.topics), 0)
+    for channel, count in recording.file.index.message_counts.items():
+        if channel in schema.TOPIC_OF:
+            counts[schema.TOPIC_OF[channel].name] += count
+    return counts
 
 
 def _read_back(fresh: Path, done: Repair, report: Report) -> None:
@@ -175,10 +178,9 @@ class _Salvage:
         self._path, self._damaged, self._counts = path, damaged, stated
         self._layout = layout_of_run(run, str(path))
         self._done = Repair(path)
-        self._next = dict.fromkeys(self._layout.topics, 0)
-        """The number of the next message expected of each topic."""
-        self._extra_columns: list[tuple[int, str]] = []
-        self._extra_widths: set[int] = set()
+        self._next = {topic.name: 0 for topic in self._layout.topics}
+        """The number of the next message expected of each topic, by name."""
+        self._names = ExtraNames(str(path))
         self._result: dict[str, str] | None = None
 
     def write(self, fresh: Path, report: Report) -> Repair:
@@ -205,17 +207,21 @@ class _Salvage:
         """Copy a good chunk; note a hole before it."""
         where = f"{self._path}: chunk at {chunk.offset}"
         topic, count = chunk.topic, len(chunk.times)
-        if topic not in self._layout.topics:
+        if topic.name not in self._next:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         if topic is schema.EXTRA_COLUMNS_TOPIC:
-            self._take_extra_columns(chunk)
-        if topic.message is schema.EXTRA and len(chunk.records) // count not in self._extra_widths:
-            self._damaged.lost_bytes += len(chunk.body)  # their names are lost
-            return
-        dtype = self._layout.dtype(topic)
+            self._names.take(chunk)
+            self._names.declare(file)
+        message = self._layout.message(topic)
+        if topic.message is schema.EXTRA:
+            if (names := self._names.of(chunk)) is None:
+                self._damaged.lost_bytes += len(chunk.body)  # their names are lost
+                return
+            message = names.message
+        dtype = record_dtype(message)
         if dtype is not None and len(chunk.records) != count * dtype.itemsize:
             raise RecordingError(f"{where}: found messages of another size.")
-        first = expected = self._next[topic]
+        first = expected = self._next[topic.name]
         if topic.message in schema.NUMBERED_BY:
             first, last = self._numbers(chunk)
             if last - first + 1 != count or not 0 <= first <= last < _MAX_MESSAGES:
@@ -224,7 +230,7 @@ class _Salvage:
             raise RecordingError(f"{self._path}: {topic.name} goes back from {expected} to {first}.")
         if first > expected:
             self._done.lost.setdefault(topic.name, []).append([expected, first])
-        self._next[topic] = first + count
+        self._next[topic.name] = first + count
         file.copy(chunk)
         self._done.kept[topic.name] = self._done.kept.get(topic.name, 0) + count
 
@@ -238,18 +244,10 @@ class _Salvage:
         first, last = (decode(message, chunk.messages[k][HEADER_BYTES:])[name] for k in (0, -1))
         return first, last
 
-    def _take_extra_columns(self, chunk: ReadChunk) -> None:
-        """Note how wide the records of extras are from here on."""
-        for time, record in zip(chunk.times.tolist(), chunk.messages, strict=True):
-            fields = decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:])
-            self._extra_columns.append((time, fields["json"]))
-        layouts = read_layouts(self._extra_columns, str(self._path))
-        self._extra_widths = {np.dtype(record_dtype(layout.message)).itemsize for layout in layouts}
-
     def _finish(self, file: RecordingFile) -> None:
         """Record what was lost, or else the result again, and finish the file."""
         done = self._done
-        for name, holes in _missing(self._counts, {topic.name: n for topic, n in self._next.items()}).items():
+        for name, holes in _missing(self._counts, self._next).items():
             done.lost.setdefault(name, []).extend(holes)
         done.lost_bytes = self._damaged.lost_bytes
         if self._damaged.torn_chunk is not None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.digest import ContentHash, combined_digest
+from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_up_to_cut
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import (
@@ -72,7 +73,11 @@ def rewrite(
 
 def copy(path: Path, transform: Callable[[Record], Record | None], into: RecordingFile) -> None:
     """Append the records of a recording to another one, as they are transformed; None leaves one out."""
+    names = ExtraNames(str(path))
     for record in whole_records(path):
+        if isinstance(record, ReadChunk) and record.topic is schema.EXTRA_COLUMNS_TOPIC:
+            names.take(record)
+            names.declare(into)
         if (transformed := transform(record)) is not None:
             into.copy(transformed)
 

@@ -5,7 +5,7 @@ Every message is protobuf; `blocks` defines how the most frequent ones are laid 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Final
 
@@ -253,12 +253,10 @@ IMAGE = MessageType(
 )
 """Foxglove's own image message, so that viewers show it as a picture."""
 
-EXTRA_COLUMNS = MessageType("ExtraColumns", (Field(1, "json", _STRING),))
-"""The names of extras, with dtypes and shapes: a description of a `Dict` space."""
-EXTRA = MessageType(
-    "Extra", (Field(1, "values", _BYTES), Field(2, "given", _BYTES), Field(3, "step", _SFIXED64))
-)
-"""The values that a loop recorded with a step, laid out as the latest `ExtraColumns` describes."""
+EXTRA_COLUMNS = MessageType("ExtraColumns", (Field(1, "json", _STRING), Field(2, "layout", _FIXED32)))
+"""The names of extras, with dtypes and shapes: the description of a `Dict` space, and its number."""
+EXTRA = MessageType("Extra", (Field(3, "step", _SFIXED64, dtype=np.dtype("<i8")),), varies=True)
+"""The values that a loop recorded with a step; `extras` adds the fields of a layout's names."""
 CHECKPOINT = MessageType(
     "Checkpoint",
     (
@@ -408,18 +406,37 @@ KINDS: Final = {
 ALL_TOPICS: Final = tuple(
     sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
 )
+MAX_LAYOUTS: Final = 256
+"""The most layouts of extras in a recording."""
+LAYOUT_STRIDE: Final = 100
+"""What the ids of channels and schema of a layout of extras differ by from those of the one before."""
 TOPIC_OF: Final = {topic.channel: topic for topic in ALL_TOPICS}
-"""Channel -> its topic."""
+"""Channel -> its topic; those of extras have a channel for each layout."""
+TOPIC_OF.update(
+    (channel, replace(topic, channel=channel))
+    for topic in (TRAIN_EXTRA, EVAL_EXTRA)
+    for channel in range(topic.channel + LAYOUT_STRIDE, LAYOUT_STRIDE * MAX_LAYOUTS, LAYOUT_STRIDE)
+)
 DIGESTED: Final = frozenset(topic.name for topic in ALL_TOPICS if topic.digested)
 """The names of the topics that the content digest covers."""
 MESSAGES: Final = tuple(dict.fromkeys(topic.message for topic in ALL_TOPICS))
 """Every message; the id of a schema is its place here, from 1."""
 
+
+def extra_topic(phase: str, layout: int) -> Topic:
+    """Return the topic of a phase's extras, with the channel of a layout."""
+    return TOPIC_OF[topics_of(phase).extras.channel + LAYOUT_STRIDE * layout]
+
+
+def schema_id(topic: Topic) -> int:
+    """Return the id of the schema of a topic's channel."""
+    return MESSAGES.index(topic.message) + 1 + topic.channel // LAYOUT_STRIDE * LAYOUT_STRIDE
+
+
 BLOCK_TOPICS: Final = (TRAIN_STEP, EVAL_STEP, TRAIN_EPISODE, EVAL_EPISODE)
 """The topics of a job whose messages have one size: read and written as blocks."""
 ROW_TOPICS: Final = (*BLOCK_TOPICS, TRAIN_RESET, EVAL_RESET)
 """The topics that are put down as rows: their messages have one size unless values of the spaces vary."""
-EXTRA_TOPICS: Final = (TRAIN_EXTRA, EVAL_EXTRA)
 
 STEP_TOPICS: Final = (TRAIN_STEP.name, EVAL_STEP.name)
 """The names of the topics that a run may leave out."""

@@ -6,6 +6,7 @@
 | a smaller number | of 32 bits |
 | an array of numbers of 32 or 64 bits, or of bools | packed, row by row |
 | an array of smaller numbers | `bytes`: the array, row by row, little-endian |
+| an array of varying length | as an array of one length |
 | a text | `string`; one with unpaired surrogates is in the field `NAME_raw`, as `bytes` |
 | `Dict`, `Tuple`, the agents of a game | a nested message with a field for each part |
 
@@ -26,7 +27,14 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
 from runner.errors import RecordingError
 from runner.recording.schema import Field
-from runner.recording.spaces import Description, encode_bytes, leaf_dtype, parts_of, text_length
+from runner.recording.spaces import (
+    Description,
+    encode_bytes,
+    item_dtype,
+    leaf_dtype,
+    parts_of,
+    varying_length,
+)
 from runner.util.arrays import Array
 
 _KINDS: Final[Mapping[str, int]] = {
@@ -64,6 +72,9 @@ def _field(number: int, name: str, stored_name: str, description: Description) -
         )
         return Field(number, name, Pb.TYPE_MESSAGE, stored_as=stored_as, parts=fields)
     dtype = leaf_dtype(description)
+    if dtype is None and (item := item_dtype(description)) is not None:
+        kind = _KINDS.get(item.base.str, Pb.TYPE_BYTES)
+        return Field(number, name, kind, kind != Pb.TYPE_BYTES, stored_as)
     if dtype is None:
         return Field(number, name, Pb.TYPE_STRING, stored_as=stored_as)
     code = dtype.base.str
@@ -206,15 +217,15 @@ def encoder(field: Field) -> Encoder:
 
         head = _head(field.number)
         return nested
-    if is_text(field):
-        heads = _head(field.number + _RAW), _head(field.number)
+    if not has_one_size(field):
+        heads = _heads(field)
 
-        def text(value: bytes, at: int) -> tuple[bytes, int]:
-            end = at + 4 + text_length(value, at)
+        def varying(value: bytes, at: int) -> tuple[bytes, int]:
+            end = at + 4 + varying_length(value, at)
             data = value[at + 4 : end]
             return _delimited(heads[_is_utf8(data)], data), end
 
-        return text
+        return varying
     dtype, stored, constant = _number_dtypes(field)
 
     def number(value: bytes, at: int) -> tuple[bytes, int]:
@@ -244,18 +255,18 @@ def decoder(field: Field) -> Decoder:
 
         head = _head(field.number)
         return nested
-    if is_text(field):
-        heads = _head(field.number + _RAW), _head(field.number)
+    if not has_one_size(field):
+        heads = _heads(field)
 
-        def text(message: bytes, at: int) -> tuple[bytes, int]:
+        def varying(message: bytes, at: int) -> tuple[bytes, int]:
             is_utf8 = message.startswith(heads[True], at)
             start, end = _span(field, message, at, heads[is_utf8])
             data = message[start:end]
-            if _is_utf8(data) != is_utf8:
+            if heads[_is_utf8(data)] != heads[is_utf8]:
                 raise _refused(field)
             return encode_bytes(data), end
 
-        return text
+        return varying
     dtype, stored, constant = _number_dtypes(field)
 
     def number(message: bytes, at: int) -> tuple[bytes, int]:
@@ -279,6 +290,12 @@ def _number_dtypes(field: Field) -> tuple[np.dtype[Any], np.dtype[Any], bytes]:
     """Return the dtypes of the numbers of a field, in rows and as they are stored, and its constant bytes."""
     assert field.dtype is not None
     return field.dtype.base, stored_dtype(field).base, tag(field)
+
+
+def _heads(field: Field) -> tuple[bytes, bytes]:
+    """Return what a value of varying size begins with: if it is no UTF-8, and if it is."""
+    head = _head(field.number)
+    return (_head(field.number + _RAW) if is_text(field) else head), head
 
 
 def _head(number: int) -> bytes:

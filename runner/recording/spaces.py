@@ -9,6 +9,9 @@ A description is JSON that anyone can read, kept in the metadata record `run`:
 The leaves follow one another in its order, without gaps: an array row by row, little-endian, in the
 space's own dtype; a text as its length in bytes (uint32) and UTF-8. Where no leaf is a text, every value
 has one size, and many of them are one NumPy array.
+
+Extras have another kind of leaf: `{"type": "Array", "dtype": "<i8", "shape": [null, 4]}`, an array whose
+first axis varies in length. It stands there as its length in bytes (uint32), and row by row.
 """
 
 from __future__ import annotations
@@ -46,7 +49,9 @@ class Leaf:
     path: tuple[str, ...]
     """Keys of `Dict`s and numbers of `Tuple`s, from the outermost in."""
     dtype: np.dtype[np.generic] | None
-    """The dtype of its value, including the shape; None for a text."""
+    """The dtype of its value, including the shape; None where values vary in size."""
+    item: np.dtype[np.generic] | None = None
+    """The dtype of an element along the first axis, of arrays of varying length; else None."""
 
 
 def leaves_of(description: object, where: str) -> list[Leaf]:
@@ -75,7 +80,10 @@ def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
 
 
 def row_dtype(description: Description) -> np.dtype[np.generic]:
-    """Return the dtype of a space's values in records, `Dict` and `Tuple` as fields; a text is an object."""
+    """Return the dtype of a space's values in records, `Dict` and `Tuple` as fields.
+
+    Values of varying size are objects.
+    """
     parts = parts_of(description)
     if parts is None:
         leaf = leaf_dtype(description)
@@ -109,13 +117,13 @@ def encode_text(text: str) -> bytes:
     return encode_bytes(text.encode("utf-8", "surrogatepass"))
 
 
-def encode_bytes(text: bytes) -> bytes:
-    """Return a text, given in UTF-8, as it stands in a recording."""
-    return _LENGTH.pack(len(text)) + text
+def encode_bytes(data: bytes) -> bytes:
+    """Return a text in UTF-8, or an array of varying length as its bytes, as it stands in a recording."""
+    return _LENGTH.pack(len(data)) + data
 
 
-def text_length(value: bytes, at: int) -> int:
-    """Return how many bytes a text has that stands at `at` in a value."""
+def varying_length(value: bytes, at: int) -> int:
+    """Return how many bytes a leaf of varying size has that stands at `at` in a value."""
     (length,) = _LENGTH.unpack_from(value, at)
     return int(length)
 
@@ -135,7 +143,7 @@ def _leaves(description: object, path: tuple[str, ...]) -> Iterator[Leaf]:
         raise ValueError("found no object that describes a space, or too many inside one another")
     parts = parts_of(description)
     if parts is None:
-        yield Leaf(path, leaf_dtype(description))
+        yield Leaf(path, leaf_dtype(description), item_dtype(description))
         return
     for name, part in parts:
         if not is_text(name) or not name:
@@ -150,11 +158,23 @@ def _count(description: Any) -> int:
 
 
 def leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
-    """Return the dtype of a leaf, None for a text; every other kind of space has arrays of one shape."""
-    kind = description["type"]
-    if kind == "Text":
+    """Return the dtype of a leaf; None where values vary in size: texts, and arrays of varying length."""
+    is_one_size = description["type"] not in ("Text", "Array")
+    return _array_dtype(description, description["shape"]) if is_one_size else None
+
+
+def item_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
+    """Return the dtype of an element of arrays of varying length; None for other leaves."""
+    if description["type"] != "Array":
         return None
-    dtype, shape = description["dtype"], description["shape"]
+    shape = description["shape"]
+    if not isinstance(shape, list) or shape[:1] != [None] or 0 in shape:
+        raise ValueError(f"shape {shape}")
+    return _array_dtype(description, shape[1:])
+
+
+def _array_dtype(description: Mapping[str, object], shape: object) -> np.dtype[np.generic]:
+    kind, dtype = description["type"], description["dtype"]
     if not isinstance(kind, str) or not isinstance(dtype, str) or not NUMBERS.fullmatch(dtype):
         raise ValueError(f"{kind} of {dtype}")
     if not isinstance(shape, list) or not all(is_whole(n, 0, MAX_VALUE_BYTES) for n in shape):
@@ -177,8 +197,11 @@ def _value(description: Description, data: bytes, at: int) -> tuple[Value, int]:
         (length,) = _LENGTH.unpack_from(data, at)
         start, at = at + _LENGTH.size, at + _LENGTH.size + length
         if at > len(data):
-            raise ValueError(f"a text of {length:,} bytes in {len(data):,}")
-        return data[start:at].decode("utf-8", "surrogatepass"), at
+            raise ValueError(f"a value of {length:,} bytes in {len(data):,}")
+        item = item_dtype(description)
+        if item is None:
+            return data[start:at].decode("utf-8", "surrogatepass"), at
+        return np.frombuffer(data[start:at], item), at
     if at + dtype.itemsize > len(data):
         raise ValueError(f"{len(data):,} bytes, too few")
     flat = np.frombuffer(data, dtype.base, math.prod(dtype.shape), at)

@@ -20,7 +20,7 @@ from runner.recording.index import ChunkTable, Index
 from runner.recording.messages import Message, decode, decode_rows
 from runner.recording.record_store import RecordStore
 from runner.recording.records import checked_messages
-from runner.recording.schema import ALL_TOPICS, MessageType, Topic
+from runner.recording.schema import TOPIC_OF, MessageType, Topic
 
 M = TypeVar("M")
 FOREVER: Final = 2**63 - 1
@@ -30,8 +30,8 @@ _ROWS_BYTES: Final = 16 << 20
 """The most messages of varying size in a block of `rows`, and the bytes of values with which one ends."""
 
 
-def chunks_by_topic(index: Index, store: RecordStore, path: str) -> dict[Topic, NDArray[np.intp]]:
-    """Return which chunks of a file hold each topic's messages, in order."""
+def channels_of(index: Index, store: RecordStore, path: str) -> NDArray[np.uint16]:
+    """Return the channel of each chunk of a file."""
     table = index.chunks
     channels = table.columns["channel"].copy()
     for k in np.flatnonzero(channels == 0).tolist():  # the file was cut off before the chunk's index
@@ -40,7 +40,7 @@ def chunks_by_topic(index: Index, store: RecordStore, path: str) -> dict[Topic, 
         raise _damaged(
             path, table[k], f"messages of channel {channels[k]}, which the recording does not have"
         )
-    return {topic: np.flatnonzero(channels == topic.channel) for topic in ALL_TOPICS}
+    return channels
 
 
 class ChunkSpan(NamedTuple):
@@ -165,6 +165,20 @@ class TopicChunks:
             rows = block[max(numbers.start - first, 0) : numbers.stop - first]
             if len(rows):
                 yield rows
+
+    def rows_between(self, field: str, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
+        """Yield the messages with values from `start` to before `stop` in a field that never decreases.
+
+        They come in blocks, as `rows` yields them; `stop` is None for all that follow.
+        """
+        for k in self.chunks_from(field, start):
+            rows = self._rows_of(k)
+            low = int(np.searchsorted(rows[field], start))
+            high = len(rows) if stop is None else int(np.searchsorted(rows[field], stop))
+            if low < high:
+                yield rows[low:high]
+            if high < len(rows):
+                return
 
     def one(self, number: int) -> np.void:
         """Return a message by its number, as `rows` does.
@@ -311,7 +325,7 @@ class TopicChunks:
         entry = self.entry(k)
         data = self.file.store.chunk(entry)
         channel, log_times, offsets = checked_messages(data, f"{self.file.path}: chunk at {entry.offset}")
-        if channel != self.topic.channel:
+        if channel != (entry.channel or channel) or TOPIC_OF[channel].name != self.topic.name:
             raise self._damaged(k, f"other messages than of {self.topic.name}")
         return data, log_times, offsets
 

@@ -7,6 +7,7 @@ of a long recording, are encoded by `chunks`; the many small records of a short 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, Self
@@ -17,7 +18,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
 from runner.recording.chunks import Chunk
-from runner.recording.index import Index, beginning_of, checksum
+from runner.recording.index import Beginning, Index, beginning_of, checksum
 from runner.recording.layout import Layout
 from runner.recording.records import (
     AttachmentRecord,
@@ -79,10 +80,16 @@ class RecordingFile:
         self._append(beginning.schema_records + beginning.channel_records)
         self._index.begin(beginning)
 
+    def declare(self, beginning: Beginning) -> None:
+        """State schemas and channels; they are written before the first chunk of one of the channels."""
+        self._later |= {channel.id: beginning for channel in beginning.channels}
+
     def _set(self, path: Path, stream: BinaryIO, index: Index) -> None:
         self.path, self._stream, self._index = path, stream, index
         self._crc = 0
         self._indexed = True
+        self._later: dict[int, Beginning] = {}
+        """Schemas and channels that are written before the first chunk of a channel, by its id."""
 
     @property
     def size(self) -> int:
@@ -92,7 +99,10 @@ class RecordingFile:
     @property
     def message_counts(self) -> dict[str, int]:
         """The number of messages of each topic that has any, by name."""
-        return {TOPIC_OF[channel].name: n for channel, n in self._index.count_messages().items()}
+        counts = Counter[str]()
+        for channel, n in self._index.count_messages().items():
+            counts[TOPIC_OF[channel].name] += n
+        return counts
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Append a metadata record."""
@@ -115,6 +125,11 @@ class RecordingFile:
 
     def add_chunks(self, chunks: Sequence[Chunk]) -> None:
         """Append chunks of one topic each with their message indexes: all of them, or none if that fails."""
+        for channel in {chunk.entry.channel for chunk in chunks} - self._index.channels.keys():
+            beginning = self._later.get(channel)
+            if beginning is not None and channel not in self._index.channels:
+                self._append(beginning.schema_records + beginning.channel_records)
+                self._index.declare(beginning)
         start, _ = self._append(b"".join(part for chunk in chunks for part in (chunk.record, chunk.index)))
         for chunk in chunks:
             self._index.chunks.append(chunk.entry._replace(offset=start, index_length=len(chunk.index)))

@@ -226,12 +226,14 @@ def _loop_results(loop: Summary, with_environment: bool) -> dict[str, str]:
 
 
 def _extras(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
-    """Return the number of steps with extras, and dtype and shape of each name: `float32 [2]`."""
+    """Return the number of steps with extras, and dtype and shape of each name: `int64 [T]`."""
     from runner.recording.schema import PHASE_NAMES
 
     rows = {f"{PHASE_NAMES[phase]} steps": f"{own.steps:,}" for phase, own in extras.items()}
     for own in extras.values():
-        rows |= {name: f"{dtype} {list(shape) or ''}".strip() for name, (dtype, shape) in own.names.items()}
+        for name, (dtype, shape) in own.names.items():
+            lengths = ", ".join("T" if n is None else str(n) for n in shape)
+            rows[name] = f"{dtype} [{lengths}]" if shape else dtype
     return rows
 
 

@@ -31,6 +31,7 @@ from runner.export.reports.player_data import (
 )
 from runner.export.values import is_image, names_in, number_names, observed, step_actions_in_words
 from runner.recording import schema
+from runner.recording.extras import filled
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
 from runner.replay.recorded import reset_of
@@ -110,6 +111,7 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     elif first + limit >= length:
         total = float(before.sum() + reward.sum())
     texts, series = _frames(parts, observations)
+    thoughts, more = _extras(recording, at.phase, np.concatenate(numbers), notes)
     return Playback(
         title=at.heading + (f", in environment {environment}" if recording.environments > 1 else ""),
         description=outcome_in_words(length, ended, total),
@@ -123,9 +125,9 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
             words(agent, "action", (shortened(own.get(agent, "–"), _MAX_LETTERS) for own in actions))
             for agent in agents
         ],
-        texts=texts,
+        texts=[*texts, *thoughts],
         time=frames,
-        series=[*series, *_extras(recording, at.phase, np.concatenate(numbers), notes)],
+        series=[*series, *more],
         notes=notes,
         logged=logged_near(recording, at.phase, frames),
     )
@@ -161,14 +163,23 @@ def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPa
     return [part.column(after) for part in parts]
 
 
-def _extras(recording: Recording, phase: str, steps: Ints, notes: list[str]) -> list[Series]:
-    """Return the values that the loop recorded with these steps, each at the frame before its step."""
-    series = []
+def _extras(
+    recording: Recording, phase: str, steps: Ints, notes: list[str]
+) -> tuple[list[Words], list[Series]]:
+    """Return the values that the loop recorded with these steps, each at the frame before its step.
+
+    Texts and arrays of varying length are words, all others series of numbers.
+    """
+    texts, series = [], []
     agents = recording.agents if len(recording.agents) > 1 else ()
     extras = recording.phase(phase).extras
     by_name = extras.at(steps) if extras else {}
     for name, values in by_name.items():
         agent = next((one for one in agents if name.startswith(f"{one}/")), "")
+        if values.dtype.hasobject:
+            shown = [_shortened(value) for value in filled(values).tolist()]
+            texts.append(words(agent, name.removeprefix(f"{agent}/"), [*shown, ""]))
+            continue
         shape = values.shape[1:]
         columns = values.reshape(len(steps), -1)
         if columns.shape[1] > MAX_SERIES:
@@ -177,7 +188,14 @@ def _extras(recording: Recording, phase: str, steps: Ints, notes: list[str]) -> 
         for own, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
             numbers = [None if value is None else short(value) for value in column.tolist()]
             series.append(Series(agent, "extras", own, [*numbers, None]))
-    return series
+    return texts, series
+
+
+def _shortened(value: Any) -> str:
+    """Return the beginning of a text or of an array; nothing for None."""
+    if value is None or isinstance(value, str):
+        return shortened(value or "", _MAX_LETTERS)
+    return shortened(str(value[:_MAX_LETTERS].tolist()), _MAX_LETTERS)
 
 
 def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:

@@ -167,8 +167,11 @@ class LoopTracks:
     ) -> Iterator[Track]:
         """Yield a value that the loop recorded with steps: as lines, or as bars if it is many numbers."""
         is_given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
-        numbers = values.data.reshape(len(values), -1).astype(np.float64)
         quantity = f"extra/{entity_name(name)}"
+        if values.dtype.hasobject:
+            yield from self._objects(phase, member, name, values.data[is_given], times["step"][is_given])
+            return
+        numbers = values.data.reshape(len(values), -1).astype(np.float64)
         if numbers.shape[1] <= MAX_BARS:
             # A gap in the line where the value was not recorded
             numbers = np.where(is_given[:, np.newaxis], numbers, np.nan)
@@ -178,6 +181,20 @@ class LoopTracks:
             bars = zip(times["step"][is_given].tolist(), map(rr.BarChart, numbers[is_given]), strict=True)
             view = View("bars", f"{member.name} {name}".strip(), rrb.BarChartView)
             yield rows_of(self._entity(phase, member.name, quantity), list(bars), view)
+
+    def _objects(self, phase: str, member: Member, name: str, values: Array, steps: Array) -> Iterator[Track]:
+        """Yield texts as documents, and arrays of varying length as bars."""
+        entity = self._entity(phase, member.name, f"extra/{entity_name(name)}")
+        title, placed = f"{member.name} {name}".strip(), [*zip(steps.tolist(), values.tolist(), strict=True)]
+        if texts := [(step, rr.TextDocument(text)) for step, text in placed if isinstance(text, str)]:
+            yield rows_of(entity, texts, View("texts", title, rrb.TextDocumentView))
+        bars = [
+            (step, rr.BarChart(array.ravel().astype(np.float64)))
+            for step, array in placed
+            if not isinstance(array, str) and array.size
+        ]
+        if bars:
+            yield rows_of(entity, bars, View("bars", title, rrb.BarChartView))
 
     def _line(
         self,

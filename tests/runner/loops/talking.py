@@ -39,6 +39,29 @@ class Tools(gymnasium.Env[str, str]):
         return said, float(self.sum == self.goal), tool == "answer", self.t == 9, {}
 
 
+class Assistant(gymnasium.Wrapper[dict[str, Any], str, str, str]):
+    """The same, which observes the number of the last tool, too."""
+
+    def __init__(self) -> None:
+        super().__init__(Tools())
+        self.observation_space = spaces.Dict(text=spaces.Text(100), tool=spaces.Discrete(4))
+
+    def reset(self, **arguments: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        text, info = self.env.reset(**arguments)
+        return {"text": text, "tool": 0}, info
+
+    def step(self, action: str) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
+        text, *rest = self.env.step(action)
+        tools = ("add", "look", "answer")
+        tool, _, _ = action.partition(" ")
+        return {"text": text, "tool": 1 + tools.index(tool) if tool in tools else 0}, *rest
+
+
+def assistants() -> Any:
+    """Return several of those."""
+    return SyncVectorEnv([Assistant] * ENVIRONMENTS)
+
+
 class Mistaken(Tools):
     """The same with another text after "look"."""
 

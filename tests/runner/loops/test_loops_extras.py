@@ -25,6 +25,7 @@ from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.chunks import encode_chunk
+from runner.recording.extras import ExtraNames
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from runner.recording.records import ReadChunk
@@ -215,11 +216,14 @@ def test_tensors_and_spaces_of_varying_size_have_extras_too(tmp_path):
             r"found float64 of shape \(2,\) for 'value', expected float32 of shape \(\)",
         ),
         ({"value": 0.5}, "found float64 of shape"),
-        ({"other": "text"}, "expected a number or an array"),
+        ({"value": "text"}, r"found str for 'value', expected float32 of shape \(\)"),
+        ({"other": object()}, "expected a number or an array"),
         ({"other": {"inner": 1}}, "expected a number or an array"),
         ({"": 1}, "expected text of 1 to 200 letters"),
         ({"x" * 201: 1}, "expected text of 1 to 200 letters"),
-        ({"other": np.zeros(0)}, "a number at least"),
+        ({"other": np.zeros((2, 0))}, "a number at least"),
+        ({"other": []}, "found an empty list as the first value"),
+        ({"other": "x" * (1 << 20)}, "expected at most 1,048,576"),
         ({"other": np.zeros(1 << 20)}, "expected at most 1,048,576"),
         ({str(k): k for k in range(256)}, "found more than 256 names"),
     ],
@@ -333,9 +337,12 @@ def forge(source: Path, path: Path, payload: bytes) -> None:
     """Copy a recording with another message in place of the names of its extras."""
     with runner.open_recording(source) as recording:
         layout = recording.layout
+    names = ExtraNames("it")
     with RecordingFile(path, layout) as file:
         for record in whole_records(source):
             if isinstance(record, ReadChunk) and record.topic is schema.EXTRA_COLUMNS_TOPIC:
+                names.take(record)
+                names.declare(file)
                 message = message_record(record.topic, int(record.times[0]), payload)
                 times, offsets = record.times[:1], record.offsets[:1]
                 file.add_chunk(encode_chunk(record.topic, message, times, offsets, Packing()))

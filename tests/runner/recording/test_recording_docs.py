@@ -10,6 +10,7 @@ import pytest
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
 from runner.recording import schema
+from runner.recording.extras import ExtraLayout, box_of
 from runner.recording.layout import layout_of
 
 TEXT = (Path(__file__).parents[3] / "docs" / "recording-format.md").read_text()
@@ -23,6 +24,7 @@ TYPES = {
     Pb.TYPE_BOOL: "bool",
     Pb.TYPE_STRING: "string",
     Pb.TYPE_BYTES: "bytes",
+    Pb.TYPE_MESSAGE: "message",
 }
 FOLLOWING = {"EvalMetrics": 10}
 """Messages whose first fields are stated in a sentence, and how many."""
@@ -49,6 +51,9 @@ def message_of(title: str) -> schema.MessageType:
         return layout_of("game", 2, 0, SPACES, has_turns=True).message(schema.TRAIN_STEP)
     if title == "dualtaxi.Episode":
         return layout_of("game", 2, 0, SPACES, has_turns=True).message(schema.TRAIN_EPISODE)
+    if title == "dualtaxi.Extra":
+        columns = {"value": box_of(np.dtype("<f4"), ()), "said": {"type": "Text"}}
+        return ExtraLayout(0, 0, columns).message
     name = title.removeprefix("dualtaxi.")
     return next(topic.message for topic in schema.ALL_TOPICS if topic.message.name == name)
 

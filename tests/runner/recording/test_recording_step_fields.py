@@ -48,5 +48,5 @@ def test_an_archive_keeps_it(name):
     records[name] = 1
     table = shape.tables[layout.STEPS]
     batch = batch_of(table, schema.TRAIN_STEP, records, shape)
-    (restored,) = records_of(table, schema.TRAIN_STEP, batch, shape)
+    ((_, restored),) = records_of(table, schema.TRAIN_STEP, batch, shape)
     assert restored.tobytes() == records.tobytes()

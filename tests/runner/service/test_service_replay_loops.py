@@ -103,6 +103,20 @@ def test_extras_are_shown_before_the_step_that_they_were_recorded_with(tmp_path)
     assert shown["logits[1]"]["values"][:-1] == pytest.approx(logits[: t + 1, 1], rel=1e-4)
 
 
+def test_texts_and_values_of_varying_length_are_shown_as_words(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "r", name="mind") as rec:
+        rec.reset(seed=1)
+        for t in range(5):
+            rec.step(t % 2, extras={"tokens": np.arange(t)} if t != 3 else {"thought": "left?"})
+    with serving(tmp_path / "r") as client:
+        assert page(client, "/runs/mind/replay/train/0")
+        shown = {one["name"]: taken(one) for one in part(client, "mind/replay/train/0")["texts"]}
+    assert shown == {
+        "tokens": ["[]", "[0]", "[0, 1]", "", "[0, 1, 2, 3]", ""],
+        "thought": ["", "", "", "left?", "", ""],
+    }
+
+
 def test_without_a_picture_the_page_gives_the_reason_and_the_values(loops_client):
     """An environment of somebody else's own is not imported."""
     known = set(sys.modules)
