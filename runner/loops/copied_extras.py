@@ -1,4 +1,4 @@
-"""The extras of a recording that others are folded into: as recorded, with new numbers."""
+"""The extras of recordings that are folded into another: as recorded, with new numbers."""
 
 from __future__ import annotations
 
