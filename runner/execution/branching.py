@@ -187,8 +187,9 @@ def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
         left, right = first_difference(ours, theirs, ("episode", "last_step", "returns"))
     differing = right if left is None else left
     if differing is not None:
+        episode = int(differing["episode"][0])
         raise RunnerError(
-            f"run {own.run_id}: training episode {int(differing['episode'][0]):,} is not that of its parent {parent.run_id}, "
+            f"run {own.run_id}: training episode {episode:,} is not that of its parent {parent.run_id}, "
             "though the branch begins later: the parent was recorded with other versions of NumPy or Numba, "
             f"or on another kind of processor. `dualtaxi diff {parent.run_id} {own.run_id}` shows them."
         )

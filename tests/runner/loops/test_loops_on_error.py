@@ -206,7 +206,7 @@ def test_vectors(tmp_path):
         for k in range(3):
             envs.step(np.array([0, 1]))
             envs.log("loss", k)
-        envs._rows.take = None  # as a mistake in the recorder would fail
+        envs._rows.take_vector = None  # as a mistake in the recorder would fail
         with pytest.warns(RuntimeWarning, match="recording stopped at step 6"):
             envs.step(np.array([0, 1]))
         assert envs.step(np.array([0, 1]))[0].tolist() == [[0, 0], [1, 1]]
