@@ -217,7 +217,6 @@ class Replay:
                 stepper = Stepper(env, self._recording)
                 stepper.ends_once = vector is not None and vector.is_vec_env
             stepper.is_trusted = is_trusted
-            stepper.check_spaces()
         self._steppers[key] = stepper
         return stepper
 

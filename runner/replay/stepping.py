@@ -17,9 +17,9 @@ from runner.environments.games import game_spaces
 from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
-from runner.recording.fillers import Put, filler
+from runner.recording.fillers import filler
 from runner.recording.gym_spaces import describe_space, value_of
-from runner.recording.gym_values import SpaceValues, element_of
+from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
@@ -38,7 +38,11 @@ Fill = Callable[[int, Any], None]
 
 
 class Stepper:
-    """A Gymnasium environment that takes recorded actions."""
+    """A Gymnasium environment that takes recorded actions.
+
+    Raises:
+        CannotRedo: it has other spaces than the recorded one.
+    """
 
     n = 1
     """How many environments step at once."""
@@ -53,6 +57,9 @@ class Stepper:
         """Whether an episode that terminated is not truncated too."""
         self._recording, self._has_states = recording, recording.has_states
         self.observation_space, self.action_space = self._spaces()
+        self._check_spaces()
+        leaf, is_game = StateLeaf if self._has_states else Leaf, recording.layout.kind == "game"
+        self._observation = SpaceValues(self.observation_space, "observation", leaf=leaf, is_game=is_game)
         self._after = "next_state" if self._has_states else "next_observation"
         topics, agents = recording.train.topics, recording.agents
         steps, resets = map(recording.layout.rows, (topics.steps, topics.resets))
@@ -73,7 +80,7 @@ class Stepper:
         seen = np.zeros(len(rows), self._first_dtype) if self._has_states else got[self._after]
         self._actions, self._fill = self.actions(rows), self._filler(seen, ends, got)
         self._firsts = np.zeros(len(resets), self._first_dtype)
-        self._put_first = self._putter(self._firsts)
+        self._put_first = filler(self._observation, self._firsts)
         returned = Returned(rows, resets, got)
         try:
             for step, group in groupby(resets, key=lambda placed: placed[0]):
@@ -140,18 +147,6 @@ class Stepper:
         """Return the spaces of observation and action."""
         return self.env.observation_space, self.env.action_space
 
-    def _putter(self, column: Array) -> Put:
-        """Return a function that puts an observation into a row of a column."""
-        if not self._has_states:
-            return filler(SpaceValues(self.observation_space, "observation"), column)
-
-        def put_state(row: int, observation: object) -> None:
-            if observation.__class__ is not int:
-                observation = int(np.asarray(observation).reshape(()))
-            column[row] = observation
-
-        return put_state
-
     def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
         """Return a function that puts down steps.
 
@@ -160,7 +155,7 @@ class Stepper:
             ends: [rows], for rewards and ends.
             got: [rows], for what games return besides.
         """
-        put, pack = self._putter(seen), _ENDING.pack_into
+        put, pack = filler(self._observation, seen), _ENDING.pack_into
         data, size = ends.view(np.uint8).data, _ENDING.size
 
         def fill(row: int, result: Any) -> None:
@@ -189,7 +184,7 @@ class Stepper:
         description, where = self._recording.spaces["action"], f"{self._recording.path}: an action"
         return (decode(description, data, where) for data in actions)
 
-    def check_spaces(self) -> None:
+    def _check_spaces(self) -> None:
         """Check that the environment's spaces hold the recorded values.
 
         Raises:
@@ -250,11 +245,8 @@ class GameStepper(Stepper):
             )
         return game_spaces(self.env)
 
-    def _putter(self, column: Array) -> Put:
-        return filler(SpaceValues(self.observation_space, "observation", is_game=True), column)
-
     def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:
-        put, agents = self._putter(seen), self.env.possible_agents
+        put, agents = filler(self._observation, seen), self.env.possible_agents
         masks = [got[name] for name in got.dtype.names or () if name.startswith("agents_")]
 
         def fill(row: int, result: Any) -> None:
@@ -294,18 +286,18 @@ class VectorStepper(Stepper):
     """
 
     def __init__(self, env: Any, recording: Recording, autoreset: str, drawn: int = 0) -> None:
-        super().__init__(env, recording)
         self.n = recording.environments
-        if env.num_envs != self.n:
-            raise CannotRedo(f"The vector has {env.num_envs} environments, and the recording {self.n}.")
+        super().__init__(env, recording)
         self._autoreset, self._drawn = autoreset, drawn
-        self._values = SpaceValues(self.observation_space, "observation")
+        self._observation = SpaceValues(self.observation_space, "observation")
         self._over = np.zeros(self.n, np.bool_)
         """The environments whose episode ended with the last step."""
         self._last: Array = np.zeros(self.n, self._first_dtype)
         """[n]: what the vector returned last."""
 
     def _spaces(self) -> tuple[Space, Space]:
+        if self.env.num_envs != self.n:
+            raise CannotRedo(f"The vector has {self.env.num_envs} environments, and the recording {self.n}.")
         return spaces_of_one(self.env)
 
     def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
@@ -326,7 +318,7 @@ class VectorStepper(Stepper):
                 explicit.append(reset)
         for call in calls(explicit):
             observations = self.env.reset(**self._arguments(call))[0]
-            self._last = self._values.fitted(observations, (self.n,), self._first_dtype)
+            self._last = self._observation.fitted(observations, (self.n,), self._first_dtype)
             for reset in call:
                 add(reset)
         if automatic:
@@ -355,7 +347,7 @@ class VectorStepper(Stepper):
 
     def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
         rows = seen.reshape(len(seen) // self.n, self.n, *seen.shape[1:])
-        put, put_last = filler(self._values, rows, (self.n,)), filler(self._values, seen)
+        put, put_last = filler(self._observation, rows, (self.n,)), filler(self._observation, seen)
         columns = [ends[name].reshape(-1, self.n) for name in _ENDS]
 
         def fill(step: int, result: Any) -> None:
