@@ -109,7 +109,7 @@ def filler(values: SpaceValues, column: Array, batch: tuple[int, ...] = ()) -> P
     source = _Source(check_agents=values.check_agents, to_bytes=values.to_bytes)
     lines = ["check_agents(value)" if values.agents else "pass"]
     if column.dtype.hasobject:
-        places = source.name(column.reshape(len(column), -1))
+        places = source.name(column.reshape(len(column), math.prod(batch)))
         lines.append(f"{places}[row] = to_bytes(value, {source.name(batch)})")
     for leaf in () if column.dtype.hasobject else values.leaves:
         scalars = frozenset() if batch else leaf.exact_scalars
