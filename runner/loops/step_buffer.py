@@ -185,8 +185,8 @@ class StepBuffer:
         if terminated or truncated:
             self._ended += 1
             self._idle_at = row
-        if row >= self._room:
-            self._write()
+        if row == self._room or self._are_bytes:
+            self._advance(slice(row - 1, row))
 
     def take_game(
         self,
@@ -208,12 +208,10 @@ class StepBuffer:
         flags = dict.fromkeys(actions, True), terminated, truncated
         masks = [sum(bool(ends.get(agent)) << i for i, agent in enumerate(agents)) for ends in flags]
         self._marks[row] = (*masks, 0, over, False)
-        self._filled = row = row + 1
         if over:
             self._ended += 1
-            self._idle_at = row
-        if row >= self._room:
-            self._write()
+            self._idle_at = row + 1
+        self._advance(slice(row, row + 1))
 
     def take_vector(
         self,
@@ -251,11 +249,7 @@ class StepBuffer:
                 self._put_last(row * self._n + i, element_of(final, i))
         if states:
             self._autoreset_states[row] = states
-        if self._are_bytes:
-            self._hold(*self._actions[row], *self._observations[row])
-        self._filled = row + 1
-        if self._filled >= self._room:
-            self._write()
+        self._advance(slice(row, row + 1))
 
     def take_batch(
         self,
@@ -330,12 +324,8 @@ class StepBuffer:
             if firsts is not None:
                 at, which = np.nonzero(self._ends[rows].any(axis=1))
                 self._add_resets(row + at + 1, which, firsts[done + at, which])
-            if self._are_bytes:
-                self._hold(*self._actions[rows].ravel(), *self._observations[rows].ravel())
             done += count
-            self._filled += count
-            if self._filled >= self._room:
-                self._write()
+            self._advance(rows)
 
     def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last batch or reset of the phase."""
@@ -486,19 +476,19 @@ class StepBuffer:
         except (TypeError, ValueError):
             self._rewards[row] = only_number(rewards, "reward")
         self._ends[row] = [[bool(terminated)], [bool(truncated)]]
+
+    def _advance(self, rows: slice) -> None:
+        """Take rows that were put down into the block, and hand it to the recorder if it is full."""
         if self._are_bytes:
-            self._hold(*self._actions[row], *self._observations[row])
+            self._hold(*self._actions[rows].ravel(), *self._observations[rows].ravel())
+        self._filled = rows.stop
+        if self._filled == self._room or self._held > BLOCK_BYTES:
+            self.commit()
+            self._recorder.write_if_full()
 
     def _hold(self, *values: bytes) -> None:
         """Count the bytes of values of varying size; with many of them, the block is full."""
         self._held += sum(map(len, values))
-        if self._held > BLOCK_BYTES:
-            self._room = min(self._room, self._filled + 1)  # still 0 before the first step
-
-    def _write(self) -> None:
-        """Hand a block that is full to the recorder."""
-        self.commit()
-        self._recorder.write_if_full()
 
     # --- records --------------------------------------------------------------------------------------
 
@@ -550,7 +540,6 @@ class StepBuffer:
             self._last_position = before + rows * n
         self._over, self._idle_at, self._autoreset_states = over, 0 if is_idle else -1, {}
         self._filled = self._waiting = self._held = self._ended = self._counted = 0
-        self._room = len(self._ends)
 
     def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
         """Return `was_reset`, `only_reset` and `is_over` of the `Steps`; put down the resets among these.
