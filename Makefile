@@ -37,8 +37,9 @@ lint: $(VENV)/.installed-dev  ## formatting, style, strict types and wording
 bench: $(VENV)/.installed-dev  ## measure what docs/performance.md states
 	$(BIN)/python -m benchmarks
 
-soak: $(VENV)/.installed-dev  ## kill 200 runs at random moments, and resume each
+soak: $(VENV)/.installed-dev  ## kill 200 runs, then a server and its jobs 200 times, at random moments
 	$(BIN)/python -m tests.reliability.soak --kills 200
+	$(BIN)/python -m tests.reliability.jobs --kills 200
 
 fuzz: $(VENV)/.installed-dev  ## feed the reader a million mutated recordings (Linux)
 	$(BIN)/python -m pip install --constraint constraints.txt atheris

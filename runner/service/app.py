@@ -23,7 +23,7 @@ from runner.errors import RunnerError
 from runner.service import login, pages, views
 from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import CatalogueOf, SettingsOf
+from runner.service.dependencies import CatalogueOf, Computation, SettingsOf
 from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
@@ -138,12 +138,11 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         os.environ[OWN_ONLY] = "1"  # before any child process
         stack.callback(os.environ.pop, OWN_ONLY, None)
         stack.callback(app.state.catalogue.close)
-        app.state.catalogue.prepare()
+        app.state.catalogue.start_scan()  # the first request need not wait for all of it
         app.state.jobs = stack.enter_context(
             JobQueue(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
         app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
-        app.state.spooling = anyio.CapacityLimiter(1)
         app.state.downloads = anyio.CapacityLimiter(2)
         app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
         stack.callback(app.state.uploads.close)
@@ -152,11 +151,12 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.processes = stack.enter_context(
             ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )
+        app.state.computation = Computation(app.state.cache, app.state.processes)
         app.state.sweep_processes = stack.enter_context(
             ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=math.inf)
         )
         if any(sweeps_in(folder) for folder in settings.recordings):
-            app.state.sweep_processes.submit(load_sweep_libraries)
+            app.state.sweep_processes.submit(limits.work_seconds, load_sweep_libraries)
         LOG.info("started", extra=settings.log_fields())
         yield
         app.state.stopping.set()

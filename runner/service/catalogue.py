@@ -57,7 +57,7 @@ class Catalogue:
         if now is None or not self._is_current(now):
             return None
         if time.monotonic() - self._started > self._interval:
-            self._start_scan()
+            self.start_scan()
         return now
 
     def changed(self) -> None:
@@ -68,20 +68,16 @@ class Catalogue:
         """Return a key of cached responses, which changes with the runs."""
         return self.version() or self._changed
 
-    def prepare(self) -> None:
-        """Start the first scan, so that the first request need not wait for all of it."""
-        self._start_scan()
-
     def read(self, work: Callable[[Index], Result]) -> Result:
         """Return the result of a function of the index."""
         if self.version() is None:
-            self._start_scan().result()
+            self.start_scan().result()
         return look(self.roots, work, self._log, cached=self.version() is not None)
 
     def can_list(self) -> bool:
         """Return whether runs can be listed, according to the last scan; waits for the first scan only."""
         if self._scanned == NEVER or time.monotonic() - self._started > FULL_INTERVAL:
-            self._start_scan()
+            self.start_scan()
         latest = self._scan
         try:
             if latest is not None and (self._scanned == NEVER or latest.done()):
@@ -123,7 +119,7 @@ class Catalogue:
     def _interval(self) -> float:
         return min(max(MIN_INTERVAL, INTERVAL_FACTOR * self._duration), MAX_INTERVAL)
 
-    def _start_scan(self) -> Future[None]:
+    def start_scan(self) -> Future[None]:
         """Return a scan that starts now, or one that runs and started after the last change."""
         with self._lock:
             if self._scan is None or self._scan.done() or self._started <= self._changed:

@@ -56,7 +56,6 @@ async def owner_of(request: Request) -> str:
 
 
 OwnerOf = Annotated[str, Depends(owner_of)]
-Spooling = Annotated[CapacityLimiter, _state("spooling")]
 MAX_WAITING: Final = 16
 """Calls with large temporary files that may wait for the one that runs."""
 RunName = Annotated[
@@ -150,8 +149,8 @@ def _state_of(argument: object) -> object:
 class Computation:
     """Functions of runs and recordings, called in a child process, their results cached."""
 
-    def __init__(self, cache: ResponseCache, processes: ProcessPool, spooling: CapacityLimiter) -> None:
-        self._cache, self._processes, self._spooling = cache, processes, spooling
+    def __init__(self, cache: ResponseCache, processes: ProcessPool) -> None:
+        self._cache, self._processes, self._spooling = cache, processes, CapacityLimiter(1)
 
     async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
         """Return the result of a function.
@@ -179,12 +178,7 @@ class Computation:
         return json_response(await self(function, *args, alone=alone))
 
 
-async def computation(cache: CacheOf, processes: ProcessesOf, spooling: Spooling) -> Computation:
-    """Return what computes for a request."""
-    return Computation(cache, processes, spooling)
-
-
-ComputationOf = Annotated[Computation, Depends(computation)]
+ComputationOf = Annotated[Computation, _state("computation")]
 
 
 def json_response(body: bytes) -> Response:

@@ -110,23 +110,17 @@ class ProcessPool:
         self, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
     ) -> Result:
         """Return what a function returns in a child process; arguments and errors as for `submit`."""
-        return await asyncio.wrap_future(self.submit(function, *args, **keywords))
+        return await asyncio.wrap_future(self.submit(self._seconds, function, *args, **keywords))
 
     def submit(
-        self, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
+        self, seconds: float, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
     ) -> Future[Result]:
-        """Return the future result of a function of a module, called in a child process.
+        """Return the future result of a function of a module, called in a child process within some seconds.
 
         Arguments and result are pickled, between our own processes. The future raises the function's own
         `RunnerError` or `OSError`, or `TimedOut`, `OutOfMemory`, `ProcessDied`, or `Busy` when the pool is
         closed; `Busy` is raised if too many calls are waiting.
         """
-        return self.submit_within(self._seconds, function, *args, **keywords)
-
-    def submit_within(
-        self, seconds: float, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
-    ) -> Future[Result]:
-        """Do as `submit`, with another time limit."""
         if not self._places.acquire(blocking=False):
             raise Busy
         try:

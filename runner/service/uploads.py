@@ -276,7 +276,7 @@ class Uploads:
             upload = replace(upload, state="verifying", problem="")
             self._uploads[upload.owner, upload.id] = upload
         seconds = VERIFY_SECONDS + upload.offset / VERIFY_BYTES_A_SECOND
-        future = self._processes.submit_within(seconds, verify, upload, self._body(upload), self._recordings)
+        future = self._processes.submit(seconds, verify, upload, self._body(upload), self._recordings)
         future.add_done_callback(partial(self._end, upload))
         return upload
 

@@ -155,7 +155,7 @@ async def replay_of(
     async def make() -> bytes:
         if request.frames:
             with contextlib.suppress(CallFailed):
-                drawing = processes.submit_within(DRAW_SECONDS, computed.replay, runs, request)
+                drawing = processes.submit(DRAW_SECONDS, computed.replay, runs, request)
                 return await asyncio.wrap_future(drawing)
         return await processes(computed.replay, runs, replace(request, frames=False))
 

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 
 from runner.client.jobs import EventData
 from runner.errors import RunnerError
-from runner.runs.listing import run_at
+from runner.runs.locking import locked
 from runner.runs.run import Run
 from runner.service.jobs.store import Job, read_values
 
@@ -85,14 +85,9 @@ def wait_for_owners(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
     """
     for run in runs:
         if run.status == "running":
-            until_free(partial(_require_free, run.folder), RunnerError, stop, OTHER_OWNER_SECONDS)
+            until_free(partial(_require_free, run), RunnerError, stop, OTHER_OWNER_SECONDS)
 
 
-def _require_free(folder: Path) -> None:
-    run = run_at(folder)
-    if run.status == "running":
-        owner = run.file.owner
-        raise RunnerError(
-            f"run {run.run_id} is still running (process {owner.get('pid')} on {owner.get('host')}); "
-            "resume the job when that has ended."
-        )
+def _require_free(run: Run) -> None:
+    with locked(run):
+        pass

@@ -170,7 +170,7 @@ class JobChecker:
         self, source: str, function: Callable[Args, CheckedJob], *args: Args.args, **keywords: Args.kwargs
     ) -> CheckedJob:
         """Return the job that a function returns in a child process; `source` begins the messages."""
-        future = self._pool.submit(function, *args, **keywords)
+        future = self._pool.submit(CHECK_SECONDS, function, *args, **keywords)
         waiting = asyncio.wrap_future(future)
         done, _ = await asyncio.wait({waiting}, timeout=QUEUE_SECONDS)
         if not done and future.cancel():

@@ -20,13 +20,13 @@ CLOSE_SECONDS: Final = 10
 """How long the command may take to close its recording before Ray kills it."""
 LOG_SECONDS: Final = 5.0
 """How long to wait for the rest of the log of a command that has ended."""
-COMMAND: Final = ("python", "-P", "-m", "runner", "run", "--job")
+COMMAND: Final = "python -P -m runner run --job"
 """The command without the folder of its job; `-P` imports nothing from the current folder."""
 
 
 def require_job_api() -> Any:
     """Return the module of Ray's job API, with all that it needs."""
-    return require("ray.job_submission", "aiohttp", "requests", extra="ray", purpose="`serve --ray`")
+    return require("ray.job_submission", "aiohttp", extra="ray", purpose="`serve --ray`")
 
 
 def do_on_cluster(spec: JobSpec, address: str, channel: JobChannel) -> StateEvent | None:
@@ -35,35 +35,34 @@ def do_on_cluster(spec: JobSpec, address: str, channel: JobChannel) -> StateEven
     None if the command died, perhaps with its machine. What a killed server left on the cluster is stopped.
     """
     folder = os.fspath(spec.folder)
-    variables = {OWN_ONLY: "1", "RAY_JOB_STOP_WAIT_TIME_S": str(CLOSE_SECONDS)}
     try:
         client = require_job_api().JobSubmissionClient(address)
         for job in client.list_jobs():
             if (job.metadata or {}).get("folder") == folder and not job.status.is_terminal():
                 client.stop_job(job.submission_id)
         submission = client.submit_job(
-            entrypoint=shlex.join([*COMMAND, folder]),
+            entrypoint=f"{COMMAND} {shlex.quote(folder)}",
             entrypoint_num_cpus=0 if spec.job.kind in WITHOUT_RUNS else 1,
-            runtime_env={"env_vars": variables},
+            runtime_env={"env_vars": {OWN_ONLY: "1", "RAY_JOB_STOP_WAIT_TIME_S": str(CLOSE_SECONDS)}},
             metadata={"folder": folder},
         )
         return asyncio.run(_follow(client, submission, channel))
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, RunnerError) as error:
         return StateEvent("failed", f"--ray: the cluster at {address} does not do this job: {error}")
 
 
 async def _follow(client: Any, submission: str, channel: JobChannel) -> StateEvent | None:
     """Forward the events of a command until it has ended; return its outcome."""
-    log, is_stopping = asyncio.create_task(_forward(client, submission, channel)), False
+    log = asyncio.create_task(_forward(client, submission, channel))
     while not client.get_job_status(submission).is_terminal():
-        if channel.stop() and not is_stopping:
-            is_stopping = client.stop_job(submission)
+        if channel.stop():
+            client.stop_job(submission)
         await asyncio.sleep(POLL_SECONDS)
     with contextlib.suppress(OSError, RuntimeError):  # the machine with the log is gone
         async with asyncio.timeout(LOG_SECONDS):
             if (outcome := await log) is not None:
                 return outcome
-    if is_stopping:
+    if channel.stop():
         return StateEvent("interrupted")
     channel.send(LogEvent(f"Ray: {client.get_job_info(submission).message}"))
     return None

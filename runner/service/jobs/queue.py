@@ -11,7 +11,6 @@ from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
 from runner.service.jobs.checking import JobChecker
-from runner.service.jobs.cluster import require_job_api
 from runner.service.jobs.store import WITHOUT_RUNS, CheckedJob, Job, JobStore, now
 from runner.service.jobs.workers import WorkerPool
 from runner.util.humanize import size
@@ -37,8 +36,6 @@ class JobQueue:
     def __init__(
         self, recordings: Path, workers: int, *, max_unfinished: int = 1000, ray: str | None = None
     ) -> None:
-        if ray is not None:
-            require_job_api()
         self.recordings = recordings.absolute()
         self.store = JobStore(self.recordings, max_unfinished)
         self.pool = WorkerPool(self.store, workers, ray)
@@ -112,8 +109,15 @@ class JobQueue:
                 raise JobStateConflict(f"job {number} is {job.state}; {hint}.")
             if job.kind == "sweep":
                 self._refuse_running_sweep(job.name)
-            fresh = {"error": "", "ended": "", "deaths": 0, "retry": True}
-            return self.store.update(number, state="queued", accept_changes=accept_changes, **fresh)
+            return self.store.update(
+                number,
+                state="queued",
+                error="",
+                ended="",
+                deaths=0,
+                retry=True,
+                accept_changes=accept_changes,
+            )
 
     def status(self) -> QueueStatus:
         """Return the state of the queue."""

@@ -24,8 +24,7 @@ from runner.sweep.whole import run_whole_sweep
 
 def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
     """Run what is left of a sweep, once no other process runs it."""
-    rest = partial(_run_rest, spec, channel)
-    until_free(rest, state.SweepBusy, channel.stop, OTHER_OWNER_SECONDS)
+    until_free(partial(_run_rest, spec, channel), state.SweepBusy, channel.stop, OTHER_OWNER_SECONDS)
 
 
 def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
@@ -65,13 +64,11 @@ class _SweepReporter:
 
     def send(self, status: SweepStatus) -> None:
         """Send the sweep's progress."""
-        best = status.best
-        if best is not None and best.number != self._best:
-            self._best = best.number
-            text = f"trial {best.number} is the best so far: {best.value:g}"
-            self._channel.send(LogEvent(text))
-        shown = None
+        best, shown = status.best, None
         if best is not None:
+            if best.number != self._best:
+                self._best = best.number
+                self._channel.send(LogEvent(f"trial {best.number} is the best so far: {best.value:g}"))
             # A level that was never reached is infinite or None; JSON has no infinity.
             value = best.value if best.value is not None and math.isfinite(best.value) else None
             shown = BestTrial(best.number, value, best.values)

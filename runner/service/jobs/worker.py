@@ -55,7 +55,7 @@ def work(pipe: Connection, spec: JobSpec, cluster: str | None = None) -> None:
             pipe.send(event)
 
     signal.signal(signal.SIGTERM, lambda *_: stopping.set())
-    threading.Thread(target=wait_for_stop, name="channel", daemon=True).start()
+    threading.Thread(target=wait_for_stop, daemon=True).start()
     channel = JobChannel(send, stopping.is_set)
     outcome = do_job(spec, channel) if cluster is None else do_on_cluster(spec, cluster, channel)
     if outcome is not None:

@@ -34,10 +34,7 @@ RETRY_SECONDS: Final = 5.0
 
 @dataclass
 class _Worker:
-    number: int
-    """The number of its job."""
-    workers: int
-    """How many workers the job holds."""
+    job: Job
     process: BaseProcess
     pipe: Any
     stopped: float | None = None
@@ -61,7 +58,7 @@ class WorkerPool:
     """
 
     def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
-        self.size, self.ray, self._store, self._lock = size, ray, store, store.lock
+        self.size, self.ray, self._store = size, ray, store
         self._context = process_context(PRELOADED)
         self._busy: dict[int, _Worker] = {}
         self._start_problem, self._retry_at = "", 0.0
@@ -95,7 +92,7 @@ class WorkerPool:
     def _run(self) -> None:
         """Start workers and receive their events, until the server stops."""
         while self._busy or not self._stopping.is_set():
-            with _logged(), self._lock:
+            with _logged(), self._store.lock:
                 self._start_next()
             with _logged():
                 self._receive()
@@ -106,9 +103,9 @@ class WorkerPool:
         if job is None:
             self._start_problem = ""
             return
-        if self._needed(job) > self._free() or job.number in self._busy or self._short_of_disk():
+        if self._stopping.is_set() or time.monotonic() < self._retry_at or job.number in self._busy:
             return
-        if self._stopping.is_set() or time.monotonic() < self._retry_at:
+        if self._needed(job) > self._free() or self._short_of_disk():
             return
         try:
             self._busy[job.number] = self._start_worker(job)
@@ -126,8 +123,8 @@ class WorkerPool:
 
     def _start_worker(self, job: Job) -> _Worker:
         """Start the worker process of a job."""
-        workers = self._needed(job)
-        spec = JobSpec(self._store.path(job.number), replace(job, workers=workers))
+        job = replace(job, workers=self._needed(job))
+        spec = JobSpec(self._store.path(job.number), job)
         ours, theirs = self._context.Pipe()
         with contextlib.closing(theirs):
             # Not a daemon: a sweep's worker has child processes of its own.
@@ -136,7 +133,7 @@ class WorkerPool:
             except BaseException:
                 ours.close()
                 raise
-        return _Worker(job.number, workers, process, ours)
+        return _Worker(job, process, ours)
 
     def _next_job(self) -> Job | None:
         """Return the job that is started next: jobs start in the order of their numbers."""
@@ -147,7 +144,7 @@ class WorkerPool:
         return min(job.workers, self.size)
 
     def _free(self) -> int:
-        return self.size - sum(worker.workers for worker in list(self._busy.values()))
+        return self.size - sum(worker.job.workers for worker in list(self._busy.values()))
 
     def _short_of_disk(self) -> str:
         free = free_bytes(self._store.recordings)
@@ -162,7 +159,7 @@ class WorkerPool:
             self._stopping.wait(RECEIVE_SECONDS)
             return
         for worker in by_pipe.values():
-            if self._stopping.is_set() or not self._store.is_running(worker.number):
+            if self._stopping.is_set() or not self._store.is_running(worker.job.number):
                 worker.stop()
         for pipe in connection.wait(list(by_pipe), RECEIVE_SECONDS):
             with _logged():
@@ -181,7 +178,7 @@ class WorkerPool:
         if event is None or isinstance(event, StateEvent):
             self._end(worker, event)
         else:
-            self._store.report(worker.number, event)
+            self._store.report(worker.job.number, event)
 
     def _end(self, worker: _Worker, outcome: StateEvent | None) -> None:
         """Remove a worker that is about to end, with the outcome of its job; None if it died.
@@ -193,11 +190,11 @@ class WorkerPool:
         worker.process.kill()
         worker.process.join()
         worker.pipe.close()
-        with self._lock:
-            del self._busy[worker.number]
-            if not self._store.is_running(worker.number):
+        with self._store.lock:
+            del self._busy[worker.job.number]
+            if not self._store.is_running(worker.job.number):
                 return
-            job = self._store.job(worker.number)
+            job = self._store.job(worker.job.number)
             deaths = job.deaths + (outcome is None)
             if outcome is None:
                 code = worker.process.exitcode

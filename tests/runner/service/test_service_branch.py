@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import time
+from contextlib import closing
 
 import pytest
 
@@ -100,7 +101,7 @@ def test_a_trial_offers_no_branch_of_training(client):
 
 
 def test_a_branch_whose_parent_was_removed_fails_and_leaves_no_run(connect, recordings, tmp_path):
-    with JobStore(recordings) as store:
+    with closing(JobStore(recordings)) as store:
         parent = find_run("first", recordings)
         checked = check_branch(parent, BranchQuestion(at="20:1", overrides=("epsilon=0.5",), name="orphan"))
         job = store.add(checked, "")

@@ -6,6 +6,7 @@ import concurrent.futures
 import errno
 import json
 import time
+from contextlib import closing
 from dataclasses import replace
 from multiprocessing.process import BaseProcess
 
@@ -322,7 +323,7 @@ def test_a_reserved_run_that_was_never_made_is_made(tmp_path, folder):
 
 def test_a_command_does_a_job_from_its_folder_alone(tmp_path):
     folder = tmp_path / "runs"
-    with JobStore(folder) as store:
+    with closing(JobStore(folder)) as store:
         text = json.dumps(CONFIG)
         path = store.path(store.add(check(text, "job.yaml", folder), text).number)
         missing = one_seed().values | {"env": {"id": "Missing-v0", "kwargs": {}}}

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import threading
+from contextlib import closing
 
 import httpx2
 import psutil
@@ -130,7 +131,7 @@ def test_a_stopped_server_leaves_its_job_resumable_and_ends_event_streams(tmp_pa
         assert server.stop() in (0, -signal.SIGTERM)
         watcher.join(10)
         assert not watcher.is_alive()
-        with JobStore(tmp_path) as store:
+        with closing(JobStore(tmp_path)) as store:
             assert store.job(1).state == "interrupted"
         assert [run.status for run in list_runs(tmp_path)] == ["interrupted"]
 

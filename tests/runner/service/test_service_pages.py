@@ -146,7 +146,7 @@ def test_the_page_of_a_run_waits_for_no_child_process(client, monkeypatch):
     def hang(*_, **__):
         raise AssertionError("a child process is called")
 
-    monkeypatch.setattr(ProcessPool, "submit_within", hang)
+    monkeypatch.setattr(ProcessPool, "submit", hang)
     for name in ("first", "second"):
         assert client.get(f"/runs/{name}").status_code == 200
 

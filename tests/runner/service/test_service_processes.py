@@ -46,29 +46,29 @@ def test_results_and_errors_are_those_of_the_function_on_any_event_loop(pool):
 
 def test_a_call_that_exceeds_a_limit_or_dies_fails(pool):
     with pytest.raises(OutOfMemory, match=r"more than 268 MB"):
-        pool.submit(bytearray, 2 * MEMORY).result()
+        pool.submit(60, bytearray, 2 * MEMORY).result()
     with pytest.raises(ProcessDied):
-        pool.submit(os._exit, 3).result()
-    with ProcessPool(1, 0.5, MEMORY) as hasty, pytest.raises(TimedOut, match=r"longer than 0\.5 s"):
-        hasty.submit(time.sleep, 600).result()
+        pool.submit(60, os._exit, 3).result()
+    with ProcessPool(1, 60, MEMORY) as hasty, pytest.raises(TimedOut, match=r"longer than 0\.5 s"):
+        hasty.submit(0.5, time.sleep, 600).result()
 
 
 def test_closing_ends_running_calls():
     pool = ProcessPool(1, 600, MEMORY)
-    calls = [pool.submit(time.sleep, 600) for _ in range(3)]
+    calls = [pool.submit(60, time.sleep, 600) for _ in range(3)]
     pool.close()
     assert all(isinstance(call.exception(), Busy) for call in calls)
 
 
 def test_a_process_can_be_reused():
     with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
-        assert pool.submit(os.getpid).result() == pool.submit(os.getpid).result()
+        assert pool.submit(60, os.getpid).result() == pool.submit(60, os.getpid).result()
 
 
 def test_calls_of_a_reused_process_leak_no_threads():
     with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
-        pool.submit(os.getpid).result()
+        pool.submit(60, os.getpid).result()
         before = threading.active_count()
         for _ in range(20):
-            pool.submit(os.getpid).result()
+            pool.submit(60, os.getpid).result()
         assert threading.active_count() <= before + 2  # a cancelled timer may still be ending

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import closing
 
 import pytest
 
@@ -27,12 +28,12 @@ def texts(events):
 
 @pytest.fixture
 def store(tmp_path):
-    with JobStore(tmp_path / "recordings") as opened:
+    with closing(JobStore(tmp_path / "recordings")) as opened:
         yield opened
 
 
 def test_jobs_their_runs_and_events_outlive_the_process(tmp_path):
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         first, second = added(store), added(store, "other")
         third = store.add(CheckedJob("sweep", "swept", 2, 0, SWEEP), "", 2)
         store.update(first.number, state="failed", error="no luck")
@@ -40,7 +41,7 @@ def test_jobs_their_runs_and_events_outlive_the_process(tmp_path):
         store.update(second.number, run_ids={2**64 - 1: "aaaa", 3: "bbbb"})
         store.report(second.number, RunEvent("aaaa", 2**64 - 1))
         before, events = store.jobs(), store.events(second.number)
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         assert store.jobs() == before
         assert [(job.number, job.state, job.error) for job in before] == [
             (1, "failed", "no luck"),
@@ -63,7 +64,7 @@ def test_one_process_at_a_time_has_the_store(store):
 
 
 def test_more_unfinished_jobs_than_the_maximum_are_refused(tmp_path):
-    with JobStore(tmp_path, max_unfinished=2) as store:
+    with closing(JobStore(tmp_path, max_unfinished=2)) as store:
         first, _ = added(store), added(store)
         with pytest.raises(QueueFull, match="2 jobs are unfinished"):
             added(store)
@@ -72,20 +73,20 @@ def test_more_unfinished_jobs_than_the_maximum_are_refused(tmp_path):
 
 
 def test_the_oldest_jobs_that_are_over_are_forgotten_but_no_number_is_used_twice(tmp_path):
-    with JobStore(tmp_path, max_over=2) as store:
+    with closing(JobStore(tmp_path, max_over=2)) as store:
         for _ in range(4):
             store.update(added(store).number, state="finished")
         waiting = added(store)
         assert [job.number for job in store.jobs()] == [3, 4, 5]
         with pytest.raises(JobNotFound, match="no job 1;"):
             store.events(1)
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         assert [job.number for job in store.jobs()] == [3, 4, waiting.number]
         assert added(store).number == 6
 
 
 def test_a_damaged_job_is_reported_and_kept(tmp_path):
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         state = store.path(added(store).number, stores.STATE_FILE)
     for damaged in (b"", b"no job", b'{"number": 1}'):
         state.write_bytes(damaged)
@@ -95,22 +96,22 @@ def test_a_damaged_job_is_reported_and_kept(tmp_path):
 
 
 def test_a_submission_that_was_not_confirmed_leaves_nothing(tmp_path):
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         folder = store.path(added(store).number)
     (folder / stores.STATE_FILE).unlink()  # which is written last
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         assert (store.jobs(), folder.exists()) == ([], False)
         assert added(store).number == 1
 
 
 def test_a_line_that_was_not_written_to_its_end_is_left_out(tmp_path):
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         number = added(store).number
         store.report(number, LogEvent("one"))
         before, log = store.events(number), store.path(number, stores.LOG_FILE)
     with log.open("ab") as stream:
         stream.write(b'{"kind": "log", "values": {"text": "the power fai')
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         assert store.log_size(number) == before[1]
         assert store.events(number) == before
         store.report(number, LogEvent("two"))
@@ -157,7 +158,7 @@ def test_on_a_full_disk_a_job_is_not_queued_and_a_change_counts_until_the_next_s
     def full(path, *_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
 
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         job = added(store)
         monkeypatch.setattr(stores, "_write", full)
         with pytest.raises(StorageError, match="No space left on device"):
@@ -165,7 +166,7 @@ def test_on_a_full_disk_a_job_is_not_queued_and_a_change_counts_until_the_next_s
         assert [folder.name for folder in store.path(job.number).parent.iterdir() if folder.is_dir()] == ["1"]
         store.update(job.number, state="cancelled")
         assert [job.state for job in store.jobs()] == ["cancelled"]
-    with JobStore(tmp_path) as store:
+    with closing(JobStore(tmp_path)) as store:
         assert store.jobs() == [job]
 
 
