@@ -205,7 +205,7 @@ def _gathered(series: Iterable[RunSeries], key: Callable[[RunSeries], Key]) -> d
 def _labelled(runs_of: Iterable[Sequence[RunSeries]]) -> list[Group]:
     """Return a group for each sequence of runs, labelled by their names and the values in which it differs.
 
-    Only groups of the same names are told apart by values, so that a label stays short.
+    Only groups of the same names differ by values in their labels, so that a label stays short.
     """
     named = [
         (" / ".join(dict.fromkeys(run.name for run in runs)), flat_config(runs[0].config), runs)

@@ -176,7 +176,7 @@ def first_of(recording: Recording, reset: RecordedReset) -> Value:
     return int(reset.observation) - least_number(recording.spaces["observation"])
 
 
-# --- beside the steps ---------------------------------------------------------------------------------
+# --- next to the steps -----------------------------------------------------------------------------------
 
 
 def recorded_frames(

@@ -87,7 +87,7 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
     """Start or resume a job's run of one seed; return its status."""
     run = _existing_run(spec.recordings / spec.job.run_ids[seed])
     if run is not None and run.status == "finished":
-        if seed not in spec.job.started_runs:  # the server was killed before it was told
+        if seed not in spec.job.started_runs:  # the server was killed before it knew
             channel.send(RunEvent(run.run_id, seed))
         return run.status
     if run is not None:

@@ -23,7 +23,7 @@ from tests.runner.loops.talking import ENVIRONMENTS, said
 STEPS = 60
 
 
-def thoughts(draws, t):
+def generated(draws, t):
     """Return tokens, log-probabilities and a value; often as many tokens as before, sometimes none."""
     n = (3, 3, 5, 0, 8)[t % 5]
     return {
@@ -58,7 +58,7 @@ def recorded(tmp_path_factory):
     ) as rec:
         rec.reset(seed=5)
         for t in range(STEPS):
-            values = [thoughts(draws, t + i) for i in range(ENVIRONMENTS)]
+            values = [generated(draws, t + i) for i in range(ENVIRONMENTS)]
             rec.step(tuple(said(t, i) for i in range(ENVIRONMENTS)), extras=stacked(values))
             given += values
     return rec.run, given
@@ -139,7 +139,7 @@ def test_one_environment_alone(tmp_path):
     with runner.record(talking.Assistant(), tmp_path, make=talking.Assistant) as rec:
         rec.reset(seed=1)
         for t in range(200):
-            values = thoughts(draws, t)
+            values = generated(draws, t)
             over = any(rec.step(said(t, 0), extras=values)[2:4])
             if t % 3 == 0:
                 values["said"] = "\0" + "thought \N{HORIZONTAL ELLIPSIS} \ud800" * (t % 7)
