@@ -185,7 +185,7 @@ class StepBuffer:
         if terminated or truncated:
             self._ended += 1
             self._idle_at = row
-        if row == self._room or self._are_bytes:
+        if row >= self._full_at:
             self._advance(slice(row - 1, row))
 
     def take_game(
@@ -424,6 +424,7 @@ class StepBuffer:
         self._first_action(action)
         room, n = max(1, self._recorder.capacity(self._topics.steps) // self._n), self._n
         self._room = room
+        self._full_at = 0 if self._are_bytes else room  # the bytes of each step are counted
         masks = [(name, "<u4") for name in (*_OF_GAMES, "environment")]
         self._marks = np.zeros(room, [*masks, ("over", "?"), ("begins", "?")])
         action = self._recorder.dtype(self._topics.steps)["action"]
