@@ -109,7 +109,7 @@ class StateLeaf(Leaf):
 
     def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:
         super().__init__(part, what, on_rounded)
-        self.exact_scalars = frozenset()
+        self.exact_scalars = frozenset([int])  # others are converted
 
     def fit(self, value: object, batch: tuple[int, ...] = ()) -> int:  # noqa: ARG002
         """Return a whole number, which may stand in an array of one.
