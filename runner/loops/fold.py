@@ -379,9 +379,11 @@ class _Fold:
         if topic.message in (schema.RESET_OPTIONS, schema.RESET_STATE):
             for attached in _of_resets(source, topic):
                 read[topic.name] += 1
-                units = source.units[phase][source.units[phase]["reset"] == attached.reset]
-                for unit in units:
-                    moved = attached._replace(reset=int(unit["new_reset"]))
+                # Other processes may come between the resets of a call, so each gets its options.
+                alone = attached._replace(resets=1) if isinstance(attached, ResetOptions) else attached
+                after = source.units[phase]["reset"] - attached.reset
+                for unit in source.units[phase][(after >= 0) & (after < attached.resets)]:
+                    moved = alone._replace(reset=int(unit["new_reset"]))
                     yield int(unit["new_position"]), moved.to_payload()
             return
         for fields in source.recording.table(topic).decoded():

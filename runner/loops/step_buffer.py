@@ -25,7 +25,7 @@ from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.fillers import Change, Put, filler, step_filler
 from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, only_number
 from runner.recording.recorder import BLOCK_BYTES, Recorder
-from runner.recording.reset_options import ResetOptions
+from runner.recording.reset_options import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions
 from runner.recording.reset_states import ResetState
 from runner.recording.spaces import Value, least_number
 from runner.util.arrays import Array, Ints, Records, zeros
@@ -244,9 +244,10 @@ class StepBuffer:
         ends[0], ends[1] = terminated, truncated
         if infos is not None and _TRUE in ends.tobytes() and (final := final_observations(infos)) is not None:
             which = ends.any(axis=0).nonzero()[0].tolist()
-            self._add_resets(row + 1, which, self._observations[row, which])
+            firsts = self._observations[row, which]
             for i in which:
                 self._put_last(row * self._n + i, element_of(final, i))
+            self._add_resets(row + 1, which, firsts)
         if states:
             self._autoreset_states[row] = states
         self._advance(slice(row, row + 1))
@@ -350,8 +351,16 @@ class StepBuffer:
             which: the environments.
             states: what the reset depended on, by environment, as far as it is to be recorded.
             options: those of the reset as JSON; empty for none.
+
+        Raises:
+            RecordingError: an observation is none of the space, or a seed has too many digits.
         """
-        self._put_seen(0, observations)
+        if any(seed is not None and seed > MAX_LARGE_SEED for seed in seeds):
+            raise RecordingError(f"found a seed with more digits than {MAX_DIGITS:,}, expected fewer.")
+        if self._batch:
+            self._seen[0] = self._fitted(observations, self._n)  # all or nothing of them
+        else:
+            self._put_seen(0, observations)
         seen = self._seen[0] if len(which) == self._n else self._seen[0, which]
         must_commit = bool(self._batch) and not self.over[which].all()
         self._ended += not self._batch and self._idle_at != self._filled
@@ -396,13 +405,15 @@ class StepBuffer:
             self._resets = np.concatenate([self._resets, np.zeros_like(self._resets)])
         added = self._resets[start : self._waiting]
         added["row"], added["environment"], added["observation"] = rows, which, observations
+        large = [k for k, seed in enumerate(seeds) if seed is not None and seed > MAX_SEED]
         for k, seed in enumerate(seeds):
-            is_large = seed is not None and seed > MAX_SEED
             if seed is not None and 0 <= seed <= MAX_SEED:
                 added["seed"][k], added["seeded"][k] = seed, True
-            if options or is_large:
-                attached = ResetOptions(json=options, large_seed=seed if is_large else None)
-                self._attached[start + k].append(attached)
+        for k in range(len(which)) if large and options else large:
+            attached = ResetOptions(json=options, large_seed=seeds[k] if k in large else None)
+            self._attached[start + k].append(attached)
+        if options and not large:
+            self._attached[start].append(ResetOptions(json=options, resets=len(which)))
         for k, environment in enumerate(which) if states else ():
             if environment in states:
                 self._attached[start + k].append(states[environment])
@@ -453,7 +464,7 @@ class StepBuffer:
     def _copied(self, action: Value) -> Value:
         """Return a copy of an action; not as bytes, which are what `step_filler` makes of actions."""
         given = as_given(action)
-        is_taken_for_those = given.__class__ is bytes and not (self._are_bytes or self._starts)
+        is_taken_for_those = isinstance(given, bytes | bytearray) and not (self._are_bytes or self._starts)
         return np.array(given) if is_taken_for_those else given
 
     def _put_parts(

@@ -21,11 +21,10 @@ from runner.recording.differences import first_differing_row
 from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
-from runner.recording.steps import Steps as WholeSteps
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import TopicChunks
 from runner.recording.turns import is_taken
-from runner.util.arrays import Array, Ints
+from runner.util.arrays import Array, Ints, zeros
 
 _MAX_STEPS: Final = 2**62
 """More steps than a recording has."""
@@ -55,7 +54,7 @@ class Findings:
 
 
 def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
-    """Compare the steps, resets and episodes of a phase with one another; of actions alone, their numbers.
+    """Compare the steps, resets and episodes of a phase with one another.
 
     Args:
         complete: whether the recording was completed; else it is checked up to its last reset, as later ones
@@ -68,9 +67,9 @@ def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
     for table in (own.resets, own.episodes):
         for _ in _numbered(table):
             pass
-    if recording.leaves_out_steps:
-        return Findings(last_time=_last_time_of(own.steps))
-    if own.steps.are_actions:
+    if recording.leaves_out_steps and not own.steps.are_actions:
+        return Findings()
+    if own.steps.are_actions and not recording.leaves_out_steps:
         raise Inconsistent(
             f"{own.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
         )
@@ -141,7 +140,9 @@ class _PhaseCheck:
     def __init__(self, recording: Recording, phase: str, stop: int | None) -> None:
         self._recording, self._own, self._stop = recording, recording.phase(phase), stop
         self._n, self._learners = recording.environments, len(recording.agents)
-        self._mdp = recording.mdp if recording.tabular else None
+        self._is_whole = not self._own.steps.are_actions
+        """Whether steps have observations and rewards, and not their actions alone."""
+        self._mdp = recording.mdp if recording.tabular and self._is_whole else None
         self._episodes = EpisodeLog(self._n, self._learners, self._mdp, recording.layout.has_turns)
         self._environments = np.arange(self._n)
         """The environments of the last round: those of shards follow one another."""
@@ -187,13 +188,14 @@ class _PhaseCheck:
             raise self._wrong("step", numbers[wrong[0]], "taken", "no step", "a reset before it")
         ends = rows["terminated"], rows["truncated"]
         is_over, counts = self._is_over(numbers, rows), self._counts(first, rows)
+        rewards = rows["rewards"] if self._is_whole else np.zeros((*rows.shape, self._learners))
         episodes = self._episodes.take(
-            Steps(first, rows["rewards"], *ends, was_reset, only_reset, is_over, counts, environment)
+            Steps(first, rewards, *ends, was_reset, only_reset, is_over, counts, environment)
         )
         expected: Columns = {"t": episodes.t, "episode": episodes.number}
         if "environment" in names:
             expected["environment"] = environment
-        if self._recording.has_states:
+        if self._recording.has_states and self._is_whole:
             expected |= self._states(rows, given, was_reset, only_reset)
         elif only_reset.any() and "next_observation" in names:
             observed = rows["next_observation"][only_reset]
@@ -220,7 +222,7 @@ class _PhaseCheck:
         They are [steps of each environment, environments].
         """
         first, resets = numbers.start, self._resets
-        given, was_reset = np.zeros(shape, resets.left.dtype["observation"]), np.zeros(shape, np.bool_)
+        given, was_reset = zeros(shape, resets.left.dtype["observation"]), np.zeros(shape, np.bool_)
         environment = np.broadcast_to(self._environments, shape).astype(np.int64)
         for block in resets.before(numbers.stop):
             step, is_unknown = block["step"], block["environment"] >= environment_count(self._recording)
@@ -313,7 +315,8 @@ class _PhaseCheck:
                 f"/{self._own.name}/episode: found {first + have} episodes, expected one that ended at step "
                 f"{expected['last_step'][have]}"
             )
-        self._compare("episode", found, {name: values[:have] for name, values in expected.items()})
+        known = expected.keys() if self._is_whole else expected.keys() - {"returns"}
+        self._compare("episode", found, {name: expected[name][:have] for name in sorted(known)})
 
     def _finish(self, steps: int) -> None:
         """Check the resets after the last step, and that there is nothing else."""
@@ -349,17 +352,6 @@ class _PhaseCheck:
         return Inconsistent(
             f"/{self._own.name}/{what}, {what} {number}: {name}: found {found}, expected {expected}"
         )
-
-
-def _last_time_of(steps: WholeSteps) -> int:
-    """Check the numbers and times of steps of which only the actions were recorded; return the last time."""
-    last, name = -1, steps.actions.topic.name
-    for rows in _numbered(steps, name):
-        times = rows["log_time"].astype(np.int64)
-        if (np.diff(times, prepend=last) <= 0).any():
-            raise Inconsistent(f"{name}: found times that do not increase from step to step")
-        last = int(times[-1])
-    return max(last, 0)
 
 
 def _numbered(table: TopicChunks, name: str = "") -> Iterator[NDArray[np.void]]:

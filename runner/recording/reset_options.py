@@ -9,7 +9,9 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import decode, encode
 
-_MAX_DIGITS: Final = 100
+MAX_DIGITS: Final = 4000
+MAX_LARGE_SEED: Final = 10**MAX_DIGITS - 1
+"""The largest seed that is recorded."""
 
 
 class ResetOptions(NamedTuple):
@@ -21,6 +23,8 @@ class ResetOptions(NamedTuple):
     """The options as a JSON object, or as text the reason why they are not recorded; empty for none."""
     large_seed: int | None = None
     """The seed, if it has more than 64 bits."""
+    resets: int = 1
+    """How many consecutive resets have the options: those of one call, which resets several environments."""
 
     @property
     def options(self) -> dict[str, object] | None:
@@ -31,7 +35,7 @@ class ResetOptions(NamedTuple):
     def to_payload(self) -> bytes:
         """Return the message."""
         seed = "" if self.large_seed is None else str(self.large_seed)
-        return encode(schema.RESET_OPTIONS, {"reset": self.reset, "json": self.json, "large_seed": seed})
+        return encode(schema.RESET_OPTIONS, self._asdict() | {"large_seed": seed})
 
 
 def decode_reset_options(payload: bytes) -> ResetOptions:
@@ -42,11 +46,10 @@ def decode_reset_options(payload: bytes) -> ResetOptions:
     """
     fields = decode(schema.RESET_OPTIONS, payload)
     seed = fields["large_seed"]
-    if seed and not (seed.isascii() and seed.isdecimal() and len(seed) < _MAX_DIGITS):
-        raise RecordingError(
-            f"found the seed {seed[:40]!r} of a reset, expected at most {_MAX_DIGITS} digits"
-        )
-    given = ResetOptions(fields["reset"], fields["json"], int(seed) if seed else None)
+    if seed and not (seed.isascii() and seed.isdecimal() and len(seed) <= MAX_DIGITS):
+        raise RecordingError(f"found the seed {seed[:40]!r} of a reset, expected at most {MAX_DIGITS} digits")
+    large_seed = int(seed) if seed else None
+    given = ResetOptions(fields["reset"], fields["json"], large_seed, fields["resets"])
     try:
         given.options  # noqa: B018 - read once, to refuse what is no JSON
     except (ValueError, RecursionError) as error:

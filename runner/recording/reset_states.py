@@ -44,6 +44,11 @@ class ResetState(NamedTuple):
     """The state of an Atari environment's emulator before the reset, as `ale_py.ALEState` takes it, with its
     generator; empty for other environments."""
 
+    @property
+    def resets(self) -> int:
+        """How many consecutive resets it belongs to: one."""
+        return 1
+
     def to_payload(self) -> bytes:
         """Return the message."""
         seed = self.np_random_seed

@@ -215,7 +215,13 @@ RESET_STATE = MessageType(
 )
 """What a reset without a seed depends on; `reset_states` describes its fields."""
 RESET_OPTIONS = MessageType(
-    "ResetOptions", (Field(1, "reset", _SFIXED64), Field(2, "json", _STRING), Field(3, "large_seed", _STRING))
+    "ResetOptions",
+    (
+        Field(1, "reset", _SFIXED64),
+        Field(2, "json", _STRING),
+        Field(3, "large_seed", _STRING),
+        Field(4, "resets", _FIXED32),
+    ),
 )
 """What a reset was called with, if there is more than a seed; `reset_options` describes its fields."""
 INFO = MessageType("Info", (Field(1, "step", _SFIXED64), Field(2, "reset", _BOOL), Field(3, "json", _STRING)))

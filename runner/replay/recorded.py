@@ -141,9 +141,9 @@ def _by_reset(messages: Iterator[M]) -> Callable[[int], M | None]:
 
     def message_of(number: int) -> M | None:
         nonlocal waiting
-        while waiting is not None and waiting.reset < number:
+        while waiting is not None and waiting.reset + waiting.resets <= number:
             waiting = next(messages, None)
-        return waiting if waiting is not None and waiting.reset == number else None
+        return waiting if waiting is not None and waiting.reset <= number else None
 
     return message_of
 

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TransformReward
 from making import Leaving, Rooms
 from starlette.testclient import TestClient
@@ -28,6 +28,7 @@ from runner.export.reports.report import render_report
 from runner.recording.actions import packed, unpacked
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
+from runner.recording.recorder import Recorder
 from runner.replay.steps import whole_steps
 from runner.runs.marks import MARK_FILE
 from runner.service.app import create_app
@@ -437,3 +438,57 @@ def test_wide_actions_of_many_environments_stay_readable(tmp_path):
     with open_recording(rec.run.recording) as recording:
         found = np.concatenate([rows["action"] for rows in recording.train.steps.rows()])
     assert found.tobytes() == actions.reshape(-1, 1024).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "expected"),
+    [("environment", 7, "environment"), ("taken", False, "taken"), ("t", 3, "t"), ("episode", 9, "episode")],
+)
+def test_forged_turns_of_actions_alone_are_damage(tmp_path, monkeypatch, name, value, expected):
+    put = Recorder.put
+
+    def forged(recorder, topic, columns, positions):
+        if topic.name == "/train/step":
+            columns = {**columns, name: np.array(columns[name])}
+            columns[name][10:] = value
+        put(recorder, topic, columns, positions)
+
+    monkeypatch.setattr(Recorder, "put", forged)
+    envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 2)
+    with runner.record_vector(envs, tmp_path, steps="actions") as rec:
+        rec.reset(seed=0)
+        for _ in range(12):
+            rec.step(np.ones(2, np.int64))
+    monkeypatch.undo()
+    found = verify(rec.run.recording, trust=True)
+    assert found.verdict == "damaged"
+    assert f": {expected}: found" in found.finding
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+@pytest.mark.parametrize("steps", ["all", "actions"])
+def test_a_vector_without_observations_is_verified(tmp_path, mode, steps):
+    envs = SyncVectorEnv([Blind, Blind], autoreset_mode=mode)
+    with runner.record_vector(envs, tmp_path, steps=steps) as rec:
+        rec.reset(seed=0)
+        for _ in range(9):
+            over = rec.step(np.ones(2, np.int64))[2]
+            if mode == AutoresetMode.DISABLED and over.any():
+                rec.reset(options={"reset_mask": over})
+    found = verify(rec.run.recording)
+    assert (found.verdict, found.finding) == ("reproduced", "")
+
+
+class Blind(gymnasium.Env):
+    """An environment whose observations have no numbers."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-1, 1, (0,)), gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._t = 0
+        return np.zeros(0, np.float32), {}
+
+    def step(self, action):
+        self._t += 1
+        return np.zeros(0, np.float32), float(self.np_random.random()), self._t == 4, False, {}

@@ -91,13 +91,14 @@ def test_bytes_are_no_action_though_actions_are_kept_as_bytes(tmp_path, observat
     env.action_space = spaces.Box(-1, 1, (2,), np.float32)
     with runner.record(env, tmp_path) as rec:
         rec.reset()
-        for action in (bytes(8), np.ones(2, np.float32), bytes(8)):
+        for action in (bytes(8), np.ones(2, np.float32), bytes(8), np.bytes_(b"ab")):
             if isinstance(action, bytes):
                 with pytest.raises(RecordingError, match=r"not of the environment's action space"):
                     rec.step(action)
             else:
                 rec.step(action)
-    assert steps_of(rec.run)["action"].tolist() == [[1.0, 1.0]]
+        rec.step(bytearray(b"\0\1"))  # an array of numbers
+    assert steps_of(rec.run)["action"].tolist() == [[1.0, 1.0], [0.0, 1.0]]
 
 
 def pendulum_actions(n: int) -> list[Any]:

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import runner
 from dualtaxi import Rewards
 from dualtaxi.parallel import DualTaxiParallelEnv
-from runner.errors import EnvironmentNotUsable
+from runner.errors import EnvironmentNotUsable, RecordingError
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
@@ -318,6 +318,20 @@ def test_options_are_recorded_as_they_were_before_a_game_took_them(tmp_path):
     with open_recording(rec.run.recording) as recording:
         (given,) = recording.train.reset_options()
     assert (given.reset, given.options) == (0, {"map": "small"})
+
+
+def test_options_of_a_vector_are_recorded_once_for_a_call(tmp_path):
+    with runner.record_vector(vector("CartPole-v1", AutoresetMode.NEXT_STEP), tmp_path) as envs:
+        envs.reset(seed=1, options={"low": -0.01})
+        envs.reset(seed=10**3999, options={"low": -0.02})
+        with pytest.raises(RecordingError, match="more digits than 4,000"):
+            envs.reset(seed=10**4001)
+    with open_recording(envs.run.recording) as recording:
+        given = list(recording.train.reset_options())
+    assert [(one.reset, one.resets, one.options) for one in given] == [
+        (0, 3, {"low": -0.01}),
+        *((k, 1, {"low": -0.02}) for k in (3, 4, 5)),
+    ]
 
 
 def test_a_game_is_made_with_the_arguments_it_had(tmp_path):
