@@ -213,6 +213,7 @@ class Extras:
         }
         if described == self._described:
             return
+        self._write(row)  # with the names so far, which begins a layout if they are new
         if len(described) > MAX_NAMES or self._layout.number + 1 == schema.MAX_LAYOUTS:
             raise ConfigError(
                 f"extras: found more than {MAX_NAMES} names, or {schema.MAX_LAYOUTS} steps with names that "
@@ -221,7 +222,6 @@ class Extras:
         size = sum(dtype.itemsize for dtype in map(leaf_dtype, described.values()) if dtype is not None)
         if size > MAX_EXTRA_BYTES:
             raise _too_large(size)
-        self._write(row)
         if self._steps:
             self._partial.setdefault(0, set(self._described))
         self._fixed_bytes, self._described = size, described

@@ -215,6 +215,8 @@ class Messages:
         if not options:
             return ""
         try:
+            if not isinstance(options, Mapping):
+                raise ValueError(f"found {type(options).__name__}, expected a mapping")
             text = json.dumps({str(key): as_json(value) for key, value in options.items()})
             if len(text) > MAX_INFO_BYTES:
                 raise ValueError(f"they take more than {MAX_INFO_BYTES:,} bytes of JSON")

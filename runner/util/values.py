@@ -123,13 +123,15 @@ def is_too_deep(value: object, depth: int = 0) -> bool:
 
 
 def finite(value: object) -> Any:
-    """Return a value as JSON can hold it: NaN and infinities become None, dataclasses objects."""
+    """Return a value as JSON can hold it: NaN and infinities None, arrays lists, dataclasses objects."""
     if isinstance(value, Mapping):
         return {str(key): finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [finite(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if callable(to_list := getattr(value, "tolist", None)):  # an array, without an import of NumPy
+        return finite(to_list())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {each.name: finite(getattr(value, each.name)) for each in dataclasses.fields(value)}
     return value

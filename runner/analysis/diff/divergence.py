@@ -24,6 +24,7 @@ from runner.recording.differences import differing_rows
 from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
+from runner.replay.recorded import ended_episode
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
 
@@ -292,6 +293,13 @@ def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None
         )
     if any(alone) or ours.dtype is None:
         divergence = replace(divergence, a_step=None, b_step=None, actions_alone=any(alone))
+    if ours.have_turns:  # a row counts the episodes of its environment, and the phase those of all
+        for recording, steps in ((a, ours), (b, theirs)):
+            if divergence.step < steps.total():
+                row = steps.one(divergence.step)
+                ended = ended_episode(recording, phase, int(row["environment"]), divergence.step)
+                if ended is not None:
+                    return replace(divergence, episode=ended)
     return divergence
 
 

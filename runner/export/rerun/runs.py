@@ -115,7 +115,8 @@ class RunReader:
     def _batches(self, phase: str, spans: Sequence[range], values: ValueReader | None) -> Iterator[Batch]:
         """Yield the steps of a phase after checking them, at most a batch of each environment at a time."""
         recording, train = self._recording, episodes_of(self._recording, "train")
-        trials = int(recording.config["evaluation"]["trials"]) if self._is_job else 2**63 - 1
+        plan = recording.config["evaluation"] if self._is_job else None
+        trials = int(plan["trials"]) if plan else 2**63 - 1
         for steps in self._blocks(phase, spans):
             if self._steps:
                 check_steps(steps, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])

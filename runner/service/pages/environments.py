@@ -78,6 +78,8 @@ def _episodes_at(
     """Return each environment and the number of its episode at the first step of another one, if it ended."""
     episodes, begin = recording.phase(phase).episodes, steps.table.round_of(steps.first).start
     by_environment = {steps.environment: episode}
+    if not steps.table.have_turns:
+        return list(by_environment.items())
     names = ("environment", "episode", "last_step")
     for block in episodes.blocks(episodes.first_from("last_step", begin)):
         for environment, number, last in zip(*(block[name].tolist() for name in names), strict=True):

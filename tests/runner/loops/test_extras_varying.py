@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import gymnasium
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -14,6 +15,7 @@ import runner
 from runner.errors import ConfigError
 from runner.execution.verify import verify
 from runner.recording import schema
+from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from tests.runner.loops import talking
@@ -281,3 +283,19 @@ def test_a_step_has_at_most_a_megabyte_and_memory_is_bounded(tmp_path):
     with open_recording(rec.run.recording) as recording:
         found = recording.train.extras.at(np.arange(30))
     assert [len(value) for value in found["x"]] == [1000 * k for k in range(30)]
+
+
+def test_more_layouts_than_a_recording_holds_are_refused(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as rec:
+        rec.reset(seed=0)
+        names = [(f"a{k}", length) for length in (1, 2) for k in range(140)]
+        for name, length in names[:256]:
+            if rec.step(rec.action_space.sample(), extras={name: np.zeros(length)})[2]:
+                rec.reset()
+        name, length = names[256]
+        with pytest.raises(ConfigError, match="256 steps with names that were new"):
+            rec.step(0, extras={name: np.zeros(length)})
+        rec.step(0, extras={"a0": np.zeros(1)})
+    check_integrity(rec.run.recording)
+    with open_recording(rec.run.recording) as recording:
+        assert len(recording.train.extras) == 140

@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner.recording.reader import open_recording
@@ -32,6 +33,26 @@ def test_diff_names_the_step_at_which_loops_diverge(folder):
     foreign = dualtaxi(folder, "diff", "pole", "rooms")
     assert foreign.exit_code == 1
     assert "other spaces" in foreign.stdout
+
+
+def test_diff_names_an_episode_of_a_vector_by_its_number_among_all(tmp_path):
+    runs = []
+    for last in (1, 0):
+        envs = SyncVectorEnv([lambda: make("CartPole-v1")] * 3)
+        with runner.record_vector(envs, tmp_path) as rec:
+            rec.reset(seed=3)
+            rec.action_space.seed(1)
+            for k in range(60):
+                actions = rec.action_space.sample()
+                actions[2] = last if k == 40 else actions[2]
+                rec.step(actions)
+        runs.append(rec.run)
+    first = json.loads(dualtaxi(tmp_path, "diff", *(run.run_id for run in runs), "--json").stdout)
+    divergence = first["divergence"]
+    assert divergence["step"] == 40 * 3 + 2
+    with open_recording(runs[0].recording) as recording:
+        episode = recording.train.episode(divergence["episode"])
+        assert (episode.environment, episode.one(divergence["t"])["step"]) == (2, divergence["step"])
 
 
 def test_loops_that_have_their_seed_among_their_settings_are_one_group(tmp_path):

@@ -12,11 +12,12 @@ import numpy as np
 import pandas
 import pytest
 from click.testing import CliRunner
+from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner.cli import cli
 from runner.recording.reader import open_recording
-from tests.runner.loops.making import dualtaxi, make
+from tests.runner.loops.making import drive, dualtaxi, make
 
 
 def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
@@ -30,6 +31,25 @@ def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
     with open_recording(runner.find_run("lake", folder).recording) as recording:
         steps = len(recording.train.episode_steps(2))
     assert f"training episode 2, scene, {steps + 1} frames" in done.stdout
+
+
+def test_episodes_of_a_vector_are_exported_with_their_own_steps_and_resets(tmp_path):
+    envs = SyncVectorEnv([lambda: make("CartPole-v1")] * 3)
+    with runner.record_vector(envs, tmp_path / "runs") as rec:
+        drive(rec, 120)
+    folder = str(tmp_path / "tables")
+    words = ["export", "parquet", rec.run.run_id, "--episodes", "2..5", "-o", folder]
+    done = dualtaxi(tmp_path / "runs", *words)
+    assert done.exit_code == 0, done.output
+    steps, resets, ended = (
+        pandas.read_parquet(f"{folder}/{name}.parquet") for name in ("steps", "resets", "episodes")
+    )
+    assert ended["episode"].tolist() == [2, 3, 4]
+    with open_recording(rec.run.recording) as recording:
+        episodes = [recording.train.episode(number) for number in (2, 3, 4)]
+        numbers = np.concatenate([episode.numbers() for episode in episodes])
+    assert steps["step"].tolist() == sorted(numbers.tolist())
+    assert sorted(resets["environment"]) == sorted(episode.environment for episode in episodes)
 
 
 def test_a_loop_is_exported_and_imported_with_the_same_content(folder, tmp_path):
