@@ -100,8 +100,10 @@ def test_jobs_on_a_cluster_give_the_same_runs_are_cancelled_and_outlive_a_machin
         job_until(jobs, long, lambda job: job.progress and job.progress.episode > 0)
         kill_machine(first)
         cluster.remove_node(first, allow_graceful=False)
-        (run,) = [run for run in list_runs(tmp_path / "far") if run.name == "long"]
-        assert run.status == "interrupted"
+        (run,) = until(
+            lambda runs: runs[0].status == "interrupted",
+            lambda: [run for run in list_runs(tmp_path / "far") if run.name == "long"],
+        )
         second = cluster.add_node(num_cpus=1)
         over = job_until(jobs, long, lambda job: job.is_over)
         assert (over.state, over.deaths) == ("finished", 1), over.error
