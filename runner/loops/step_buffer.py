@@ -243,14 +243,16 @@ class StepBuffer:
         ends = self._ends[row]
         ends[0], ends[1] = terminated, truncated
         if infos is not None and _TRUE in ends.tobytes() and (final := final_observations(infos)) is not None:
-            which = ends.any(axis=0).nonzero()[0].tolist()
+            which = ends.any(axis=0).nonzero()[0]
             firsts = self._observations[row, which]
-            for i in which:
+            for i in which.tolist():
                 self._put_last(row * self._n + i, element_of(final, i))
             self._add_resets(row + 1, which, firsts)
         if states:
             self._autoreset_states[row] = states
-        self._advance(slice(row, row + 1))
+        self._filled = row = row + 1
+        if row >= self._full_at:
+            self._advance(slice(row - 1, row))
 
     def take_batch(
         self,
