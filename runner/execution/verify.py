@@ -293,8 +293,8 @@ def _check_loop(recording: Recording) -> Verification:
             check_extras(recording, phase, finished)
         notes += _check_checkpoints(recording)
         if not_outcomes := sum(findings.not_outcomes for findings in phases.values()):
-            strange = "are no outcome of the environment's table: it has other rules too"
-            notes.append(f"{not_outcomes:,} steps {strange}")
+            reason = "are no outcome of the environment's table: it has other rules too"
+            notes.append(f"{not_outcomes:,} steps {reason}")
         for phase, findings in phases.items():
             notes += _unusual(recording, phase, findings)
         steps = verification.train_steps + verification.eval_steps

@@ -73,9 +73,9 @@ def write_tables(
         whole_ranges(episodes, _episode_count(recording, phase), phase, str(recording.path))
     source = Batches(recording)
     own = source.shape.tables
-    of_rows = _in_turns(recording, phase, episodes) if phase is not None and episodes else None
+    keys = _keys_of(recording, phase, episodes) if phase is not None and episodes else None
     tables = {
-        name: _selected(source.of(own[table]), phase, episodes, of_rows)
+        name: _selected(source.of(own[table]), phase, episodes, keys)
         for name, table in _TABLES.items()
         if table in own
     } | {"metrics": _metrics(recording)}
@@ -133,8 +133,8 @@ def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
         yield pa.RecordBatch.from_arrays(arrays, schema=_METRICS)
 
 
-def _in_turns(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | None:
-    """Return which rows of steps and resets episodes have, as `_key`; None where one environment is alone.
+def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | None:
+    """Return the `_key` of the steps and resets of each episode; None where one environment is alone.
 
     The rows count the episodes of their own environment, the phase those of all as they ended.
     """
@@ -143,26 +143,26 @@ def _in_turns(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | 
         return None
     count = own.episodes.count()
     numbers = [n for start, stop in episodes for n in range(start, count if stop is None else stop)]
-    found = map(own.episode, numbers)
-    keys = [steps.environment << _ENVIRONMENT_BITS | int(steps.one(0)["episode"]) for steps in found]
+    selected = map(own.episode, numbers)
+    keys = [steps.environment << _ENVIRONMENT_BITS | int(steps.one(0)["episode"]) for steps in selected]
     return pa.array(keys, pa.int64())
 
 
 def _key(rows: pa.RecordBatch) -> pa.Array:
-    """Return the environment and the number of the episode in it, as one number a row."""
+    """Return one number for each row: its environment, and its episode as counted in that environment."""
     environment = pc.shift_left(rows["environment"].cast(pa.int64()), _ENVIRONMENT_BITS)
     return pc.bit_wise_or(environment, rows["episode"].cast(pa.int64()))
 
 
 def _selected(
-    batches: Iterator[pa.RecordBatch], phase: str | None, episodes: Ranges, of_rows: pa.Array | None
+    batches: Iterator[pa.RecordBatch], phase: str | None, episodes: Ranges, keys: pa.Array | None
 ) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of a phase and of ranges of episodes; `of_rows` as `_in_turns` returns it."""
+    """Yield the rows of a phase and of ranges of episodes, whose `keys` are as `_keys_of` returns them."""
     for batch in batches:
         rows = batch if phase is None else batch.filter(pc.equal(batch["phase"], phase))
         is_ended = "length" in rows.schema.names  # an episode, which has its number in the phase
-        if of_rows is not None and not is_ended and {"episode", "environment"} <= set(rows.schema.names):
-            is_selected = pc.is_in(_key(rows), of_rows)
+        if keys is not None and not is_ended and {"episode", "environment"} <= set(rows.schema.names):
+            is_selected = pc.is_in(_key(rows), keys)
             if "taken" in rows.schema.names:
                 is_selected = pc.and_(is_selected, rows["taken"])
             rows = rows.filter(is_selected)

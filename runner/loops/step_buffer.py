@@ -466,8 +466,8 @@ class StepBuffer:
     def _copied(self, action: Value) -> Value:
         """Return a copy of an action; not as bytes, which are what `step_filler` makes of actions."""
         given = as_given(action)
-        is_taken_for_those = isinstance(given, bytes | bytearray) and not (self._are_bytes or self._starts)
-        return np.array(given) if is_taken_for_those else given
+        looks_like_kept = isinstance(given, bytes | bytearray) and not (self._are_bytes or self._starts)
+        return np.array(given) if looks_like_kept else given
 
     def _put_parts(
         self,

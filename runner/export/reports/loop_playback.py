@@ -111,7 +111,7 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     elif first + limit >= length:
         total = float(before.sum() + reward.sum())
     texts, series = _frames(parts, observations)
-    texts_along, more = _extras(recording, at.phase, np.concatenate(numbers), notes)
+    extra_texts, extra_series = _extras(recording, at.phase, np.concatenate(numbers), notes)
     return Playback(
         title=at.heading + (f", in environment {environment}" if recording.environments > 1 else ""),
         description=outcome_in_words(length, ended, total),
@@ -125,9 +125,9 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
             words(agent, "action", (shortened(own.get(agent, "–"), _MAX_LETTERS) for own in actions))
             for agent in agents
         ],
-        texts=[*texts, *texts_along],
+        texts=[*texts, *extra_texts],
         time=frames,
-        series=[*series, *more],
+        series=[*series, *extra_series],
         notes=notes,
         logged=logged_near(recording, at.phase, frames),
     )
