@@ -48,7 +48,7 @@ _MAX_PARTS: Final = 6
 
 
 @dataclass(frozen=True)
-class Histogram:
+class ValueCounts:
     """The counts of a quantity over an axis."""
 
     quantity: Quantity
@@ -70,7 +70,7 @@ class Histogram:
 
 
 @dataclass
-class _Column:
+class _QuantityCounts:
     """A quantity whose values are being counted."""
 
     low: float = np.inf
@@ -114,7 +114,7 @@ class _Column:
         self.counts += np.bincount(flat, minlength=self.counts.size).reshape(self.counts.shape)
 
 
-def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histogram], list[str]]:
+def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[ValueCounts], list[str]]:
     """Return the histograms of a recording's training over an axis, and what is left out, a sentence each.
 
     Returns and lengths are at the ends of episodes, actions and rewards at their steps.
@@ -122,12 +122,12 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
     moments = positions(recording, axis)
     done = recording.done()
     last = float(moments.at(done["episodes"], done["train_steps"]))
-    result: list[Histogram] = []
+    result: list[ValueCounts] = []
     notes: list[str] = []
     for read in (_episodes, _steps):
         few = min(STRETCHES, max(_FEWEST, done["episodes"] // _EPISODES_EACH))
         edges = edges_of(axis, last, few if read is _episodes else STRETCHES)
-        columns: defaultdict[tuple[Quantity, str], _Column] = defaultdict(_Column)
+        columns: defaultdict[tuple[Quantity, str], _QuantityCounts] = defaultdict(_QuantityCounts)
         for _, block in read(recording, moments, notes):
             for key, values in block.items():
                 columns[key].scan(values.astype(np.float64))
@@ -143,7 +143,7 @@ def histograms(recording: Recording, axis: Axis = EPISODES) -> tuple[list[Histog
             levels = column.levels.tolist()
             names = _action_names(recording, line) if quantity == "action" else {}
             result.append(
-                Histogram(
+                ValueCounts(
                     quantity=quantity,
                     line=line,
                     unit=_UNITS[quantity],

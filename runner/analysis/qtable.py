@@ -71,7 +71,7 @@ class TablesDescription(TypedDict):
 
 
 @dataclass(frozen=True, eq=False)
-class Tables:
+class QTables:
     """The Q-tables at a step."""
 
     description: TablesDescription
@@ -135,7 +135,7 @@ def _count(count: int | None) -> str:
 
 def tables_of(
     recording: Recording, step: int | None = None, episode: int | None = None, state: str | None = None
-) -> Tables:
+) -> QTables:
     """Return the tables after a number of training steps, or episodes, by default after the last.
 
     Args:
@@ -158,7 +158,7 @@ def tables_of(
     description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
     if number is not None:
         _add_state(description, recording, replay, number)
-    return Tables(description, one_array(replay.tables))
+    return QTables(description, one_array(replay.tables))
 
 
 def recorded_tables(recording: Recording) -> Iterator[Snapshot]:
@@ -180,7 +180,7 @@ def _shape(recording: Recording) -> tuple[int, int]:
     return recording.spaces["observation"]["n"], recording.spaces["action"]["n"]
 
 
-def _recorded(recording: Recording, step: int | None, state: str | None) -> Tables:
+def _recorded(recording: Recording, step: int | None, state: str | None) -> QTables:
     """Return the latest tables that a loop recorded, or the latest at a step."""
     arrays = list(recorded_tables(recording))
     last = max([recording.train.steps.total(), *(array.step for array in arrays)])
@@ -217,7 +217,7 @@ def _recorded(recording: Recording, step: int | None, state: str | None) -> Tabl
             for table, q in tables.items()
             for value in _action_values(table, names, q[number], int(q[number].argmax()), visits)
         ]
-    return Tables(description, one_array(list(tables.values())))
+    return QTables(description, one_array(list(tables.values())))
 
 
 def _action_values(

@@ -13,7 +13,7 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
 from runner.archive import layout
 from runner.archive.layout import TEXT
-from runner.archive.values import Column, SpaceColumns, nullable, numbers, stored
+from runner.archive.values import ArchiveColumn, SpaceColumns, nullable, numbers, stored
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import record_dtype
@@ -45,7 +45,7 @@ class Table:
     """Its file."""
     topics: tuple[Topic, ...]
     """The topics of its messages: one, or those of training and of evaluation."""
-    messages: tuple[Column, ...]
+    messages: tuple[ArchiveColumn, ...]
     """The columns of the messages, besides run, phase and position."""
 
     @cached_property
@@ -147,7 +147,7 @@ class Shape:
         """The columns that count events, such as `n_taxi_1_drop_off`."""
         return _names("n_", self._events)
 
-    def _columns_of(self, topic: Topic) -> list[Column]:
+    def _columns_of(self, topic: Topic) -> list[ArchiveColumn]:
         fields = {field.name: field for field in self.messages[topic].fields}
         return [
             column
@@ -156,7 +156,7 @@ class Shape:
             for column in self._columns_of_field(topic.message, fields[name])
         ]
 
-    def _columns_of_field(self, message: MessageType, field: Field) -> list[Column]:
+    def _columns_of_field(self, message: MessageType, field: Field) -> list[ArchiveColumn]:
         name, is_row = field.name, message in schema.NUMBERED_BY
         if is_row and name in ("rewards", "returns"):
             return self._summed(name.removesuffix("s"), name)
@@ -172,35 +172,35 @@ class Shape:
         own = self.own_actions if message is schema.STEP and name == "action" else []
         return [column, *(self._action_of(i, action) for i, action in enumerate(own))]
 
-    def _action_of(self, agent: int, name: str) -> Column:
+    def _action_of(self, agent: int, name: str) -> ArchiveColumn:
         """Return the column of an agent's own action, which follows from the joint one."""
         assert self._mdp is not None
         own = self._mdp.own_actions[:, agent].astype(np.int32)
-        return Column(name, _INT32, lambda records: pa.array(own[records["action"] % len(own)]))
+        return ArchiveColumn(name, _INT32, lambda records: pa.array(own[records["action"] % len(own)]))
 
-    def _summed(self, name: str, source: str) -> list[Column]:
+    def _summed(self, name: str, source: str) -> list[ArchiveColumn]:
         """Return the column of the learners' sum and, where there are several, one for each."""
         own = self.per_learner(name)
         if not own:
             return [stored(name, _FLOAT, _item(source, 0))]
-        total = Column(name, _FLOAT, lambda records: pa.array(records[source].sum(axis=1)))
+        total = ArchiveColumn(name, _FLOAT, lambda records: pa.array(records[source].sum(axis=1)))
         return [total, *(stored(key, _FLOAT, _item(source, i)) for i, key in enumerate(own))]
 
-    def _explored(self) -> list[Column]:
+    def _explored(self) -> list[ArchiveColumn]:
         """Return the column for any learner's exploration and, where there are several, one for each."""
         own = self.per_learner("explored")
-        any_explored = Column("explored", _FLAG, lambda records: pa.array(records["explored"] != 0))
+        any_explored = ArchiveColumn("explored", _FLAG, lambda records: pa.array(records["explored"] != 0))
         bits = [_bit("explored", i, name) for i, name in enumerate(own or ["explored"])]
         return [any_explored, *bits] if own else bits
 
 
-def _bit(field: str, i: int, name: str) -> Column:
+def _bit(field: str, i: int, name: str) -> ArchiveColumn:
     """Return the column of bit `i` of a field, which is 0 in blank records."""
 
     def write(records: Records, column: pa.Array) -> None:
         records[field] |= numbers(column).astype(np.uint32) << i
 
-    return Column(name, _FLAG, lambda records: pa.array(records[field] >> i & 1 != 0), write)
+    return ArchiveColumn(name, _FLAG, lambda records: pa.array(records[field] >> i & 1 != 0), write)
 
 
 def _type_of(field: Field) -> pa.DataType:

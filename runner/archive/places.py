@@ -80,7 +80,7 @@ def archive_of(run: Run) -> Iterator[Path]:
     Raises:
         RecordingError: it is at none of its places.
     """
-    from runner.archive.store import Store, split_place
+    from runner.archive.store import ArchiveStore, split_place
 
     place = archive_place(run)
     if place is None:
@@ -88,17 +88,17 @@ def archive_of(run: Run) -> Iterator[Path]:
             f"run {run.run_id}: found no archive at {' or '.join(_places(run))}; its recording was put into "
             f"it. Mount or copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
         )
-    with Store(split_place(place)[0]).reading(run.run_id) as folder:
+    with ArchiveStore(split_place(place)[0]).reading(run.run_id) as folder:
         yield folder
 
 
 def archive_place(run: Run) -> str | None:
     """Return the place of a run's archive; None if it is at none of its places."""
-    from runner.archive.store import Store, split_place
+    from runner.archive.store import ArchiveStore, split_place
 
     for place in _places(run):
         location, run_id = split_place(place)
-        if run_id == run.run_id and Store(location).manifest(run_id) is not None:
+        if run_id == run.run_id and ArchiveStore(location).manifest(run_id) is not None:
             return place
     return None
 

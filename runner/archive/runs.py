@@ -15,7 +15,7 @@ from runner.archive.layout import CONTENTS
 from runner.archive.manifest import Manifest
 from runner.archive.places import Report, archive_of, restore_to
 from runner.archive.restoring import restore
-from runner.archive.store import Store, no_archive, split_place, temporary_folder
+from runner.archive.store import ArchiveStore, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.description import recorded_facts
@@ -25,7 +25,7 @@ from runner.recording.rewriting import content_of
 from runner.runs.locking import locked
 from runner.runs.resolve import run_of_id
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
-from runner.runs.store import Store as Contents
+from runner.runs.store import Store
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ def archive_run(
         raise RunnerError(
             f"{run.recording}: found a recording that stands alone, expected a run in a folder."
         )
-    store = Store(to)
+    store = ArchiveStore(to)
     with locked(run, archived=True) as current:
         if current.status == "archived":
             raise RunnerError(f"run {run.run_id} is archived already, in {current.archive.target}.")
         return _archive(current, store, remove, report, dry_run)
 
 
-def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool) -> Archived:
+def _archive(run: Run, store: ArchiveStore, remove: bool, report: Report, dry_run: bool) -> Archived:
     place, existing = store.place(run.run_id), store.manifest(run.run_id)
     is_new = existing is None
     with _undamaged(run) as recording:
@@ -103,7 +103,7 @@ def _archive(run: Run, store: Store, remove: bool, report: Report, dry_run: bool
     run = run.update(archive=reference)
     if remove:
         run.recording.unlink()
-        contents, name = Contents(run.folder.parent), run.folder.name
+        contents, name = Store(run.folder.parent), run.folder.name
         if {f"{CONTENTS}{digest}" for digest in contents.of_run(name)} <= manifest.files.keys():
             contents.drop(name)
     return Archived(run, place, manifest, is_new, remove, size)
@@ -155,7 +155,7 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
 
 def _restore_contents(archive: Path, folder: Path) -> None:
     """Put the contents of checkpoints in an archive, which was checked, into the store next to a run."""
-    store = Contents(folder.parent)
+    store = Store(folder.parent)
     for path in sorted((archive / CONTENTS).glob("*")):
         store.put(folder.name, path, expected=path.name)
 
@@ -169,7 +169,7 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         StorageError: the run cannot be written.
     """
     location, run_id = split_place(place)
-    store = Store(location)
+    store = ArchiveStore(location)
     manifest = store.manifest(run_id)
     if manifest is None:
         raise no_archive(place)

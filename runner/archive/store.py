@@ -27,7 +27,7 @@ S3: Final = "s3://"
 _PIECE: Final = 1 << 20
 
 
-class Store:
+class ArchiveStore:
     """A folder or an object storage prefix that has one archive per run, named by the run's id.
 
     Args:

@@ -32,7 +32,7 @@ MAX_COLUMNS: Final = 1024
 
 
 @dataclass(frozen=True)
-class Column:
+class ArchiveColumn:
     """A column of messages: how it is read from message records, and written back."""
 
     name: str
@@ -42,7 +42,7 @@ class Column:
     """Sets the records' field; None if other columns determine it."""
 
 
-def stored(name: str, kind: pa.DataType, values_in: Callable[[Records], Array]) -> Column:
+def stored(name: str, kind: pa.DataType, values_in: Callable[[Records], Array]) -> ArchiveColumn:
     """Return the column of values that stand in records; `values_in` returns a view of them, [n, ...].
 
     Unsigned 32-bit numbers become signed, which readers can subtract.
@@ -67,10 +67,10 @@ def stored(name: str, kind: pa.DataType, values_in: Callable[[Records], Array]) 
         else:
             values[...] = numbers(column)
 
-    return Column(name, kind, read, write)
+    return ArchiveColumn(name, kind, read, write)
 
 
-def nullable(column: Column, given_in: Callable[[Records], Array | None]) -> Column:
+def nullable(column: ArchiveColumn, given_in: Callable[[Records], Array | None]) -> ArchiveColumn:
     """Return the column with null where a value was not given.
 
     Args:
@@ -95,7 +95,7 @@ def nullable(column: Column, given_in: Callable[[Records], Array | None]) -> Col
             given[...] = numbers(values.is_valid())
             write_values(records, values.fill_null(zero))
 
-    return Column(column.name, column.type, read, write)
+    return ArchiveColumn(column.name, column.type, read, write)
 
 
 class SpaceColumns:
@@ -163,7 +163,7 @@ def _spreadable(leaf: Leaf) -> int:
     return count if count <= MAX_NUMBERS else 0
 
 
-def _column(name: str, field: str, given: str, leaf: Leaf, at: tuple[int, ...] | None) -> Column:
+def _column(name: str, field: str, given: str, leaf: Leaf, at: tuple[int, ...] | None) -> ArchiveColumn:
     """Return the column of one number of a leaf, or of all of it."""
     if leaf.dtype is None and given:
         return _varying(name, field, given, leaf)
@@ -188,7 +188,7 @@ def _number(dtype: np.dtype[np.generic]) -> pa.DataType:
     return pa.float32() if dtype == np.float16 else pa.from_numpy_dtype(dtype.newbyteorder("="))
 
 
-def _varying(name: str, field: str, given: str, leaf: Leaf) -> Column:
+def _varying(name: str, field: str, given: str, leaf: Leaf) -> ArchiveColumn:
     """Return the column of an extra of varying size: of texts, or of lists, which hold arrays row by row."""
     (key,), item = leaf.path, leaf.item
     kind = pa.string() if item is None else pa.list_(_number(item.base))
@@ -226,7 +226,7 @@ def _varying(name: str, field: str, given: str, leaf: Leaf) -> Column:
                 flat = np.array([] if value is None else value, item.base)
                 values[k] = flat.reshape(-1, *item.shape)
 
-    return Column(name, kind, read, write)
+    return ArchiveColumn(name, kind, read, write)
 
 
 def _inside(values: NDArray[Any], leaf: Leaf) -> NDArray[Any]:

@@ -27,9 +27,9 @@ from runner.config.model import (
 )
 from runner.config.problems import found, problems_in, refuse
 from runner.config.schema import schema_at
-from runner.config.sections import Recording
+from runner.config.sections import RecordingSection
 from runner.config.shipped import config_path, suggestion
-from runner.config.values import MAX_DEPTH, Path, Section, position_in, value_at
+from runner.config.values import MAX_DEPTH, ConfigSection, Path, position_in, value_at
 from runner.errors import ConfigError, shortened
 from runner.util.humanize import size
 from runner.util.packing import Packing
@@ -100,10 +100,10 @@ def from_mapping(
     return experiment_in(Document(values), overrides, name, named_by=repr(name))
 
 
-def packing_from(values: Mapping[str, object]) -> Recording:
+def packing_from(values: Mapping[str, object]) -> RecordingSection:
     """Return the section `recording` of a configuration with these values."""
     try:
-        return Recording.model_validate(dict(values))
+        return RecordingSection.model_validate(dict(values))
     except ValidationError as error:
         problems = problems_in(error, values, schema_at(("recording",)))
         raise refuse(problems, Document(values)) from None
@@ -292,4 +292,4 @@ def _with(value: object, path: Path, new: object) -> Any:
 def _default(key: str) -> Json:
     field = ExperimentFile.model_fields.get(key)
     default = field.default if field else None
-    return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, Section) else {}
+    return default.model_dump(mode="json", exclude_unset=True) if isinstance(default, ConfigSection) else {}

@@ -16,21 +16,21 @@ from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
     Algorithm,
     AlgorithmSection,
-    Branch,
+    BranchSection,
     Environment,
-    Evaluation,
+    EvaluationSection,
     Exploration,
     Hysteretic,
     InitialTable,
     Log,
     NStep,
     Quirks,
-    Recording,
+    RecordingSection,
     SarsaLambda,
     Snapshots,
     WolfPhc,
 )
-from runner.config.values import Optional, Section, refusal
+from runner.config.values import ConfigSection, Optional, refusal
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json
 
 Mode = Literal["cooperative", "competitive"]
@@ -68,7 +68,7 @@ Seeds = Annotated[
 ]
 
 
-class SeedRange(Section):
+class SeedRange(ConfigSection):
     """Consecutive seeds."""
 
     first: Seed = Field(default=0, description="The first seed.")
@@ -96,7 +96,7 @@ def _only_with(section: type[AlgorithmSection]) -> Any:
     return Field(default=None, description=f"Only with algorithm: {section.algorithm}.")
 
 
-class Settings(Section):
+class Settings(ConfigSection):
     """The keys that a file and the resolved experiment share, in the order in which people read them."""
 
     name: Optional[Name] = Field(
@@ -143,19 +143,21 @@ class Settings(Section):
     wolf_phc: Optional[WolfPhc] = _only_with(WolfPhc)
     sarsa_lambda: Optional[SarsaLambda] = _only_with(SarsaLambda)
     n_step: Optional[NStep] = _only_with(NStep)
-    evaluation: Evaluation | None = Field(
-        default=Evaluation(every=1000, trials=200),
+    evaluation: EvaluationSection | None = Field(
+        default=EvaluationSection(every=1000, trials=200),
         description="Greedy trials during training, which never alter it; null for none.",
     )
     log: Log | None = Field(default=Log(), description="Reports on training; null for none.")
     snapshots: Snapshots = Field(
         default=Snapshots(), description="Q-tables in the recording; the first and last are always there."
     )
-    recording: Recording = Field(default=Recording(), description="What is recorded and how it is packed.")
+    recording: RecordingSection = Field(
+        default=RecordingSection(), description="What is recorded and how it is packed."
+    )
     quirks: Quirks = Field(
         default=Quirks(), description="Deviations of the published tutorial's code, to reproduce its figures."
     )
-    branches: Annotated[tuple[Branch, ...], Field(strict=False, max_length=MAX_BRANCHES)] = Field(
+    branches: Annotated[tuple[BranchSection, ...], Field(strict=False, max_length=MAX_BRANCHES)] = Field(
         default=(),
         description="Steps at which training was changed, as `dualtaxi branch` writes them; the steps before "
         "the first are those of the run that was branched.",

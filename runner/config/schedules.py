@@ -12,7 +12,7 @@ from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
 
-from runner.config.values import Count, Fraction, Section, refusal
+from runner.config.values import ConfigSection, Count, Fraction, refusal
 from runner.errors import nearest
 from runner.util.values import Json
 
@@ -31,7 +31,7 @@ def _names_itself(schema: Json) -> None:
     schema["required"] = ["schedule", *schema.get("required", [])]
 
 
-class Linear(Section, json_schema_extra=_names_itself):
+class Linear(ConfigSection, json_schema_extra=_names_itself):
     """A straight line from `start` at n = 0 to `end` at n = `over`, and `end` from there on."""
 
     schedule: Literal["linear"] = Field(default="linear", description="A straight line, then constant.")
@@ -46,7 +46,7 @@ class Linear(Section, json_schema_extra=_names_itself):
         return max(self.floor, min(self.start, self.end)) == 0
 
 
-class Exponential(Section, json_schema_extra=_names_itself):
+class Exponential(ConfigSection, json_schema_extra=_names_itself):
     """Decay by a constant factor: `start` * `factor` ** n."""
 
     schedule: Literal["exponential"] = Field(default="exponential", description="Decay by a constant factor.")
@@ -62,7 +62,7 @@ class Exponential(Section, json_schema_extra=_names_itself):
         return max(self.floor, self.start) == 0
 
 
-class Piecewise(Section, json_schema_extra=_names_itself):
+class Piecewise(ConfigSection, json_schema_extra=_names_itself):
     """Straight lines between points [n, value], and the last point's value from there on."""
 
     schedule: Literal["piecewise"] = Field(default="piecewise", description="Lines between points.")
@@ -97,7 +97,7 @@ SCHEDULES: dict[str, str] = {"linear": "Linear", "exponential": "Exponential", "
 
 def _kind(value: object) -> str | None:
     """Return the tag of the branch of `value`, which is also the branch's name in the JSON Schema."""
-    if isinstance(value, Section):
+    if isinstance(value, ConfigSection):
         return type(value).__name__
     if isinstance(value, Mapping):
         schedule = value.get("schedule")
@@ -121,7 +121,7 @@ def _names_its_schedule(value: object) -> object:
 
 
 def _stays_positive(value: float | Schedule) -> float | Schedule:
-    if isinstance(value, Section) and value.reaches_zero():
+    if isinstance(value, ConfigSection) and value.reaches_zero():
         raise refusal((), "found a schedule that reaches 0, expected values above 0: set its floor")
     return value
 

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from runner.config.schedules import Probability, StepSize
-from runner.config.values import Count, FrozenMapping, Optional, Section, frozen, plain, refusal
+from runner.config.values import ConfigSection, Count, FrozenMapping, Optional, frozen, plain, refusal
 from runner.util.packing import (
     DEFAULT_LEVEL,
     MAX_CHUNK_STEPS,
@@ -44,7 +44,7 @@ def _environment_arguments(value: object) -> FrozenMapping:
     return arguments
 
 
-class Environment(Section):
+class Environment(ConfigSection):
     """A Gymnasium environment."""
 
     id: str = Field(
@@ -63,7 +63,7 @@ class Environment(Section):
     )
 
 
-class UniformRange(Section):
+class UniformRange(ConfigSection):
     """The range of random initial values: uniform in [low, high)."""
 
     low: float = Field(default=0.0, description="The lowest value.")
@@ -76,13 +76,13 @@ class UniformRange(Section):
         return self
 
 
-class RandomTable(Section):
+class RandomTable(ConfigSection):
     """Random initial values, drawn for each cell."""
 
     random: UniformRange = Field(description="The range of the values.")
 
 
-class RunTable(Section):
+class RunTable(ConfigSection):
     """Initial values taken from a recorded run."""
 
     run: str = Field(min_length=1, description="The recorded run: its name, id or file.")
@@ -92,7 +92,7 @@ class RunTable(Section):
 
 
 def _table_kind(value: object) -> str | None:
-    if isinstance(value, Section):
+    if isinstance(value, ConfigSection):
         return type(value).__name__
     if isinstance(value, Mapping) and value:
         return "RandomTable" if "random" in value else "RunTable"
@@ -128,7 +128,7 @@ TrialStart = Annotated[
 ]
 
 
-class Evaluation(Section):
+class EvaluationSection(ConfigSection):
     """When the greedy policy is evaluated, and in how many trials."""
 
     every: Count = Field(description="Training episodes between evaluations.")
@@ -146,7 +146,7 @@ class Evaluation(Section):
     )
 
 
-class Log(Section):
+class Log(ConfigSection):
     """Reports on training."""
 
     every_steps: Count = Field(default=50_000, description="Training steps between reports.")
@@ -158,7 +158,7 @@ class Log(Section):
     )
 
 
-class Snapshots(Section):
+class Snapshots(ConfigSection):
     """When whole Q-tables are written to the recording."""
 
     every: Count | None = Field(
@@ -168,7 +168,7 @@ class Snapshots(Section):
     )
 
 
-class Recording(Section):
+class RecordingSection(ConfigSection):
     """The contents of the recording, and how it is packed."""
 
     steps: Literal["all", "none"] = Field(
@@ -219,7 +219,7 @@ class Recording(Section):
         return Packing(self.compression, self.level or 0, self.index, self.chunk_steps)
 
 
-class Quirks(Section):
+class Quirks(ConfigSection):
     """Differences of the published tutorial's code from its text; each is off by default."""
 
     epsilon_exploits: bool = Field(
@@ -251,7 +251,7 @@ Algorithm = Literal[
 ]
 
 
-class AlgorithmSection(Section):
+class AlgorithmSection(ConfigSection):
     """The parameters of one algorithm: a field here is all that the configuration needs of a parameter."""
 
     algorithm: ClassVar[Algorithm]
@@ -310,7 +310,7 @@ class NStep(AlgorithmSection):
     )
 
 
-class Changes(Section):
+class ChangesSection(ConfigSection):
     """The settings that can change while a run is trained; those that are left out stay as they are."""
 
     step_size: Optional[StepSize] = Field(default=None, description="As for the whole run.")
@@ -330,7 +330,7 @@ class Changes(Section):
     @model_serializer
     def _mapping(self) -> dict[str, object]:
         return {
-            key: value.model_dump(mode="json") if isinstance(value, Section) else value
+            key: value.model_dump(mode="json") if isinstance(value, ConfigSection) else value
             for key, value in self.given.items()
         }
 
@@ -339,7 +339,7 @@ Text = Annotated[str, Field(min_length=1)]
 Actions = Annotated[Mapping[Text, Text], AfterValidator(FrozenMapping), PlainSerializer(dict)]
 
 
-class Branch(Section):
+class BranchSection(ConfigSection):
     """One step at which training was changed."""
 
     run: Text = Field(description="The id of the run that was branched.")
@@ -351,4 +351,6 @@ class Branch(Section):
         description="Agent to the name or number of the action it takes at this step; the others act as they "
         "would.",
     )
-    settings: Changes = Field(default=Changes(), description="The settings that change from this step on.")
+    settings: ChangesSection = Field(
+        default=ChangesSection(), description="The settings that change from this step on."
+    )

@@ -42,7 +42,7 @@ Optional = Annotated[T | None, _NotNull()]
 """A key that may be left out, but not be null."""
 
 
-class Section(BaseModel):
+class ConfigSection(BaseModel):
     """A frozen mapping of a configuration; unknown keys, wrong types, NaN and infinity are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)

@@ -52,7 +52,7 @@ MAX_STEPS: Final = 100_000
 
 
 @dataclass(frozen=True)
-class Outcome:
+class BranchOutcome:
     """Where an episode led."""
 
     returns: dict[str, float]
@@ -69,8 +69,8 @@ class Branch:
     run: Run
     """The run that it was recorded in."""
     origin: BranchOrigin
-    parent: Outcome
-    outcome: Outcome
+    parent: BranchOutcome
+    outcome: BranchOutcome
     is_recorded_action: bool
     """Whether the action of the step is the one that was recorded there."""
 
@@ -197,14 +197,14 @@ def branch(
         return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped), is_recorded)
 
 
-def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> Outcome:
+def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> BranchOutcome:
     """Return where an episode led; `otherwise` is its end if it has none."""
     returns, length, end = [0.0] * len(recording.agents), 0, otherwise
     for step in transitions_of(recording, phase, episode):
         length += 1
         returns = [sum(pair) for pair in zip(returns, map(float, step["rewards"]), strict=True)]
         end = "terminated" if step["terminated"] else "truncated" if step["truncated"] else otherwise
-    return Outcome(dict(zip(recording.agents, returns, strict=True)), length, end)
+    return BranchOutcome(dict(zip(recording.agents, returns, strict=True)), length, end)
 
 
 # --- in the child process -----------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from runner.planning.evaluation import joint_probabilities
 Records = NDArray[np.void]
 
 
-class Moment(NamedTuple):
+class Position(NamedTuple):
     """The step of an episode from which it is played on."""
 
     phase: Literal["train", "eval"]
@@ -39,7 +39,7 @@ class Continuation:
     The tables of the learner are those of the moment; they do not change.
     """
 
-    def __init__(self, learner: Learner, moment: Moment) -> None:
+    def __init__(self, learner: Learner, moment: Position) -> None:
         self._learner, self._moment = learner, moment
         learner.begin_evaluation()
         rules = learner.segment_at(moment.trained_step).rules

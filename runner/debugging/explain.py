@@ -27,7 +27,7 @@ from runner.debugging.explanation_files import FOLDER, LOCK, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step
 from runner.debugging.game import Game, Plan, interactions_of, mixture_bounds, settings_of
-from runner.debugging.mixtures import Measured, Measurement, Mixtures, Readings, measure
+from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures, Readings, measure
 from runner.errors import RunnerError, RunNotFound, nearest
 from runner.execution.initial_tables import resolve_initial_q
 from runner.replay.trust import require_may_train
@@ -97,7 +97,7 @@ def explain(
     """
     folder = recordings_folder(recordings)
     question = ask(a, b, metric=metric, at=at, seeds=seeds, recordings=folder, trust=trust)
-    pool: Workers[Measurement, Measured]
+    pool: Workers[Measurement, MixtureResult]
     with worker_pool(workers, ray, 2**MAX_ALL) as pool:
         return answer(question, pool, report, planned, stop)
 
@@ -155,7 +155,7 @@ def ask(
 
 def answer(
     question: Question,
-    pool: Workers[Measurement, Measured],
+    pool: Workers[Measurement, MixtureResult],
     report: Report = lambda *_: None,
     planned: Callable[[Plan], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,

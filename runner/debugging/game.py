@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from runner.analysis.compare.statistics import Estimate, bootstrap_means
 from runner.debugging.explanation import ENOUGH, Interaction, Mixture, Setting
 from runner.debugging.factors import MAX_ALL
-from runner.debugging.mixtures import Measured, Measurement, Mixtures
+from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures
 from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
 from runner.sweep.local import Workers
 
@@ -62,7 +62,7 @@ def mixture_bounds(settings: int) -> tuple[int, int]:
 class Game:
     """The values of mixtures, measured when they are needed: settings are players, mixtures coalitions."""
 
-    def __init__(self, mixtures: Mixtures, pool: Workers[Measurement, Measured], metric: str) -> None:
+    def __init__(self, mixtures: Mixtures, pool: Workers[Measurement, MixtureResult], metric: str) -> None:
         self.mixing, self.metric = mixtures.mixing, metric
         self._mixtures, self._pool = mixtures, pool
         self._count = len(self.mixing.factors)

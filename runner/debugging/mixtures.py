@@ -54,7 +54,7 @@ Readings = Mapping[str, float | None]
 
 
 @dataclass(frozen=True)
-class Measured:
+class MixtureResult:
     """The result of a task."""
 
     readings: Mapping[int, Readings] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class Measurement:
         """Return the task: it runs in one thread, and writes nothing."""
         return self
 
-    def run(self, stop: Callable[[], bool]) -> Measured:
+    def run(self, stop: Callable[[], bool]) -> MixtureResult:
         """Return what was measured; errors that a user can fix become a result."""
         by_seed: dict[int, Readings] = {}
         seconds = 0.0
@@ -91,8 +91,8 @@ class Measurement:
                 by_seed[seed] = measured
                 seconds = time.perf_counter() - began
         except RunnerError as error:
-            return Measured(by_seed, seconds, str(error))
-        return Measured(by_seed, seconds)
+            return MixtureResult(by_seed, seconds, str(error))
+        return MixtureResult(by_seed, seconds)
 
 
 def measure(
@@ -210,7 +210,7 @@ class Mixtures:
         return np.array(rows, np.float64)
 
     def measure(
-        self, mixtures: Sequence[int], workers: Workers[Measurement, Measured], seeds: int | None = None
+        self, mixtures: Sequence[int], workers: Workers[Measurement, MixtureResult], seeds: int | None = None
     ) -> None:
         """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet."""
         waiting = deque(self._tasks(mixtures, self.seeds[:seeds]))
@@ -253,7 +253,7 @@ class Mixtures:
                 some = tuple(missing[start : start + batch])
                 yield Measurement(mixture, config.to_mapping(), some, str(self._recordings))
 
-    def _keep(self, task: Measurement, measured: Measured) -> None:
+    def _keep(self, task: Measurement, measured: MixtureResult) -> None:
         """Append readings to the file: a line each, with the identity of the job."""
         config = from_mapping(task.config)
         lines = []

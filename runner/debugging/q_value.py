@@ -29,7 +29,7 @@ KEY: Final = (
 
 
 @dataclass(frozen=True)
-class Part:
+class ValuePart:
     """A part of a Q-value."""
 
     weight: float
@@ -39,7 +39,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class RewardPart(Part):
+class RewardPart(ValuePart):
     """What rewards of one kind add to a Q-value."""
 
     reward: float | None
@@ -49,7 +49,7 @@ class RewardPart(Part):
 
 
 @dataclass(frozen=True)
-class EpisodesPart(Part):
+class EpisodesPart(ValuePart):
     """What the rewards of a stretch of episodes add to a Q-value."""
 
     start: int
@@ -58,7 +58,7 @@ class EpisodesPart(Part):
 
 
 @dataclass(frozen=True)
-class StepPart(Part):
+class StepPart(ValuePart):
     """What the reward of one step adds to a Q-value."""
 
     at: str
@@ -100,9 +100,9 @@ class Why:
     """The sum of all contributions."""
     counted: int
     """Number of steps whose rewards have a weight."""
-    rewarded: Part
+    rewarded: ValuePart
     """All rewards."""
-    initial: Part
+    initial: ValuePart
     """The initial values."""
     rewards: tuple[RewardPart, ...]
     """The parts by kind of reward, those that add or take most first."""
@@ -149,7 +149,7 @@ def facts_of(found: Why) -> dict[str, str]:
 def _parts_of(found: Why) -> list[Section]:
     whole = found.rewarded.weight + found.initial.weight
 
-    def cells(part: Part) -> tuple[str, str, str]:
+    def cells(part: ValuePart) -> tuple[str, str, str]:
         share = 100 * part.weight / whole if whole else 0.0
         return f"{part.contribution:+.4g}", f"{part.weight:.4g}", f"{share:.3g} %"
 
@@ -165,7 +165,7 @@ def _parts_of(found: Why) -> list[Section]:
         for part in found.rewards[:MAX_ROWS]
     ]
     if rest:
-        others = Part(sum(part.weight for part in rest), sum(part.contribution for part in rest))
+        others = ValuePart(sum(part.weight for part in rest), sum(part.contribution for part in rest))
         rewards.append((f"{len(rest)} other kinds", "", *cells(others)))
     off = "It equals the table's value."
     if found.total != found.value:

@@ -13,7 +13,7 @@ from runner.config import from_mapping
 from runner.debugging.expressions import JOINT, TABLE_NAMES, Array, Columns, Quantity
 from runner.errors import RecordingError, RunnerError
 from runner.learning.learner import rules_of
-from runner.learning.watching import Changes, Watch, explorations
+from runner.learning.watching import Watch, WatchedValues, explorations
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 
@@ -152,13 +152,13 @@ class JobColumns:
                     columns[each][len(steps) - len(own) :] = explorations(rules, *numbers)
         return columns
 
-    def _of_tables(self, changes: Changes, places: NDArray[np.int64]) -> dict[Quantity, Array]:
+    def _of_tables(self, changes: WatchedValues, places: NDArray[np.int64]) -> dict[Quantity, Array]:
         """Return the values at places in a block, each that of the last change before or at it."""
         at = np.searchsorted(changes.row, places, side="right")
         values = self._table_values(changes)
         return {key: np.concatenate([self._last[key], value])[at] for key, value in values.items()}
 
-    def _table_values(self, changes: Changes) -> dict[Quantity, Array]:
+    def _table_values(self, changes: WatchedValues) -> dict[Quantity, Array]:
         columns: dict[Quantity, Array] = {}
         for each, cells in self._cells.items():
             columns[each] = changes.q[:, cells] if each.action < 0 else changes.q[:, cells.start]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from runner.analysis.contents import ending_of, require_steps
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
-from runner.debugging.continuation import Continuation, Moment
+from runner.debugging.continuation import Continuation, Position
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
 from runner.export.reports.playback import tabular_playback
@@ -131,7 +131,7 @@ class _Branches:
         step = int(self._step["step"])
         is_training = at.after is None
         self._tables = TableReplay(recording, step if is_training else at.evaluation_in(recording).train_step)
-        moment = Moment(
+        moment = Position(
             phase=at.phase,
             episode=self._number,
             step=step,

@@ -49,7 +49,7 @@ class Value:
 
 
 @dataclass(frozen=True)
-class Moment:
+class WhenMoment:
     """A training step at which the expression changed."""
 
     step: int
@@ -69,9 +69,9 @@ class Moment:
 class Interval:
     """Training steps after each of which the expression holds."""
 
-    start: Moment
+    start: WhenMoment
     """The first of them."""
-    end: Moment | None
+    end: WhenMoment | None
     """The step after which it no longer holds; None if it holds to the end, or only `start` was searched."""
 
 
@@ -93,13 +93,13 @@ class When:
     """The number of all intervals that were found."""
     steps: int | None
     """The number of steps after which it holds; None unless `every`."""
-    last: Moment
+    last: WhenMoment
     """The last step of the search."""
     states: tuple[tuple[int, str], ...]
     """The states in the expression, with their names."""
 
     @property
-    def first(self) -> Moment | None:
+    def first(self) -> WhenMoment | None:
         """The first step after which the expression holds; None if there is none."""
         return self.intervals[0].start if self.intervals else None
 
@@ -199,11 +199,11 @@ def when_in(
 
 @dataclass(frozen=True)
 class _Found:
-    moments: list[Moment]
+    moments: list[WhenMoment]
     """The steps at which the expression begins and ceases to hold, in turn."""
     count: int
     steps: int
-    last: Moment
+    last: WhenMoment
 
 
 def _search(
@@ -217,7 +217,7 @@ def _search(
     report: Callable[[int], None],
 ) -> _Found:
     """Evaluate an expression after the steps from `start` to before `stop`; unless `every`, to the first."""
-    moments: list[Moment] = []
+    moments: list[WhenMoment] = []
     count = 0
     steps = 0
     holds, expected = False, start
@@ -254,7 +254,7 @@ def _values(term: Series, columns: Columns) -> Array:
     return np.broadcast_to(term.evaluate(columns), rows)
 
 
-def _moment(step: np.void, parts: Sequence[tuple[Series, Array]], before: int, after: int) -> Moment:
+def _moment(step: np.void, parts: Sequence[tuple[Series, Array]], before: int, after: int) -> WhenMoment:
     have_values = [not any(np.isnan(column[row]) for _, column in parts) for row in (before, after)]
     values = [
         Value(
@@ -264,7 +264,7 @@ def _moment(step: np.void, parts: Sequence[tuple[Series, Array]], before: int, a
         )
         for term, column in parts
     ]
-    return Moment(int(step["step"]), int(step["episode"]), int(step["t"]), tuple(values))
+    return WhenMoment(int(step["step"]), int(step["episode"]), int(step["t"]), tuple(values))
 
 
 def _scalar(term: Series, value: np.float64 | np.bool_, is_known: bool) -> Scalar:
@@ -308,11 +308,11 @@ def _section_of(found: When) -> Section:
     return Section(found.expression, sentences, grids, replay=found.first.at.replay)
 
 
-def _named(moment: Moment) -> str:
+def _named(moment: WhenMoment) -> str:
     return f"training step {moment.step:,}, step {moment.t:,} of episode {moment.episode:,} ({moment.at})"
 
 
-def _values_grid(heading: str, moment: Moment, with_before: bool) -> Grid:
+def _values_grid(heading: str, moment: WhenMoment, with_before: bool) -> Grid:
     if not with_before:
         return Grid((heading, "value"), [(each.expression, _text(each.after)) for each in moment.values])
     rows = [(each.expression, _text(each.before), _text(each.after)) for each in moment.values]

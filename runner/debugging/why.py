@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import at_hand
-from runner.debugging.q_value import EpisodesPart, Part, RewardPart, StepPart, Why
+from runner.debugging.q_value import EpisodesPart, RewardPart, StepPart, ValuePart, Why
 from runner.debugging.weights import Cell, Weights, weights_of
 from runner.drawing import svg
 from runner.drawing.svg_moves import Move, moves_map
@@ -125,8 +125,8 @@ def why_in(
     )
     stop = last_step(recording) if step is None else _steps_before(recording, step)
     weights = weights_of(recording, cell, stop, limit or MAX_LIMIT, report)
-    rewarded = Part(*(float(total) for total in weights.episodes.sum(axis=0)))
-    initial = Part(float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum()))
+    rewarded = ValuePart(*(float(total) for total in weights.episodes.sum(axis=0)))
+    initial = ValuePart(float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum()))
     moves = tuple(_moves(mdp, weights.outcomes, "" if is_joint else mdp.agents[learner]))
     return Why(
         run_id=recording.run_id,

@@ -19,7 +19,7 @@ from runner.analysis.diff.divergence import first_difference, unbroken
 from runner.analysis.episodes import EpisodeRef, StepLike, reference_to, training_step, training_steps
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
-from runner.config.sections import Branch, Changes
+from runner.config.sections import BranchSection, ChangesSection
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions, agent_of, joint_action, numbered_actions, own_action
 from runner.errors import ConfigError, RunnerError
@@ -132,7 +132,7 @@ def branch_job(
             f"episodes: found {wanted.episodes:,}, expected more than {where.episode:,}: the branch begins "
             "in this training episode, and those before it count too. `--episodes N` trains more."
         )
-    branch = Branch(
+    branch = BranchSection(
         run=recording.run_id,
         step=step,
         actions=chosen_actions(recording.mdp, action),
@@ -157,22 +157,24 @@ def chosen_actions(mdp: Mdp, action: Action | None) -> dict[str, str]:
     return {mdp.agents[agent]: names[agent][value] for agent, value in own.items()}
 
 
-def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> Changes:
+def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> ChangesSection:
     """Return the settings of a branch.
 
     Raises:
         ConfigError: something differs that cannot change at a step.
     """
     differing = [key for key, value in wanted if value != getattr(now, key)]
-    fixed = [key for key in differing if key not in (*Changes.model_fields, *OF_THE_WHOLE)]
+    fixed = [key for key in differing if key not in (*ChangesSection.model_fields, *OF_THE_WHOLE)]
     if fixed:
-        can = [key for key in Changes.model_fields if getattr(now, key) is not None]
+        can = [key for key in ChangesSection.model_fields if getattr(now, key) is not None]
         raise ConfigError(
             f"{fixed[0]}: cannot change at a step of training; {', '.join(can)} can. "
             "A new run with this setting can begin with the tables of a step: "
             "`initial_q: {run: RUN, step: STEP}`."
         )
-    return Changes(**{key: getattr(wanted, key) for key in differing if key in Changes.model_fields})
+    return ChangesSection(
+        **{key: getattr(wanted, key) for key in differing if key in ChangesSection.model_fields}
+    )
 
 
 def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:

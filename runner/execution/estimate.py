@@ -31,7 +31,7 @@ OTHER_BYTES: Final = 2
 
 
 @dataclass(frozen=True)
-class Estimate:
+class RunEstimate:
     """The estimated evaluations, snapshots, steps and bytes of one run."""
 
     evaluations: int
@@ -42,7 +42,7 @@ class Estimate:
     max_bytes: int
 
 
-def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
+def estimate(config: ExperimentConfig, step_limit: int) -> RunEstimate:
     """Return the estimate of one seed of an experiment; `step_limit` of its environment must not be 0."""
     evaluations = 0
     trials = 0
@@ -55,7 +55,7 @@ def estimate(config: ExperimentConfig, step_limit: int) -> Estimate:
     typical = round(step_limit * (CLUMSY * (clumsy + trials) + SKILLED * (config.episodes - clumsy)))
     longest = step_limit * (config.episodes + trials)
     rate = bytes_per_step(config)
-    return Estimate(evaluations, snapshots, typical, typical * rate, longest, longest * rate)
+    return RunEstimate(evaluations, snapshots, typical, typical * rate, longest, longest * rate)
 
 
 def _occasions(episodes: int, every: int) -> int:

@@ -38,7 +38,7 @@ class Watch(NamedTuple):
     """[P]: whether the path has an event of success."""
 
 
-class Changes(NamedTuple):
+class WatchedValues(NamedTuple):
     """The watched values after the steps of a block that could change them, a row for each."""
 
     row: NDArray[np.int64]
@@ -51,9 +51,9 @@ class Changes(NamedTuple):
     """[k, P]."""
 
 
-def empty_changes(watch: Watch, rows: int) -> Changes:
+def empty_changes(watch: Watch, rows: int) -> WatchedValues:
     """Return changes to be filled, of up to this number of rows."""
-    return Changes(
+    return WatchedValues(
         np.empty(rows, np.int64),
         np.empty((rows, len(watch.cells))),
         np.empty((rows, len(watch.greedy)), np.int32),
@@ -61,10 +61,10 @@ def empty_changes(watch: Watch, rows: int) -> Changes:
     )
 
 
-def joined(parts: Sequence[tuple[Changes, int]]) -> Changes:
+def joined(parts: Sequence[tuple[WatchedValues, int]]) -> WatchedValues:
     """Return the filled rows of changes, each with their number, one after the other."""
     columns = zip(*([array[:rows] for array in changes] for changes, rows in parts), strict=True)
-    return Changes(*map(np.concatenate, columns))
+    return WatchedValues(*map(np.concatenate, columns))
 
 
 @inlined
@@ -102,7 +102,7 @@ def _follow(model: Model, tables: Tables, watch: Watch, p: int) -> None:
 
 
 @inlined
-def _read(tables: Tables, watch: Watch, changes: Changes, k: int) -> None:
+def _read(tables: Tables, watch: Watch, changes: WatchedValues, k: int) -> None:
     """Fill row k of `changes` with the watched values as they are now."""
     for n in range(len(watch.cells)):
         changes.q[k, n] = tables.q[watch.cells[n]]
@@ -124,7 +124,7 @@ def _is_remembered(model: Model, tables: Tables, states: NDArray[np.bool_]) -> b
 
 
 @loop
-def begin(model: Model, tables: Tables, watch: Watch, changes: Changes) -> None:
+def begin(model: Model, tables: Tables, watch: Watch, changes: WatchedValues) -> None:
     """Follow all greedy paths, and fill the first row of `changes`."""
     for p in range(len(watch.starts)):
         _follow(model, tables, watch, p)
@@ -139,7 +139,7 @@ def replay_watched(
     rules: Rules,
     steps: NDArray[np.void],
     watch: Watch,
-    changes: Changes,
+    changes: WatchedValues,
 ) -> int:
     """Replay steps, fill `changes`, which has a row for each step, and return how many rows were filled.
 

@@ -65,7 +65,7 @@ class _Column(NamedTuple):
     `_OtherValues` if it has another shape or dtype."""
 
 
-class Extras:
+class PendingExtras:
     """The extras of a loop that the recorder does not have yet; the caller holds the loop's lock.
 
     Args:

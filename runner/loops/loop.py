@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
-from runner.loops.extras import Extras
+from runner.loops.extras import PendingExtras
 from runner.loops.flushing import FLUSHER
 from runner.loops.loop_run import LoopRun
 from runner.loops.messages import Messages
@@ -64,7 +64,7 @@ class Loop:
         self._failure = ""
         """Why recording stopped, if it did and `on_error` is "warn"."""
         self._warnings: set[str] = set()
-        self.extras = Extras(self._recorder, () if mode is None else (described.environments,))
+        self.extras = PendingExtras(self._recorder, () if mode is None else (described.environments,))
         self.messages = Messages(
             self,
             self._recorder,

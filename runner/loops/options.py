@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, TypedDict
 import numpy as np
 
 from runner.config.loading import packing_from
-from runner.config.sections import Recording
+from runner.config.sections import RecordingSection
 from runner.errors import ConfigError, nearest
 from runner.loops.description import Described
 from runner.loops.makers import why_not_certain
@@ -30,7 +30,7 @@ PACKING: Final = ("compression", "level", "index", "chunk_steps", "code", "syste
 _ARGUMENTS: Final = ("recordings", "make", "frames_of", "phase", "autoreset_mode")
 """The other arguments of functions that record, of which a misspelt one may be meant."""
 _AS_GIVEN: Final = ("name", "frames_every", "frame_format", "shard", "steps", "on_error", "run_id")
-_DEFAULT_PACKING: Final = Recording()
+_DEFAULT_PACKING: Final = RecordingSection()
 Arguments = dict[str, Any]
 """Arguments of a function that records, by name."""
 _STEPS: Final = ("all", "actions", "none")
@@ -99,7 +99,7 @@ class Options:
     frame_format: str = "png"
     frames_of: tuple[int, ...] | None = None
     """The environments of a vector of which frames are recorded; None for all."""
-    packing: Recording = field(default_factory=Recording)
+    packing: RecordingSection = field(default_factory=RecordingSection)
     join: Run | None = None
     """The run that this process records a shard of."""
     shard: str | None = None

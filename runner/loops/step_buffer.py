@@ -21,7 +21,7 @@ from runner.loops.description import Copied, Described
 from runner.loops.generators import States
 from runner.loops.values import as_given, require_reset, warn_user
 from runner.recording import schema
-from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
+from runner.recording.episode_log import Columns, EpisodeLog, Flags, TurnBlock
 from runner.recording.fillers import Change, Put, filler, step_filler
 from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, only_number
 from runner.recording.recorder import BLOCK_BYTES, Recorder
@@ -527,7 +527,7 @@ class StepBuffer:
             counts = None if self._mdp is None else self._counts(self._mdp, columns)
             environment = self._marks["environment"][:rows, np.newaxis] if self._is_copied else None
             ends = rewards, terminated, truncated
-            steps = Steps(first, *ends, begins, only_reset, is_over, counts, environment)
+            steps = TurnBlock(first, *ends, begins, only_reset, is_over, counts, environment)
             episodes = self._log.take(steps)
             number = episodes.number
             columns["step"] = first + np.arange(rows * n).reshape(rows, n)
@@ -556,7 +556,7 @@ class StepBuffer:
         self._filled = self._waiting = self._held = self._ended = self._counted = 0
 
     def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
-        """Return `was_reset`, `only_reset` and `is_over` of the `Steps`; put down the resets among these.
+        """Return `was_reset`, `only_reset` and `is_over` of the `TurnBlock`; put down the resets among these.
 
         Args:
             was_reset: [rows, N], where resets were put down so far.

@@ -29,7 +29,7 @@ class Cycle:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class PolicyOutcome:
     """Means of a policy's episodes over the start states, weighted by their probability."""
 
     starts: int
@@ -75,7 +75,7 @@ class _AtStarts(NamedTuple):
     cycles: tuple[Cycle, ...] = ()
 
 
-def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount: float) -> Outcome:
+def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount: float) -> PolicyOutcome:
     """Return the exact outcome of a deterministic policy.
 
     In a deterministic environment every state has one successor, and each path ends, or closes a cycle;
@@ -90,7 +90,7 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
 
 def evaluate_stochastic_policy(
     mdp: Mdp, policies: Sequence[NDArray[np.float64]], learners: int, discount: float
-) -> Outcome:
+) -> PolicyOutcome:
     """Return the exact outcome of learners that draw their actions, in expectation over all draws.
 
     Args:
@@ -145,7 +145,7 @@ def joint_probabilities(policies: Sequence[NDArray[np.float64]]) -> NDArray[np.f
     )
 
 
-def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
+def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> PolicyOutcome:
     if not mdp.step_limit:
         raise EnvironmentNotUsable(
             f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
@@ -155,7 +155,7 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> Outcome:
     measure = _deterministic if _is_certain(chosen) else _stochastic
     paths = measure(chosen, starts, weights, mdp.step_limit, discount)
     length, penalties, *returns = _means(paths.totals, weights)
-    return Outcome(
+    return PolicyOutcome(
         starts=len(starts),
         success_percent=paths.success_percent if mdp.success_mask else math.nan,
         timeout_percent=paths.timeout_percent,

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
-from runner.planning.evaluation import Outcome, evaluate_policy, evaluate_stochastic_policy, start_mean
+from runner.planning.evaluation import PolicyOutcome, evaluate_policy, evaluate_stochastic_policy, start_mean
 from runner.planning.optimum import best_response, best_response_to_stochastic, greedy_policy, optimal_values
 
 Policy = NDArray[np.int32] | Sequence[NDArray[np.float64]]
@@ -21,7 +21,7 @@ class ExactEvaluator:
     def __init__(self, mdp: Mdp, learners: int) -> None:
         self._mdp = mdp
         self._learners = learners
-        self._best: dict[float, tuple[float, Outcome]] = {}
+        self._best: dict[float, tuple[float, PolicyOutcome]] = {}
 
     def measure(self, policy: Policy, discount: float) -> dict[str, object]:
         """Return the exact measures of a policy, named as in the recording.
@@ -65,7 +65,7 @@ class ExactEvaluator:
             values = best_response_to_stochastic(self._mdp, policy, learner, discount)
         return start_mean(self._mdp, values)
 
-    def _optimum(self, discount: float) -> tuple[float, Outcome]:
+    def _optimum(self, discount: float) -> tuple[float, PolicyOutcome]:
         if discount not in self._best:
             values = optimal_values(self._mdp, discount)
             policy = greedy_policy(self._mdp, discount, values)

@@ -18,7 +18,7 @@ from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.description import environment_count
 from runner.recording.differences import first_differing_row
-from runner.recording.episode_log import Columns, EpisodeLog, Flags, Steps
+from runner.recording.episode_log import Columns, EpisodeLog, Flags, TurnBlock
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
 from runner.recording.steps import aligned
@@ -190,7 +190,7 @@ class _PhaseCheck:
         is_over, counts = self._is_over(numbers, rows), self._counts(first, rows)
         rewards = rows["rewards"] if self._is_whole else np.zeros((*rows.shape, self._learners))
         episodes = self._episodes.take(
-            Steps(first, rewards, *ends, was_reset, only_reset, is_over, counts, environment)
+            TurnBlock(first, rewards, *ends, was_reset, only_reset, is_over, counts, environment)
         )
         expected: Columns = {"t": episodes.t, "episode": episodes.number}
         if "environment" in names:

@@ -21,7 +21,7 @@ Columns = dict[str, Array]
 """Fields of records, by name."""
 
 
-class Steps(NamedTuple):
+class TurnBlock(NamedTuple):
     """Steps of N environments that take turns, [rows, N] each."""
 
     first: int
@@ -76,7 +76,7 @@ class EpisodeLog:
         self.ended = 0
         """Episodes of all environments that have ended."""
 
-    def take(self, steps: Steps) -> Episodes:
+    def take(self, steps: TurnBlock) -> Episodes:
         """Take the next steps of all environments."""
         (rows, n), was_reset = steps.terminated.shape, steps.was_reset
         ends = steps.terminated | steps.truncated | steps.is_over
@@ -130,7 +130,7 @@ class EpisodeLog:
         self.length[which], self._sums[which] = 0, self._zero
         return ended
 
-    def _summed(self, steps: Steps, number: Ints, ends: Flags) -> tuple[Floats, Ints]:
+    def _summed(self, steps: TurnBlock, number: Ints, ends: Flags) -> tuple[Floats, Ints]:
         """Return the sums of each episode, and in which row of them that of each step is, [rows, N].
 
         The episodes of an environment follow one another, and one is left to follow the last.

@@ -118,7 +118,7 @@ class RerunSteps:
         return self
 
 
-class Comparison:
+class RerunComparison:
     """Compares rerun steps with a recording.
 
     Args:

@@ -19,7 +19,7 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.topic_chunks import FOREVER
 from runner.recording.turns import is_of_environment
-from runner.replay.comparison import Comparison, Frame, PlacedReset, RerunSteps, Returned, Start
+from runner.replay.comparison import Frame, PlacedReset, RerunComparison, RerunSteps, Returned, Start
 from runner.replay.makers import is_whole_vector, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import Piece, RecordedReset, pieces
 from runner.replay.stepping import GameStepper, Stepper, VectorStepper
@@ -67,7 +67,7 @@ class Replay:
         self.drawn = 0
         """The environment that is drawn, of a vector that is stepped as a whole."""
         self._recording, self._trust, self._make = recording, trust, make
-        self._comparison = Comparison(recording, tolerance)
+        self._comparison = RerunComparison(recording, tolerance)
         self._report, self.render = report, render
         self._last_step_time = _last_step_time(recording)
         """When the steps end that were recorded: later resets came after steps that were lost."""

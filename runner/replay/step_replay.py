@@ -18,7 +18,7 @@ from runner.errors import RecordingError
 from runner.learning import kernel
 from runner.learning.learner import Learner, NamedTables
 from runner.learning.ledger import UPDATE
-from runner.learning.watching import Changes, Watch, begin, empty_changes, joined, replay_watched
+from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
 from runner.replay.steps import check_steps
 from runner.util.arrays import Array
 
@@ -144,13 +144,13 @@ class StepReplay:
             else:
                 kernel.replay_probed(*what, *probe.between(part.start, part.stop))
 
-    def begin_watch(self, watch: Watch) -> Changes:
+    def begin_watch(self, watch: Watch) -> WatchedValues:
         """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""
         changes = empty_changes(watch, 1)
         begin(self._learner.model, self._learner.tables, watch, changes)
         return changes
 
-    def watch(self, steps: NDArray[np.void], watch: Watch) -> Changes:
+    def watch(self, steps: NDArray[np.void], watch: Watch) -> WatchedValues:
         """Apply updates as `apply` does, and return the watched values after each that could change them.
 
         Args:

@@ -15,7 +15,7 @@ from runner.runs.run import UNLISTED, Run, recordings_folder
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
+    from runner.runs.catalogue.index import CatalogueIndex
     from runner.runs.catalogue.rows import Candidate
 
 LATEST: Final = "@latest"
@@ -100,7 +100,7 @@ def run_with_id(run_id: str, recordings: Path) -> Run | None:
     return run_in(place) if place else None
 
 
-def matching(name: str, index: Index, exclude: str = "") -> list[Candidate]:
+def matching(name: str, index: CatalogueIndex, exclude: str = "") -> list[Candidate]:
     """Return the runs that a name, but no path, may stand for, the newest first; `choose` picks one."""
     if not name:
         return []
@@ -111,7 +111,7 @@ def matching(name: str, index: Index, exclude: str = "") -> list[Candidate]:
     return candidates[:1] if newest else candidates
 
 
-def of_name(name: str, index: Index) -> list[Candidate]:
+def of_name(name: str, index: CatalogueIndex) -> list[Candidate]:
     """Return all runs of a name, the oldest first."""
     return [run for run in reversed(matching(name, index)) if run.name == name]
 
@@ -142,7 +142,7 @@ def choose(name: str, candidates: Sequence[Candidate], newest: bool = False) -> 
     )
 
 
-def not_found(name: str, index: Index, recordings: Path) -> RunNotFound:
+def not_found(name: str, index: CatalogueIndex, recordings: Path) -> RunNotFound:
     """Return the error for a name that no run matches, with the most similar name."""
     runs = index.newest(limit=_MAX_SUGGESTED)
     if not runs:
@@ -167,7 +167,7 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
     """
     from runner.runs.catalogue.index import look
 
-    def work(index: Index) -> dict[str, str]:
+    def work(index: CatalogueIndex) -> dict[str, str]:
         meanings = {LATEST: "the newest run"} if index.newest() else {}
         meanings |= {run.run_id: run_title(run.name, run.seed) for run in index.with_id_prefix(beginning)}
         for name, count in index.names_from(beginning.rpartition("@")[0] or beginning):

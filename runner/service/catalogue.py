@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.database import Version, version
-from runner.runs.catalogue.index import Index, look
+from runner.runs.catalogue.index import CatalogueIndex, look
 from runner.runs.resolve import choose, matching, not_found, of_name, run_of_id
 from runner.runs.run import Run
 
@@ -68,7 +68,7 @@ class Catalogue:
         """Return a key of cached responses, which changes with the runs."""
         return self.version() or self._changed
 
-    def read(self, work: Callable[[Index], Result]) -> Result:
+    def read(self, work: Callable[[CatalogueIndex], Result]) -> Result:
         """Return the result of a function of the index."""
         if self.version() is None:
             self.start_scan().result()

@@ -13,7 +13,7 @@ from pydantic import Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import SECTION_OF, Name, Seed, SeveralSeeds
-from runner.config.values import Count, Section, refusal
+from runner.config.values import ConfigSection, Count, refusal
 from runner.util.values import Json, JsonView
 
 Strategy = Literal["grid", "random", "tpe", "genetic"]
@@ -35,7 +35,7 @@ Number = Annotated[
 ]
 
 
-class Range(Section):
+class Range(ConfigSection):
     """Numbers from `low` to `high`, both included; whole ones if both are whole."""
 
     low: Number = Field(description="The lowest value.")
@@ -94,7 +94,7 @@ Parameter = Annotated[
 """The values to try: each of a list, or numbers of a range."""
 
 
-class Objective(Section):
+class Objective(ConfigSection):
     """The value of a trial: the median over its seeds of a metric at a moment."""
 
     metric: str = Field(
@@ -136,7 +136,7 @@ class Objective(Section):
         return f"{self.metric}, {at}, {self.direction}"
 
 
-class Pruning(Section):
+class Pruning(ConfigSection):
     """When a run is stopped early: its best reading so far is worse than that of most trials by then."""
 
     after: Count = Field(description="Number of training episodes before a run may be pruned.")
@@ -147,7 +147,7 @@ class Pruning(Section):
     )
 
 
-class Limits(Section):
+class Limits(ConfigSection):
     """Limits at which a sweep stops; it can be resumed after they are raised."""
 
     runs: Count | None = Field(default=None, description="Maximum number of runs.")
@@ -161,7 +161,7 @@ _Base = Annotated[
 ]
 
 
-class SweepFile(Section):
+class SweepFile(ConfigSection):
     """A sweep as a YAML file describes it."""
 
     name: Name | None = Field(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from runner.views.view import View, view_input
 
 if TYPE_CHECKING:
-    from runner.analysis.qtable import Tables
+    from runner.analysis.qtable import QTables
     from runner.recording.reader import Recording
 
 _MAX_STEP: Final = 2**62
@@ -40,7 +40,7 @@ def qtable(
         label="State",
         placeholder="number or name",
     ),
-) -> Tables:
+) -> QTables:
     """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
     For your own loop it is the latest snapshot before the step: each array of [states, actions] that

@@ -21,7 +21,7 @@ _MAX_CELLS: Final = 5
 
 
 @dataclass(frozen=True)
-class Cell:
+class CellDiff:
     """One cell of a table, by the names of state and action, and its value in both runs."""
 
     state: str
@@ -43,7 +43,7 @@ class TableDiff:
     """Share of the states in which the greedy action differs."""
     greedy_share_visited: float
     """The same, each state weighted by its visits in both runs' training; nan without steps."""
-    cells: list[Cell]
+    cells: list[CellDiff]
     """Where the difference is largest."""
 
 
@@ -89,7 +89,7 @@ def _moment(table: QTable) -> tuple[int, int]:
     return table.episode, table.table
 
 
-def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[Cell]:
+def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[CellDiff]:
     flat = apart.reshape(-1)
     # Faster than sorting all cells, for each snapshot.
     least = np.partition(flat, -_MAX_CELLS)[-_MAX_CELLS] if flat.size > _MAX_CELLS else 0.0
@@ -100,7 +100,7 @@ def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -
     for cell in order.tolist():
         s, j = divmod(cell, apart.shape[1])
         if apart[s, j] > 0:
-            cells.append(Cell(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
+            cells.append(CellDiff(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
     return cells
 
 

@@ -210,7 +210,7 @@ def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
 
 
 def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
-    from runner.debugging.branch import RAN_OUT, Outcome
+    from runner.debugging.branch import RAN_OUT, BranchOutcome
 
     if branch.outcome.end == RAN_OUT:
         say(
@@ -222,7 +222,7 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
         print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both)
         return
 
-    def returns(outcome: Outcome) -> str:
+    def returns(outcome: BranchOutcome) -> str:
         several = len(outcome.returns) > 1
         return ", ".join(
             f"{agent} {number(value)}" if several else number(value)

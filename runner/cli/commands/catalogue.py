@@ -28,7 +28,7 @@ from runner.runs.run import label
 from runner.util.humanize import UNKNOWN, duration, size
 
 if TYPE_CHECKING:
-    from runner.runs.catalogue.index import Index
+    from runner.runs.catalogue.index import CatalogueIndex
     from runner.runs.catalogue.usage import Sums, Usage
 
 
@@ -211,7 +211,7 @@ def rebuild(recordings: tuple[Path, ...] = folders_option, as_json: bool = json_
     raise click.exceptions.Exit(ExitCode.DIFFERENT if problems else ExitCode.OK)
 
 
-def _contents(index: Index) -> _Contents:
+def _contents(index: CatalogueIndex) -> _Contents:
     from runner.runs.catalogue.filters import Filter
 
     rows = index.rows(Filter(None), columns=("root", "entry", "status", "digest"))

@@ -20,7 +20,7 @@ from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
     FIELDS,
     HEADINGS,
-    Kind,
+    ColumnKind,
     as_json,
     as_text,
     columns_of,
@@ -32,7 +32,7 @@ from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.runs.catalogue.filters import Filter
-    from runner.runs.catalogue.index import Index
+    from runner.runs.catalogue.index import CatalogueIndex
 
 MAX_PROBLEMS: Final = 5
 """Damaged runs whose problems are printed."""
@@ -62,7 +62,14 @@ _DEFAULT_COLUMNS: Final = (
 """Columns of the table, unless they hold nothing of interest."""
 _OPTIONAL: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
 """Columns left out where a terminal is narrow, in this order."""
-_LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
+_LEFT: Final = (
+    ColumnKind.START,
+    ColumnKind.TEXT,
+    ColumnKind.STATUS,
+    ColumnKind.PROSE,
+    ColumnKind.TAGS,
+    ColumnKind.DATE,
+)
 _SHRINKING: Final = (
     "name",
     "config",
@@ -177,7 +184,7 @@ def _stream(
             problems.extend([row["problem"]] if row["problem"] else [])
             yield row
 
-    def work(index: Index) -> int:
+    def work(index: CatalogueIndex) -> int:
         spool.seek(0)
         spool.truncate()
         problems.clear()
@@ -207,7 +214,7 @@ def _page(recordings: tuple[Path, ...], query: _Query, columns: Sequence[str]) -
 
     order, needed = order_of(query.sort), needed_for([*columns, "same_as"])
 
-    def work(index: Index) -> tuple[list[Row], int]:
+    def work(index: CatalogueIndex) -> tuple[list[Row], int]:
         rows, total = index.page(query.filter, *order, limit=query.limit, offset=query.offset, columns=needed)
         return index.with_same_as(rows), total
 

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.axes import axis_of
-from runner.analysis.histograms import Histogram
+from runner.analysis.histograms import ValueCounts
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import shortened
@@ -29,23 +29,23 @@ EXPLANATION: Final = (
 )
 
 
-def heatmap_plots(histograms: list[Histogram]) -> list[Plot]:
+def heatmap_plots(histograms: list[ValueCounts]) -> list[Plot]:
     """Return the heat maps for a page, of what is not constant."""
     varying = [histogram for histogram in histograms if len(histogram.names) != 1]
     return [Plot(title_of(histogram), heatmap_chart(histogram).svg(), False) for histogram in varying]
 
 
-def constants_in(histograms: list[Histogram]) -> list[str]:
+def constants_in(histograms: list[ValueCounts]) -> list[str]:
     """Return a sentence on each quantity that has one value, of which a heat map shows nothing."""
     return [f"{title_of(each)}: always {each.names[0]}." for each in histograms if len(each.names) == 1]
 
 
-def title_of(histogram: Histogram) -> str:
+def title_of(histogram: ValueCounts) -> str:
     """Return the title of a heat map."""
     return _TITLES[histogram.quantity] + (f": {spoken(histogram.line)}" if histogram.line else "")
 
 
-def heatmap_chart(histogram: Histogram) -> Chart:
+def heatmap_chart(histogram: ValueCounts) -> Chart:
     """Return the heat map of a histogram."""
     counts = np.array(histogram.counts, np.float64)
     totals = counts.sum(axis=1, keepdims=True)

@@ -23,7 +23,7 @@ SETTING: Final = "config."
 STATUSES: Final = ("running", "finished", "interrupted", "failed", "archived", "damaged")
 
 
-class Kind(enum.Enum):
+class ColumnKind(enum.Enum):
     """How a filter compares the values of a column; the text says what it expects."""
 
     START = "a text in quotes; like() finds it by its beginning"
@@ -38,7 +38,7 @@ class Kind(enum.Enum):
     AGE = 'a time span such as "90s", "12h", "30d" or "2w", with < or >'
 
 
-TEXT_KINDS: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS)
+TEXT_KINDS: Final = (ColumnKind.START, ColumnKind.TEXT, ColumnKind.STATUS, ColumnKind.PROSE, ColumnKind.TAGS)
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Column:
     """A column of a run."""
 
     name: str
-    kind: Kind | None
+    kind: ColumnKind | None
     """None if it cannot be filtered or sorted by."""
     meaning: str
     type: type | None = str
@@ -89,14 +89,14 @@ _METRIC_HEADINGS: Final = {"success_percent": "success %", "mean_return": "retur
 COLUMNS: Final = {
     column.name: column
     for column in (
-        Column("id", Kind.START, "the run's id", key="run_id"),
-        Column("name", Kind.TEXT, "the run's name"),
-        Column("config", Kind.TEXT, "the name of its configuration"),
-        Column("seed", Kind.WHOLE, "its seed", int, show=str),
-        Column("status", Kind.STATUS, "its status"),
+        Column("id", ColumnKind.START, "the run's id", key="run_id"),
+        Column("name", ColumnKind.TEXT, "the run's name"),
+        Column("config", ColumnKind.TEXT, "the name of its configuration"),
+        Column("seed", ColumnKind.WHOLE, "its seed", int, show=str),
+        Column("status", ColumnKind.STATUS, "its status"),
         Column(
             "tag",
-            Kind.TAGS,
+            ColumnKind.TAGS,
             "one of its tags",
             None,
             key="tags",
@@ -106,10 +106,10 @@ COLUMNS: Final = {
             show=" ".join,
             if_empty="",
         ),
-        Column("note", Kind.PROSE, "its note", if_empty=""),
+        Column("note", ColumnKind.PROSE, "its note", if_empty=""),
         Column(
             "created",
-            Kind.DATE,
+            ColumnKind.DATE,
             "when it began",
             int,
             read=lambda row: moment(row).isoformat(timespec="milliseconds"),
@@ -117,7 +117,7 @@ COLUMNS: Final = {
         ),
         Column(
             "age",
-            Kind.AGE,
+            ColumnKind.AGE,
             "how long ago it began",
             None,
             needs=("created",),
@@ -125,16 +125,16 @@ COLUMNS: Final = {
             read=lambda row: round((datetime.now(UTC) - moment(row)).total_seconds()),
             show=age,
         ),
-        Column("episodes", Kind.NUMBER, "training episodes done", int),
-        Column("episodes_to_do", Kind.NUMBER, "training episodes in its configuration", int),
-        Column("steps", Kind.NUMBER, "steps of training and evaluation", int, in_json=False),
-        Column("train_steps", Kind.NUMBER, "steps of training", int),
-        Column("eval_steps", Kind.NUMBER, "steps of evaluation", int),
-        Column("seconds", Kind.NUMBER, "how long it took", float, show=duration),
+        Column("episodes", ColumnKind.NUMBER, "training episodes done", int),
+        Column("episodes_to_do", ColumnKind.NUMBER, "training episodes in its configuration", int),
+        Column("steps", ColumnKind.NUMBER, "steps of training and evaluation", int, in_json=False),
+        Column("train_steps", ColumnKind.NUMBER, "steps of training", int),
+        Column("eval_steps", ColumnKind.NUMBER, "steps of evaluation", int),
+        Column("seconds", ColumnKind.NUMBER, "how long it took", float, show=duration),
         *(
             Column(
                 metric.name,
-                Kind.NUMBER,
+                ColumnKind.NUMBER,
                 f"{metric.heading} of the last evaluation"
                 + (" of a loop; of its last 100 training episodes without one" if metric.per_agent else ""),
                 float,
@@ -145,16 +145,27 @@ COLUMNS: Final = {
         ),
         Column(
             "logged",
-            Kind.PROSE,
+            ColumnKind.PROSE,
             "the last values that a loop logged, by name",
             read=lambda row: json.loads(row["logged"]),
             show=_logged_text,
             if_empty="",
         ),
         Column(
-            "bytes", Kind.SIZE, "the size of its recording", int, heading="size", aliases=("size",), show=size
+            "bytes",
+            ColumnKind.SIZE,
+            "the size of its recording",
+            int,
+            heading="size",
+            aliases=("size",),
+            show=size,
         ),
-        Column("digest", Kind.START, "its content digest: equal content, equal digest", key="content_digest"),
+        Column(
+            "digest",
+            ColumnKind.START,
+            "its content digest: equal content, equal digest",
+            key="content_digest",
+        ),
         Column(
             "same_as",
             None,
@@ -165,13 +176,15 @@ COLUMNS: Final = {
             read=lambda row: row["same_as"],
             if_empty="",
         ),
-        Column("parent", Kind.START, "the run that it is a branch of", heading="branch of", if_empty=""),
-        Column("mode", Kind.TEXT, "cooperative or competitive"),
-        Column("environment", Kind.TEXT, "the environment's id", aliases=("env",)),
-        Column("host", Kind.TEXT, "the machine it ran on"),
-        Column("git", Kind.START, "the commit of the code it ran with"),
-        Column("archive", Kind.TEXT, "where its recording is archived", if_empty=""),
-        Column("folder", Kind.TEXT, "its recordings folder", None, needs=("root",), in_json=False),
+        Column(
+            "parent", ColumnKind.START, "the run that it is a branch of", heading="branch of", if_empty=""
+        ),
+        Column("mode", ColumnKind.TEXT, "cooperative or competitive"),
+        Column("environment", ColumnKind.TEXT, "the environment's id", aliases=("env",)),
+        Column("host", ColumnKind.TEXT, "the machine it ran on"),
+        Column("git", ColumnKind.START, "the commit of the code it ran with"),
+        Column("archive", ColumnKind.TEXT, "where its recording is archived", if_empty=""),
+        Column("folder", ColumnKind.TEXT, "its recordings folder", None, needs=("root",), in_json=False),
         Column(
             "path",
             None,

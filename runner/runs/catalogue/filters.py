@@ -23,7 +23,7 @@ from itertools import accumulate
 from typing import Any, Final
 
 from runner.errors import RunnerError, nearest
-from runner.runs.catalogue.columns import SETTING, STATUSES, TEXT_KINDS, Column, Kind, field_of
+from runner.runs.catalogue.columns import SETTING, STATUSES, TEXT_KINDS, Column, ColumnKind, field_of
 from runner.runs.catalogue.rows import SEED_SHIFT, Sql
 from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, Term
 
@@ -42,7 +42,7 @@ _FLIPPED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
 }
 _ITEM: Final = re.compile(r"""\[["']?([^]"']*)["']?\]""")
 """A part of a path in brackets: `config["lambda"]`, `config.branches[0]`."""
-_NUMBERS: Final = (Kind.NUMBER, Kind.SIZE, Kind.AGE)
+_NUMBERS: Final = (ColumnKind.NUMBER, ColumnKind.SIZE, ColumnKind.AGE)
 _SEEDS: Final = range(2 * SEED_SHIFT)
 _AMOUNT: Final = re.compile(r"(\d{1,15}(?:\.\d+)?)\s*([a-z]*)", re.IGNORECASE)
 _SECONDS: Final = {"s": 1, "m": 60, "min": 60, "h": 3600, "d": 86400, "w": 7 * 86400}
@@ -79,7 +79,7 @@ def parse(text: str, now: datetime | None = None) -> Filter:
 
 
 @dataclass(frozen=True)
-class Part(Term):
+class FilterPart(Term):
     """A part of a filter in SQL."""
 
     sql: Sql
@@ -89,7 +89,7 @@ class Part(Term):
     """Its value as it is stored."""
 
 
-class FilterParser(Parser[Part]):
+class FilterParser(Parser[FilterPart]):
     """Parses one filter."""
 
     what = "filter"
@@ -157,24 +157,24 @@ class FilterParser(Parser[Part]):
             error.msg += """ (put words to search for in quotes: "O'Brien")"""
         return super().syntax_error(error)
 
-    def fixed(self, value: float | str) -> Part:
+    def fixed(self, value: float | str) -> FilterPart:
         """Return a number or a text as a parameter; True and False are conditions."""
         kind = {bool: CONDITION, str: TEXT}.get(type(value), NUMBER)
         if kind == NUMBER and not -SEED_SHIFT <= value < SEED_SHIFT:  # type: ignore[operator]
             value = float(value)
-        return Part(kind, Sql("?", (value,)))
+        return FilterPart(kind, Sql("?", (value,)))
 
-    def applied(self, kind: str, operation: Operation, *parts: Part) -> Part:
+    def applied(self, kind: str, operation: Operation, *parts: FilterPart) -> FilterPart:
         """Return an operation on one or two terms."""
-        return Part(kind, _sql(self.operations[operation], *(part.sql for part in parts)))
+        return FilterPart(kind, _sql(self.operations[operation], *(part.sql for part in parts)))
 
-    def condition(self, node: ast.expr) -> Part:
+    def condition(self, node: ast.expr) -> FilterPart:
         """Return a condition; a text alone is searched for."""
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             return self._anywhere(glob.escape(node.value))
         return super().condition(node)
 
-    def call(self, node: ast.Call, name: str) -> Part:
+    def call(self, node: ast.Call, name: str) -> FilterPart:
         """Return the term of a call; like() matches wildcards."""
         if name != "like":
             return super().call(node, name)
@@ -185,7 +185,9 @@ class FilterParser(Parser[Part]):
             node, 'expected like() of a field and a text with * ? [abc], as in like(name, "a*").'
         )
 
-    def compared(self, node: ast.Compare, left: ast.expr, operator: type[ast.cmpop], right: ast.expr) -> Part:
+    def compared(
+        self, node: ast.Compare, left: ast.expr, operator: type[ast.cmpop], right: ast.expr
+    ) -> FilterPart:
         """Return the condition that compares a column with a constant, or two numbers."""
         if operator is ast.In:
             if not (isinstance(left, ast.Constant) and isinstance(left.value, str)):
@@ -195,7 +197,7 @@ class FilterParser(Parser[Part]):
                     "for in quotes.",
                 )
             term, pattern = self.term(right), glob.escape(left.value)
-            is_tags = term.column and term.column.kind is Kind.TAGS
+            is_tags = term.column and term.column.kind is ColumnKind.TAGS
             return self._matching(right, term, pattern if is_tags else f"*{pattern}*")
         if isinstance(left, ast.Constant):
             left, operator, right = right, _FLIPPED.get(operator, operator), left
@@ -204,7 +206,7 @@ class FilterParser(Parser[Part]):
         if operator is ast.Is:
             if column is None or value is not None:
                 raise self.error(node, "found `is`, expected FIELD is None, or ==.")
-            return Part(CONDITION, _sql("({} IS NULL)", term.stored))
+            return FilterPart(CONDITION, _sql("({} IS NULL)", term.stored))
         if column is None or (term.kind == NUMBER and not isinstance(value, str | bool | None)):
             return super().compared(node, left, operator, right)
         try:
@@ -215,7 +217,7 @@ class FilterParser(Parser[Part]):
 
     # --- columns ----------------------------------------------------------------------------------------
 
-    def named(self, node: ast.expr) -> Part:
+    def named(self, node: ast.expr) -> FilterPart:
         """Return a column."""
         name = _ITEM.sub(r".\1", self.text_of(node))
         try:
@@ -229,17 +231,17 @@ class FilterParser(Parser[Part]):
             at = setting_path(path)
             stored, kind = Sql("json_extract(settings, ?)", (at,)), Sql("json_type(settings, ?)", (at,))
             number = _sql("CASE WHEN {} IN ('integer', 'real') THEN {} END", kind, stored)
-            return Part(NUMBER, number, column, stored)
+            return FilterPart(NUMBER, number, column, stored)
         sql = stored = Sql(column.stored[0])
-        if column.kind is Kind.AGE:
+        if column.kind is ColumnKind.AGE:
             sql = Sql(f"((? - {sql.text}) / 1000.0)", (self._now.timestamp() * 1000,))
         elif column.kind in TEXT_KINDS:
             stored = Sql(f"NULLIF({sql.text}, '')")
-        return Part(NUMBER if column.kind in _NUMBERS else column.name, sql, column, stored)
+        return FilterPart(NUMBER if column.kind in _NUMBERS else column.name, sql, column, stored)
 
     def _compared_column(
-        self, node: ast.Compare, term: Part, column: Column, operator: type[ast.cmpop], value: Any
-    ) -> Part:
+        self, node: ast.Compare, term: FilterPart, column: Column, operator: type[ast.cmpop], value: Any
+    ) -> FilterPart:
         """Return the condition that a column compares so with a value that is no plain number.
 
         Raises:
@@ -251,14 +253,14 @@ class FilterParser(Parser[Part]):
         if term.kind == NUMBER and kind in TEXT_KINDS and is_equal and not isinstance(value, str):
             types = {None: "null", True: "true", False: "false"}
             path = setting_path(column.name.removeprefix(SETTING))
-            return Part(CONDITION, Sql("(json_type(settings, ?) IS ?)", (path, types[value])))
+            return FilterPart(CONDITION, Sql("(json_type(settings, ?) IS ?)", (path, types[value])))
         if kind in TEXT_KINDS and isinstance(value, str):
             if not is_equal:
                 raise self.error(node, f"{column.name}: text has no order, expected == or !=.")
-            if kind is Kind.STATUS and value.casefold() not in STATUSES:
+            if kind is ColumnKind.STATUS and value.casefold() not in STATUSES:
                 raise ValueError(f"{kind.value}.{nearest(value, STATUSES)}".removesuffix("."))
             return self._matching(node, term, glob.escape(value))
-        if kind is Kind.AGE and is_equal:
+        if kind is ColumnKind.AGE and is_equal:
             raise ValueError(kind.value)
         first, last = map(self.fixed, _range_of(kind, value))
         if is_equal:
@@ -266,16 +268,16 @@ class FilterParser(Parser[Part]):
             return self.applied(CONDITION, ast.And, from_first, self.applied(CONDITION, ast.LtE, term, last))
         return self.applied(CONDITION, operator, term, first if operator in (ast.Lt, ast.GtE) else last)
 
-    def _matching(self, node: ast.expr, term: Part, pattern: str) -> Part:
+    def _matching(self, node: ast.expr, term: FilterPart, pattern: str) -> FilterPart:
         """Return the condition that a column of text matches a pattern of `fnmatch`."""
         if term.column is None or term.column.kind not in TEXT_KINDS:
             raise self.error(node, f"found {self.text_of(node)}, expected a field of text.")
-        return Part(CONDITION, _sql(self.operations["like"], term.stored, Sql("?", (pattern,))))
+        return FilterPart(CONDITION, _sql(self.operations["like"], term.stored, Sql("?", (pattern,))))
 
-    def _anywhere(self, pattern: str) -> Part:
+    def _anywhere(self, pattern: str) -> FilterPart:
         """Return the condition that a word is in the id, the names, the tags or the note of a run."""
         self._selects = True
-        return Part(CONDITION, Sql("matches(words, ?)", (f"*{pattern}*",)))
+        return FilterPart(CONDITION, Sql("matches(words, ?)", (f"*{pattern}*",)))
 
 
 def _new_form(field: str, operator: str | None, value: str) -> str:
@@ -289,18 +291,18 @@ def _new_form(field: str, operator: str | None, value: str) -> str:
         value = {"true": "True", "false": "False", "null": "None"}.get(value, value)
         is_plain = re.fullmatch(r"-?[\d.]+(e\d+)?|True|False|None", value)
         return f"{field} {operator or '=='} {value if is_plain else text}"
-    if kind in (Kind.TAGS, Kind.PROSE):
+    if kind in (ColumnKind.TAGS, ColumnKind.PROSE):
         return f"{text} in {field}"
-    if kind is Kind.START:
+    if kind is ColumnKind.START:
         text = f'{text[:-1]}*"'
-    if kind is Kind.START or set("*?") & set(value):
+    if kind is ColumnKind.START or set("*?") & set(value):
         return f"like({field}, {text})"
     return f"{field} == {text}"
 
 
 def _column(name: str) -> Column:
     if name.startswith(SETTING):
-        return Column(name, Kind.TEXT, "a value of the configuration")
+        return Column(name, ColumnKind.TEXT, "a value of the configuration")
     return field_of(name)
 
 
@@ -310,17 +312,17 @@ def _sql(template: str, *parts: Sql) -> Sql:
     return Sql(template.format(*(part.text for part in parts)), values)
 
 
-def _range_of(kind: Kind, value: object) -> tuple[float, float]:
+def _range_of(kind: ColumnKind, value: object) -> tuple[float, float]:
     """Return the first and the last number in a column that a value of a filter stands for.
 
     Raises:
         ValueError: it is not of the column's kind; so do the functions below.
     """
-    if kind is Kind.WHOLE:
+    if kind is ColumnKind.WHOLE:
         if type(value) is not int or value not in _SEEDS:
             raise ValueError(f"{kind.value} from 0 to {_SEEDS[-1]}")
         return value - SEED_SHIFT, value - SEED_SHIFT
-    reads = {Kind.DATE: date_range, Kind.SIZE: size_of, Kind.AGE: seconds_of}
+    reads = {ColumnKind.DATE: date_range, ColumnKind.SIZE: size_of, ColumnKind.AGE: seconds_of}
     if kind not in reads or not isinstance(value, str):
         raise ValueError(kind.value)
     number = reads[kind](value)
@@ -337,7 +339,7 @@ def size_of(text: str) -> float:
     match = _AMOUNT.fullmatch(text)
     unit = match[2].lower().removesuffix("b") if match else None
     if match is None or unit not in _BYTES:
-        raise ValueError(Kind.SIZE.value)
+        raise ValueError(ColumnKind.SIZE.value)
     return float(match[1]) * _BYTES[unit]
 
 
@@ -348,7 +350,7 @@ def date_range(text: str) -> tuple[int, int]:
         moment = moment.replace(tzinfo=UTC) if moment.tzinfo is None else moment.astimezone(UTC)
         start = math.floor(moment.timestamp() * 1000)
     except (ValueError, OverflowError):
-        raise ValueError(Kind.DATE.value) from None
+        raise ValueError(ColumnKind.DATE.value) from None
     if re.fullmatch(r"\d{4}-\d{2}-\d{2}", text):
         return start, start + 86_399_999
     return start, start + (0 if "." in text else 999 if text.count(":") > 1 else 59_999)
@@ -358,7 +360,7 @@ def seconds_of(text: str) -> float:
     """Return a time span in seconds: `90s`, `12h`, `30d`, `2w`."""
     match = _AMOUNT.fullmatch(text)
     if match is None or match[2] not in _SECONDS:
-        raise ValueError(Kind.AGE.value)
+        raise ValueError(ColumnKind.AGE.value)
     return float(match[1]) * _SECONDS[match[2]]
 
 

@@ -27,7 +27,7 @@ _BATCH: Final = 2000
 """Rows in memory at once, written in one transaction."""
 
 
-class Difference(NamedTuple):
+class FolderChanges(NamedTuple):
     """How a recordings folder differs from the index; runs are given by the names of their folders."""
 
     root: str
@@ -52,12 +52,12 @@ class Folders:
         self._tokens: dict[str, dict[str, str]] = {}
         self._read: dict[str, set[str]] = {root: set() for root in roots}
 
-    def differences(self) -> list[Difference]:
+    def differences(self) -> list[FolderChanges]:
         """Return how the folders, as they were at the first call, differ from the index as it is now."""
         all_differences = [self._difference(root) for root in self._roots]
         return [difference for difference in all_differences if difference.changed or difference.gone]
 
-    def apply(self, found: Sequence[Difference]) -> None:
+    def apply(self, found: Sequence[FolderChanges]) -> None:
         """Read what changed and write it to the index, a transaction for each batch."""
         for root, changed, gone in found:
             changed.sort()  # in the order of the table, which then grows at its end
@@ -78,7 +78,7 @@ class Folders:
             expired = "UPDATE runs SET fingerprint = '', mark = '' WHERE root = ?"
             self._database.executemany(expired, [(root,) for root in self._roots])
 
-    def _difference(self, root: str) -> Difference:
+    def _difference(self, root: str) -> FolderChanges:
         """Return the difference of one folder; entries without files of a run are left out, or gone."""
         stored = "mark" if self._quick else "fingerprint"
         indexed: dict[str, str] = dict(
@@ -98,7 +98,7 @@ class Folders:
         there = [entry for entry in changed if _state_of(root, entry) is not None]
         missing = {*indexed} - {*tokens} | {*changed} - {*there}
         gone = [entry for entry in missing if entry in indexed and _state_of(root, entry) is None]
-        return Difference(root, there, gone)
+        return FolderChanges(root, there, gone)
 
     def _tokens_of(self, root: str) -> dict[str, str]:
         """Return the token of each run's folder at the first check, or when it was read."""

@@ -16,7 +16,7 @@ from typing import Final, TypeVar
 
 from runner.errors import RunnerError, nearest
 from runner.runs.branches import BranchNode, Origin, parse_origin
-from runner.runs.catalogue.columns import SETTING, IndexRow, Kind, field_of, with_same_as
+from runner.runs.catalogue.columns import SETTING, ColumnKind, IndexRow, field_of, with_same_as
 from runner.runs.catalogue.database import (
     Report,
     create,
@@ -43,7 +43,7 @@ _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 """The condition on a column to have one of the values in a JSON list."""
 
 
-class Index:
+class CatalogueIndex:
     """The index of some recordings folders, up to date when it was opened."""
 
     def __init__(self, database: sqlite3.Connection, roots: Sequence[str]) -> None:
@@ -225,7 +225,7 @@ class Index:
 
 def look(
     roots: Sequence[Path],
-    work: Callable[[Index], Result],
+    work: Callable[[CatalogueIndex], Result],
     report: Report = lambda _: None,
     rebuild: bool = False,
     cached: bool = False,
@@ -249,7 +249,7 @@ def look(
             with contextlib.closing(open_index(report)) as database:
                 if cached and before is not None and before.file == (version() or before).file:
                     with transaction(database, "DEFERRED"):
-                        return work(Index(database, places))
+                        return work(CatalogueIndex(database, places))
                 return _look(database, places, work, quick, rebuild)
         except (sqlite3.OperationalError, OSError) as error:
             report(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")
@@ -275,7 +275,7 @@ def order_of(text: str) -> list[Sql]:
         else:
             field = field_of(wanted)
             column = Sql(field.stored[0])
-            descending ^= field.kind is Kind.AGE
+            descending ^= field.kind is ColumnKind.AGE
         order.append(Sql(f"{column.text} {'DESC' if descending else 'ASC'} NULLS LAST", column.values))
     return order
 
@@ -283,11 +283,11 @@ def order_of(text: str) -> list[Sql]:
 def _look(
     database: sqlite3.Connection,
     roots: Sequence[str],
-    work: Callable[[Index], Result],
+    work: Callable[[CatalogueIndex], Result],
     quick: bool,
     rebuild: bool,
 ) -> Result:
-    folders, index = Folders(database, roots, quick), Index(database, roots)
+    folders, index = Folders(database, roots, quick), CatalogueIndex(database, roots)
     if rebuild:
         folders.expire()
     before = pragma(database, "data_version")

@@ -23,7 +23,7 @@ from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_readable
 from runner.runs.catalogue.columns import IndexRow, moment
 from runner.runs.catalogue.filters import Filter
-from runner.runs.catalogue.index import Index
+from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.catalogue.rows import Sql, row_of
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.listing import listed_run
@@ -188,7 +188,7 @@ class Criteria:
     """Their status; any if empty, but `archived` only if named."""
 
 
-def unwanted(index: Index, criteria: Criteria, now: float) -> tuple[list[IndexRow], Counter[str]]:
+def unwanted(index: CatalogueIndex, criteria: Criteria, now: float) -> tuple[list[IndexRow], Counter[str]]:
     """Return the rows that meet the criteria, and how many more do but are protected, by reason."""
     chosen = criteria.filter
     if criteria.older_than is not None:

@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import Filter
-from runner.runs.catalogue.index import Index
+from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.locking import RUN_LOCK
 from runner.runs.marks import MARK_FILE
 from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
@@ -166,7 +166,9 @@ class Sums:
 
 
 def usage_of(
-    read: Callable[[Callable[[Index], list[IndexRow]]], list[IndexRow]], chosen: Filter, limit: int | None
+    read: Callable[[Callable[[CatalogueIndex], list[IndexRow]]], list[IndexRow]],
+    chosen: Filter,
+    limit: int | None,
 ) -> tuple[list[Usage], Sums]:
     """Return the runs that use most of the disk, the largest first, and the sums over all runs.
 

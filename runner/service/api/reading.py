@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from runner.analysis.axes import AXES, EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
-from runner.analysis.histograms import Histogram
+from runner.analysis.histograms import ValueCounts
 from runner.export.plots.style import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
@@ -78,7 +78,7 @@ class Histograms(BaseModel):
     """The histograms of a run's training."""
 
     run_id: str
-    histograms: list[Histogram]
+    histograms: list[ValueCounts]
     notes: list[str]
     """What is left out, a sentence each."""
 

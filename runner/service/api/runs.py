@@ -14,7 +14,7 @@ from runner.recording.labels import MAX_NOTE, MAX_TAGS
 from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
-from runner.runs.catalogue.index import Index, order_of
+from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.run import Run, label
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
@@ -66,7 +66,7 @@ async def list_runs(
         chosen, order = parse(filter), order_of(sort)
         shown = columns_of(columns) if columns else DEFAULT_JSON
 
-        def work(index: Index) -> Json:
+        def work(index: CatalogueIndex) -> Json:
             rows, total = index.page(chosen, *order, limit=limit, offset=offset)
             runs = [row_as_json(row, shown) for row in index.with_same_as(rows)]
             return {"runs": runs, "total": total, "offset": offset, "limit": limit}

@@ -23,7 +23,7 @@ from runner.debugging.explain import (
     check_metric,
 )
 from runner.debugging.explanation import summary
-from runner.debugging.mixtures import Measured, Measurement
+from runner.debugging.mixtures import Measurement, MixtureResult
 from runner.errors import ConfigError, RunNotFound
 from runner.runs.resolve import find_run
 from runner.service.jobs.channel import JobChannel, JobSpec, until_free
@@ -92,7 +92,7 @@ def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
             stages.add(what)
             channel.send(LogEvent(LINES[what]))
 
-    workers: Workers[Measurement, Measured]
+    workers: Workers[Measurement, MixtureResult]
     with worker_pool(spec.workers, spec.ray, question.mixtures[1]) as workers:
         result = until_free(
             partial(answer, question, workers, report, stop=channel.stop),

@@ -15,14 +15,14 @@ from runner.runs.catalogue.columns import (
     FIELDS,
     HEADINGS,
     SETTING,
+    ColumnKind,
     IndexRow,
-    Kind,
     as_text,
     columns_of,
     field_of,
 )
 from runner.runs.catalogue.filters import Filter, parse
-from runner.runs.catalogue.index import Index, order_of
+from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.catalogue.usage import FREED_BY, usage_of
 from runner.service.addresses import Paging, link
 from runner.service.catalogue import Catalogue
@@ -46,8 +46,15 @@ USUAL: Final = (
 FOLDED: Final = ("id", "seed", "tag", "episodes")
 """Columns that a narrow screen leaves out, unless the columns were chosen."""
 ROWS: Final = 50
-_LEFT: Final = (Kind.START, Kind.TEXT, Kind.STATUS, Kind.PROSE, Kind.TAGS, Kind.DATE)
-_FALLING: Final = (Kind.NUMBER, Kind.SIZE, Kind.DATE)
+_LEFT: Final = (
+    ColumnKind.START,
+    ColumnKind.TEXT,
+    ColumnKind.STATUS,
+    ColumnKind.PROSE,
+    ColumnKind.TAGS,
+    ColumnKind.DATE,
+)
+_FALLING: Final = (ColumnKind.NUMBER, ColumnKind.SIZE, ColumnKind.DATE)
 """Kinds whose largest values come first after a click on the heading."""
 
 
@@ -139,7 +146,7 @@ def _values(catalogue: Catalogue, text: str, sort: str, columns: str, number: in
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
     is_usual = list(shown) == list(USUAL)
 
-    def work(index: Index) -> tuple[list[IndexRow], int, int]:
+    def work(index: CatalogueIndex) -> tuple[list[IndexRow], int, int]:
         shown_rows, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
         return index.with_same_as(shown_rows), total, index.count(Filter(None)) if text else total
 
@@ -180,7 +187,7 @@ def _search(
 def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:
     is_setting = column.startswith(SETTING)
     is_sortable = is_setting or column in FIELDS
-    kind = Kind.NUMBER if is_setting or not is_sortable else field_of(column).kind
+    kind = ColumnKind.NUMBER if is_setting or not is_sortable else field_of(column).kind
     rising, falling = column, f"-{column}"
     first, second = (falling, rising) if kind in _FALLING and not is_setting else (rising, falling)
     return Heading(

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from runner.archive import layout, writing
 from runner.archive.manifest import Entry, Manifest
-from runner.archive.store import Store
+from runner.archive.store import ArchiveStore
 from runner.cli import cli
 from runner.recording.liveness import owner as this_process
 from runner.recording.reader import open_recording
@@ -288,7 +288,7 @@ def test_the_rest_of_an_interrupted_archiving_is_no_archive_and_is_replaced(run,
 
 def test_two_processes_do_not_write_the_same_archive_at_once(run, recordings, command):
     to = recordings.parent / "archive"
-    with Store(str(to)).writing(run.run_id) as folder:
+    with ArchiveStore(str(to)).writing(run.run_id) as folder:
         result = command("archive", run.run_id, "--remove")
         assert result.exit_code == 2
         assert "another process is writing this archive" in result.output

@@ -13,7 +13,7 @@ from pyarrow import fs
 from runner.archive import layout
 from runner.archive.manifest import Manifest, entries_of
 from runner.archive.restoring import restore
-from runner.archive.store import Store
+from runner.archive.store import ArchiveStore
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.runs.resolve import find_run
@@ -63,7 +63,7 @@ def put(bucket, key, data):
 
 def store_copy(archive, run_id):
     """Store a copy of an archive's folder."""
-    with Store(URL).writing(run_id) as folder:
+    with ArchiveStore(URL).writing(run_id) as folder:
         shutil.copytree(archive, folder, dirs_exist_ok=True)
 
 
@@ -97,7 +97,7 @@ def test_a_run_goes_there_and_comes_back(run, bucket, tmp_path):
     result = json.loads(command("archive", run.run_id, "--to", URL, "--remove", "--json").stdout)
     assert result["place"] == f"{URL}/{run.run_id}"
     assert find_run(run.run_id, recordings).status == "archived"
-    manifest = Store(URL).manifest(run.run_id)
+    manifest = ArchiveStore(URL).manifest(run.run_id)
     assert keys(bucket) == {f"runs/{run.run_id}/{name}" for name in (*manifest.files, layout.MANIFEST)}
     command("restore", run.run_id)
     assert find_run(run.run_id, recordings).summary["content_digest"] == result["content_digest"]
@@ -114,12 +114,12 @@ def test_an_interrupted_upload_leaves_no_archive_and_is_repeated(archive, bucket
         with pytest.raises(StorageError, match=r"the connection is gone.*uploads all of it again"):
             store_copy(archive, "k3v9m2xq")
     if fail_at != -1:
-        assert Store(URL).manifest("k3v9m2xq") is None
+        assert ArchiveStore(URL).manifest("k3v9m2xq") is None
     else:
         with pytest.raises(RecordingError, match="is not the manifest of an archive"):
-            Store(URL).manifest("k3v9m2xq")
+            ArchiveStore(URL).manifest("k3v9m2xq")
     store_copy(archive, "k3v9m2xq")
-    with Store(URL).reading("k3v9m2xq") as folder:
+    with ArchiveStore(URL).reading("k3v9m2xq") as folder:
         restore(folder)
 
 
@@ -130,7 +130,7 @@ def test_files_of_several_parts(bucket, tmp_path):
     (folder / "steps.parquet").write_bytes(data)
     seal(folder)
     store_copy(folder, "k3v9m2xq")
-    with Store(URL).reading("k3v9m2xq") as back:
+    with ArchiveStore(URL).reading("k3v9m2xq") as back:
         assert (back / "steps.parquet").read_bytes() == data
 
 
@@ -141,7 +141,7 @@ def test_an_upload_leaves_those_of_other_processes_alone(archive, bucket):
     other.write(bytes(11 << 20))  # more than a part: a multipart upload is begun
     store_copy(archive, "k3v9m2xq")
     assert bucket.open_input_stream("lab/runs/p7/steps.parquet").read() == b"another's"
-    with Store(URL).reading("k3v9m2xq") as folder:
+    with ArchiveStore(URL).reading("k3v9m2xq") as folder:
         restore(folder)
     other.close()  # it was not aborted
 
@@ -153,7 +153,7 @@ def seal(folder):
 
 def test_what_is_missing_or_changed_there_is_named(archive, bucket):
     store_copy(archive, "k3v9m2xq")
-    store = Store(URL)
+    store = ArchiveStore(URL)
     key = f"runs/k3v9m2xq/{layout.EPISODES}"
     data = bytearray((archive / layout.EPISODES).read_bytes())
     data[7] ^= 1
@@ -173,20 +173,20 @@ def test_what_is_missing_or_changed_there_is_named(archive, bucket):
 def test_a_storage_that_cannot_be_reached_or_refuses_is_reported(archive, bucket, monkeypatch):
     with (
         pytest.raises(StorageError, match="bucket does not exist"),
-        Store("s3://nowhere/runs").writing("k3v9m2xq") as folder,
+        ArchiveStore("s3://nowhere/runs").writing("k3v9m2xq") as folder,
     ):
         shutil.copytree(archive, folder, dirs_exist_ok=True)
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     with pytest.raises(StorageError, match="Could not connect"):
-        Store(URL).manifest("k3v9m2xq")
+        ArchiveStore(URL).manifest("k3v9m2xq")
     with pytest.raises(RunnerError, match="found no bucket"):
-        Store("s3://")
+        ArchiveStore("s3://")
 
 
 @pytest.mark.parametrize("location", [URL, "folder"])
 def test_no_name_leads_out_of_the_store(bucket, location, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    store = Store(location)
+    store = ArchiveStore(location)
     for run_id in ("..", ".", "a/../..", "/etc", ""):
         with pytest.raises(RecordingError, match="is not the name of an archive's file"):
             store.manifest(run_id)

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.recording.episode_log import EpisodeLog, Steps
+from runner.recording.episode_log import EpisodeLog, TurnBlock
 
 AGENTS = 2
 
@@ -57,7 +57,7 @@ def test_blocks_of_steps_have_the_episodes_of_single_steps(phase):
     log, found_places, found_ended = EpisodeLog(n, AGENTS, None, has_turns=True), [], []
     for begin, stop in zip([0, *cuts], cuts, strict=False):
         columns = (each[begin:stop] for each in (rewards, terminated, truncated, reset, only_reset, over))
-        block = log.take(Steps(begin * n, *columns))
+        block = log.take(TurnBlock(begin * n, *columns))
         found_places += zip(block.t.ravel(), block.number.ravel(), strict=True)
         names = ("environment", "first_step", "last_step", "length", "returns", "terminated", "truncated")
         fields = [block.ended[name] for name in names]
