@@ -77,6 +77,21 @@ def leave_out_scipy() -> None:
     context.refresh = refresh_without_scipy
 
 
+_load_index = caching.IndexDataCacheFile._load_index
+
+
+def _load_readable_index(file: caching.IndexDataCacheFile) -> dict[object, str]:
+    """Return the entries of an index; none if it names a class that an update of this package took away."""
+    try:
+        entries: dict[object, str] = _load_index(file)
+        return entries
+    except (AttributeError, ImportError):
+        return {}
+
+
+caching.IndexDataCacheFile._load_index = _load_readable_index
+
+
 class _Announcement(event.Listener):  # type: ignore[misc]  # Numba has no types
     def on_start(self, _event: object) -> None:
         announce()

@@ -29,6 +29,25 @@ def _printed(program: str) -> list[str]:
     return done.stdout.split()
 
 
+def test_an_index_with_a_class_that_was_renamed_is_made_anew(tmp_path):
+    (tmp_path / "kinds.py").write_text(
+        "import sys\nfrom typing import NamedTuple\n"
+        "class Old(NamedTuple):\n    value: int\n"
+        "globals()[sys.argv[1]] = Old\nOld.__name__ = Old.__qualname__ = sys.argv[1]\n"
+        "if sys.argv[1] != 'Old':\n    del Old\n"
+    )
+    (tmp_path / "loops.py").write_text(
+        "import runner.learning.numba_cache, numba\n"
+        "@numba.njit(cache=True)\ndef plus_one(pair):\n    return pair.value + 1\n"
+    )
+    program = "import sys, kinds; from loops import plus_one; print(plus_one(getattr(kinds, sys.argv[1])(1)))"
+    for name in ("Old", "New"):
+        command = [sys.executable, "-c", program, name]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        assert done.stdout == "2\n"
+    assert list(tmp_path.glob("__pycache__/*.nbi"))
+
+
 def test_scipy_is_left_to_functions_that_need_it():
     program = (
         "import sys, numba, numpy as np\n"
