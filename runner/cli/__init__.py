@@ -17,7 +17,7 @@ from typing import IO, Final
 
 import click
 
-from runner.cli.command import Group
+from runner.cli.command import CommandGroup
 from runner.errors import (
     ConfigError,
     ConfigProblem,
@@ -181,7 +181,7 @@ def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem
     return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})
 
 
-class LazyGroup(Group):
+class LazyGroup(CommandGroup):
     """The commands of `COMMANDS`, each imported when it is invoked."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002

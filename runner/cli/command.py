@@ -104,7 +104,7 @@ class Command(click.Command):
             raise click.NoSuchOption(error.option_name, message, error.possibilities, ctx) from None
 
 
-class Group(click.Group):
+class CommandGroup(click.Group):
     """A group of such commands, which suggests the nearest name for an unknown one."""
 
     command_class = Command

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from runner.analysis.contents import Step, require_steps
-from runner.drawing.text import Drawing
+from runner.drawing.text import TextDrawing
 from runner.environments.mdp import events_of
 from runner.environments.naming import actions_in_words, states_in_words
-from runner.export.pictures import Moment, moments_of
+from runner.export.pictures import PictureMoment, moments_of
 from runner.export.values import plain_value, step_actions_in_words, value_in_words
 from runner.recording.spaces import least_number
 from runner.replay.steps import check_steps, transitions_of
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from runner.recording.spaces import Value
 
 
-class Episode:
+class ShownEpisode:
     """One episode of an open recording, read as it is needed; the title is the first line of each frame."""
 
     def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
@@ -59,7 +59,7 @@ class Episode:
             yield Text.assemble((self._title, "bold"), step, draw(moment.observation), _in_words(moment))
 
 
-def _in_words(moment: Moment) -> str:
+def _in_words(moment: PictureMoment) -> str:
     if not moment.action:
         return "the start"
     return (
@@ -78,7 +78,7 @@ def _state_drawer(recording: Recording) -> Callable[[Value | None], Text]:
             "the first observation was lost\n" if value is None else f"{what}{value_in_words(value)}\n"
         )
     mdp, first = recording.mdp, least_number(recording.spaces["observation"])
-    names, drawing = states_in_words(mdp), Drawing(mdp.scene) if mdp.scene is not None else None
+    names, drawing = states_in_words(mdp), TextDrawing(mdp.scene) if mdp.scene is not None else None
 
     def drawn(value: Value) -> Text:
         state, text = int(value) - first, Text()

@@ -26,7 +26,7 @@ from runner.debugging.explanation import Explanation, Side
 from runner.debugging.explanation_files import FOLDER, LOCK, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.first_step import first_step
-from runner.debugging.game import Game, Plan, interactions_of, mixture_bounds, settings_of
+from runner.debugging.game import Game, SamplingPlan, interactions_of, mixture_bounds, settings_of
 from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures, Readings, measure
 from runner.errors import RunnerError, RunNotFound, nearest
 from runner.execution.initial_tables import resolve_initial_q
@@ -66,7 +66,7 @@ def explain(
     ray: str | None = None,
     recordings: str | os.PathLike[str] | None = None,
     report: Report = lambda *_: None,
-    planned: Callable[[Plan], None] = lambda _: None,
+    planned: Callable[[SamplingPlan], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
     trust: bool = False,
 ) -> Explanation:
@@ -157,7 +157,7 @@ def answer(
     question: Question,
     pool: Workers[Measurement, MixtureResult],
     report: Report = lambda *_: None,
-    planned: Callable[[Plan], None] = lambda _: None,
+    planned: Callable[[SamplingPlan], None] = lambda _: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Explanation:
     """Return the explanation of a question, trained by some workers; see `explain`."""

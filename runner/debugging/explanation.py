@@ -12,7 +12,7 @@ import numpy as np
 from runner.analysis.compare.statistics import Estimate, bootstrap_ratio
 from runner.analysis.sections import Grid, Section, html
 from runner.export.plots.curves import Plot
-from runner.export.plots.mixtures import Column, bars_chart, mixtures_chart
+from runner.export.plots.mixtures import BarColumn, bars_chart, mixtures_chart
 from runner.util.humanize import counted, duration
 from runner.util.values import Json
 
@@ -319,7 +319,7 @@ def plots(explanation: Explanation) -> list[Plot]:
         title = f"{explanation.metric}: what two settings do together beyond what each does"
         result.append(Plot("Which need each other", bars_chart(title, pairs).svg(), True))
     columns = [
-        Column(one.settings, one.values, one == explanation.smallest)
+        BarColumn(one.settings, one.values, one == explanation.smallest)
         for one in sorted(shown_mixtures(explanation), key=lambda one: one.mean.value)
     ]
     title = f"{explanation.metric} of mixtures: a filled dot is the value of B, a hollow one that of A"

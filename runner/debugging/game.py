@@ -22,7 +22,7 @@ _START_SECONDS: Final = 10.0
 
 
 @dataclass(frozen=True)
-class Plan:
+class SamplingPlan:
     """What an explanation will train."""
 
     settings: int
@@ -67,12 +67,12 @@ class Game:
         self._mixtures, self._pool = mixtures, pool
         self._count = len(self.mixing.factors)
 
-    def plan(self) -> Plan:
+    def plan(self) -> SamplingPlan:
         """Return what will be trained."""
         count, mixtures, seeds = self._count, self._mixtures, len(self._mixtures.seeds)
         least, most = mixture_bounds(count)
         available = mixtures.known(range(least)) if least == most else mixtures.in_file
-        return Plan(count, least, most, seeds, available, mixtures.seconds, max(1, self._pool.idle))
+        return SamplingPlan(count, least, most, seeds, available, mixtures.seconds, max(1, self._pool.idle))
 
     def players(self) -> list[int]:
         """Return the numbers of the settings among which the difference is shared; measure their mixtures.

@@ -54,7 +54,7 @@ def image_bytes(pixels: Pixels, kind: str) -> bytes:
 class SceneRaster:
     """Draws states of a scene as pixels, in pictures of at most this width and height."""
 
-    def __init__(self, drawing: svg.Drawing, width: int, height: int) -> None:
+    def __init__(self, drawing: svg.SvgDrawing, width: int, height: int) -> None:
         self._drawing = drawing
         self._scale = min(width / drawing.width, height / drawing.height)
         self._size = round(drawing.width * self._scale), round(drawing.height * self._scale)

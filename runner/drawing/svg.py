@@ -1,6 +1,6 @@
 """The grid of a scene as SVG: what never moves is drawn once, and a frame is where each thing is.
 
-    drawing = Drawing(mdp.scene)
+    drawing = SvgDrawing(mdp.scene)
     places = drawing.places(mdp, states)              # int16 [frames, things, 3]: x, y, size in percent
     svg = drawing.frame(places[3], "step 3")
 
@@ -86,7 +86,7 @@ _GOAL: Final = (
 )
 
 
-class Drawing:
+class SvgDrawing:
     """Draws the grid of one scene."""
 
     def __init__(self, scene: SceneDescription) -> None:
@@ -237,9 +237,9 @@ class Drawing:
         return "frame with a flag" if kind == "goal" else "black figure"
 
 
-def drawing_of(mdp: Mdp) -> Drawing | None:
+def drawing_of(mdp: Mdp) -> SvgDrawing | None:
     """Return the drawing of an environment's scene; None if it has none, or one without cells."""
-    return None if mdp.scene is None or mdp.scene_cells is None else Drawing(mdp.scene)
+    return None if mdp.scene is None or mdp.scene_cells is None else SvgDrawing(mdp.scene)
 
 
 def picture(width: float, height: float, title: str, content: str) -> str:

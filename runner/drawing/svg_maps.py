@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.drawing.palette import LEVELS, NO_VALUE, ink_on, ramp_colour
-from runner.drawing.svg import CELL, Drawing, corner, picture
+from runner.drawing.svg import CELL, SvgDrawing, corner, picture
 from runner.environments.scene import SceneAction, SceneDescription
 
 _FONT: Final = "font-family:'DejaVu Sans',sans-serif"
@@ -90,7 +90,7 @@ def pair_map(
 
 
 def _map(scene: SceneDescription, body: str, title: str, letters: str = "") -> str:
-    drawing = Drawing(scene)
+    drawing = SvgDrawing(scene)
     walls = drawing.walls()
     paper = f'<rect class="m-paper" width="{drawing.width}" height="{drawing.height}" rx="12"/>'
     both = walls.replace("g-wall", "m-wall-edge") + walls.replace("g-wall", "m-wall")

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.drawing.svg import CELL, Drawing, corner, picture
+from runner.drawing.svg import CELL, SvgDrawing, corner, picture
 from runner.environments.scene import SceneDescription
 
 WIDEST: Final = 20.0
@@ -37,7 +37,7 @@ def moves_map(
     The width of an arrow is proportional to the move's weight; `place` is where the things are drawn,
     [things, 3].
     """
-    drawing = Drawing(scene)
+    drawing = SvgDrawing(scene)
     heaviest = max((move.weight for move in moves), default=0.0)
     widths = [(move, WIDEST * move.weight / heaviest) for move in moves if heaviest > 0]
     shapes = [
@@ -50,7 +50,7 @@ def moves_map(
     return picture(drawing.width, drawing.height, title, content)
 
 
-def _shape(scene: SceneDescription, drawing: Drawing, move: Move, width: float) -> str:
+def _shape(scene: SceneDescription, drawing: SvgDrawing, move: Move, width: float) -> str:
     """Return an arrow to the right of the line between two cells, so that its opposite is next to it."""
     colour = drawing.colour(move.thing)
     side = 8 + 26 * drawing.movers.index(move.thing) / max(1, len(drawing.movers) - 1)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 Cell = tuple[int, int]
 
 
-class Drawing:
+class TextDrawing:
     """Draws states of one scene."""
 
     def __init__(self, scene: SceneDescription) -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from runner.drawing.raster import image_bytes
 from runner.errors import CannotRedo, RunnerError
 from runner.export.painting import decoded
-from runner.export.pictures import Source, paint, source_of
+from runner.export.pictures import PictureSource, paint, source_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import recorded_frames
 from runner.util.extras import require
@@ -42,11 +42,11 @@ _WEBP_QUALITY: Final = 75
 def picture_note(recording: Recording, phase: str) -> tuple[bool, str]:
     """Return whether an episode has pictures besides those of a scene, and why not, or why no better ones."""
     source, reason = source_of(recording, phase)
-    if source is Source.VALUES:
+    if source is PictureSource.VALUES:
         return False, f"There is no picture. {sentence(reason)}"
-    if source is Source.OBSERVATION:
+    if source is PictureSource.OBSERVATION:
         return True, f"These are the observations. {sentence(reason)}"
-    return source is not Source.SCENE, ""
+    return source is not PictureSource.SCENE, ""
 
 
 def encoded_pictures(
@@ -64,16 +64,16 @@ def encoded_pictures(
     """
     with open_recording(path) as recording:
         source, reason, has_failed, painted = paint(recording, phase, episode, first=start)
-        if source is Source.VALUES:
+        if source is PictureSource.VALUES:
             raise CannotRedo(f"There is no picture. {reason}")
         if has_failed:
             yield f"These are the {source}. {reason}"
-        if source is Source.RECORDED:
+        if source is PictureSource.RECORDED:
             last = None
             for frame in recorded_frames(recording, phase, episode, start):
                 yield b"" if frame is last else frame["data"]
                 last = frame
-        elif source is not Source.SCENE:
+        elif source is not PictureSource.SCENE:
             with closing(painted):
                 yield from map(encoded_picture, painted)
 

@@ -20,7 +20,7 @@ from runner.drawing import palette
 from runner.drawing.raster import Pixels, font, shortened, wrapped
 from runner.environments.naming import spoken
 from runner.export.encoder import LOSSLESS, Encoder, encoder, frames_of
-from runner.export.pictures import Picture, Pictures
+from runner.export.pictures import EpisodePicture, Pictures
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -164,7 +164,7 @@ def _resized(pixels: Pixels, size: tuple[int, int]) -> Image.Image:
     return picture.resize(size, Image.Resampling.NEAREST if exact else Image.Resampling.LANCZOS)
 
 
-def _lines(shown: Pictures, picture: Picture) -> list[str]:
+def _lines(shown: Pictures, picture: EpisodePicture) -> list[str]:
     """Return the text below a picture without a note."""
     step = f"step {picture.t:,} of {shown.steps:,}"
     if not picture.t:

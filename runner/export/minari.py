@@ -15,7 +15,7 @@ import numpy as np
 
 from runner.analysis.contents import whole_ranges
 from runner.errors import RecordingError
-from runner.export.minari_episodes import Episode, episodes_in
+from runner.export.minari_episodes import MinariEpisode, episodes_in
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
 from runner.replay.trust import require_listed, trusting
@@ -128,7 +128,7 @@ def _missing(recording: Recording, phase: str, is_all: bool, written: Written) -
     return notes
 
 
-def _buffer(episode: Episode, number: int) -> object:
+def _buffer(episode: MinariEpisode, number: int) -> object:
     from minari.data_collector.episode_buffer import EpisodeBuffer
 
     truncated = episode.truncated.copy()

@@ -26,7 +26,7 @@ MAX_EPISODE_BYTES: Final = 1 << 30
 
 
 @dataclass(frozen=True)
-class Episode:
+class MinariEpisode:
     """The T steps of an episode that ended; observations and actions are nested as their spaces."""
 
     observations: Value
@@ -47,7 +47,7 @@ class Episode:
         return not (self.terminated[-1] or self.truncated[-1])
 
 
-def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Episode]:
+def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[MinariEpisode]:
     """Yield the episodes of a phase that ended, in these ranges.
 
     An episode of a loop is left out if a repair lost steps of it or the observation of its reset.
@@ -62,7 +62,7 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
     if not lengths:
         return
     numbers = range(max(min(starts), 0), max(lengths) + 1)
-    resets = _Resets(recording, phase)
+    resets = _EpisodeResets(recording, phase)
     for environment, steps in _steps(recording, phase, numbers, lengths):
         seed, first = resets.before(environment, steps)
         resets.keep_last(environment, steps[-1])
@@ -70,7 +70,7 @@ def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[Ep
             yield _episode(recording, steps, first, seed)
 
 
-class _Resets:
+class _EpisodeResets:
     """The seed and the observation that each episode begins with."""
 
     def __init__(self, recording: Recording, phase: str) -> None:
@@ -141,7 +141,7 @@ def _extend(recording: Recording, parts: list[Records], part: Records, is_last: 
         parts.clear()
 
 
-def _episode(recording: Recording, steps: Records, first: Value, seed: int | None) -> Episode:
+def _episode(recording: Recording, steps: Records, first: Value, seed: int | None) -> MinariEpisode:
     """Return an episode of its steps and the observation of its reset."""
     after, actions = observed(recording, steps), acted(recording, steps)
     seen, done = (recording.spaces[name] for name in ("observation", "action"))
@@ -150,7 +150,7 @@ def _episode(recording: Recording, steps: Records, first: Value, seed: int | Non
     else:
         observations = _split(seen, np.concatenate([np.array([first], after.dtype), after]))
     taken = _collected(done, actions) if isinstance(actions, list) else _split(done, actions)
-    return Episode(observations, taken, seed=seed, **_outcomes(steps))
+    return MinariEpisode(observations, taken, seed=seed, **_outcomes(steps))
 
 
 def _outcomes(steps: Records) -> dict[str, Any]:

@@ -44,7 +44,7 @@ from runner.replay.steps import (
 )
 
 
-class Source(StrEnum):
+class PictureSource(StrEnum):
     """What the pictures of an episode are made from."""
 
     SCENE = "scene"
@@ -59,7 +59,7 @@ class Source(StrEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class PictureMoment:
     """An episode after some of its steps."""
 
     t: int
@@ -79,7 +79,7 @@ class Moment:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture(Moment):
+class EpisodePicture(PictureMoment):
     """What an episode looked like after some of its steps."""
 
     pixels: Pixels
@@ -90,7 +90,7 @@ class Picture(Moment):
 
 def moments_of(
     recording: Recording, phase: str, episode: int, seen: Iterator[Seen] | None = None
-) -> Iterator[Moment]:
+) -> Iterator[PictureMoment]:
     """Yield T + 1 moments of an episode of T steps: after the reset, and after each step.
 
     `seen` are the steps of the episode as `observations_of` yields them, if they are read already.
@@ -100,7 +100,7 @@ def moments_of(
     unpaid = tuple(returns.tolist())
     for t, (observation, step) in enumerate(seen or observations_of(recording, phase, episode)):
         if step is None:
-            yield Moment(t, observation, "", unpaid, unpaid, "", "")
+            yield PictureMoment(t, observation, "", unpaid, unpaid, "", "")
             continue
         action, events = describe(step)
         rewards = np.asarray(step["rewards"], np.float64)
@@ -108,7 +108,7 @@ def moments_of(
             returns += rewards
         ended = ENDINGS[ending_of(recording, phase, episode)] if t == steps else ""
         paid, total = tuple(rewards.tolist()), tuple(returns.tolist())
-        yield Moment(t, observation, action, paid, total, events, ended)
+        yield PictureMoment(t, observation, action, paid, total, events, ended)
 
 
 class Pictures:
@@ -143,10 +143,10 @@ class Pictures:
         self.note = ""
         self._pictures = self._generate(moments_of(recording, phase, episode, seen))
 
-    def __iter__(self) -> Iterator[Picture]:
+    def __iter__(self) -> Iterator[EpisodePicture]:
         return self
 
-    def __next__(self) -> Picture:
+    def __next__(self) -> EpisodePicture:
         return next(self._pictures)
 
     def close(self) -> None:
@@ -154,51 +154,51 @@ class Pictures:
         self._pictures.close()
         self._painted.close()
 
-    def _generate(self, moments: Iterator[Moment]) -> Generator[Picture, None, None]:
+    def _generate(self, moments: Iterator[PictureMoment]) -> Generator[EpisodePicture, None, None]:
         pixels = next(self._painted)
         for moment in moments:
             try:
                 pixels = next(self._painted) if moment.t else pixels
             except CannotRedo as error:
                 self.note = str(error)
-            yield Picture(**vars(moment), pixels=pixels, note=self.note)
+            yield EpisodePicture(**vars(moment), pixels=pixels, note=self.note)
             if self.note:
                 return
 
 
 def source_of(
     recording: Recording, phase: str, trust: bool = False, episode: int | None = None
-) -> tuple[Source, str]:
+) -> tuple[PictureSource, str]:
     """Return what the pictures of an episode are made from, and why it is not anything better.
 
     Nothing is imported or made: it may turn out that an environment cannot be made again. Without a number of
     the episode, frames that were recorded of some environments count for all.
     """
     recorded = source_of_recorded(recording, phase, episode)
-    is_complete = recorded is Source.RECORDED and frames_every(recording) == 1
-    if recorded is Source.SCENE or is_complete:
+    is_complete = recorded is PictureSource.RECORDED and frames_every(recording) == 1
+    if recorded is PictureSource.SCENE or is_complete:
         return recorded, ""
     if recording.can_train_again:
         return recorded, "The environment has no scene."
     reason = why_not_rerun(recording, trust)
-    return (recorded, reason) if reason else (Source.REDRAWN, "")
+    return (recorded, reason) if reason else (PictureSource.REDRAWN, "")
 
 
-def source_of_recorded(recording: Recording, phase: str, episode: int | None) -> Source:
+def source_of_recorded(recording: Recording, phase: str, episode: int | None) -> PictureSource:
     """Return the best of what the recording itself has."""
     if recording.tabular and svg.drawing_of(recording.mdp) is not None:
-        return Source.SCENE
+        return PictureSource.SCENE
     framed = environments_with_frames(recording, phase)
     if framed and (episode is None or recording.phase(phase).episode(episode).place in framed):
-        return Source.RECORDED
+        return PictureSource.RECORDED
     has_image = Values(recording.spaces["observation"], "observation").image is not None
-    return Source.OBSERVATION if has_image else Source.VALUES
+    return PictureSource.OBSERVATION if has_image else PictureSource.VALUES
 
 
 class Painting(NamedTuple):
     """The painted states of an episode."""
 
-    source: Source
+    source: PictureSource
     reason: str
     """Why the environment does not draw them, as a sentence; empty if it does, or has no need to."""
     has_failed: bool
@@ -220,7 +220,7 @@ def paint(
     """
     source, reason = source_of(recording, phase, trust, episode)
     has_failed = False
-    if source is Source.REDRAWN:
+    if source is PictureSource.REDRAWN:
         redrawn = paint_redrawn(recording, phase, episode, trust, first)
         try:
             return Painting(source, "", has_failed, _continued(next(redrawn), redrawn))
@@ -229,11 +229,11 @@ def paint(
             source, reason, has_failed = source_of_recorded(recording, phase, episode), str(error), True
     seen = seen or observations_of(recording, phase, episode, first)
     match source:
-        case Source.SCENE:
+        case PictureSource.SCENE:
             painted = paint_scene(recording, seen)
-        case Source.RECORDED:
+        case PictureSource.RECORDED:
             painted = paint_recorded(recording, phase, episode, seen)
-        case Source.OBSERVATION:
+        case PictureSource.OBSERVATION:
             painted = paint_observation(recording, seen)
         case _:
             painted = paint_values(recording, phase, episode, seen)

@@ -31,7 +31,7 @@ from runner.service.pictures import PictureStreams
 from runner.service.problems import add_error_handlers, error_docs
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.service.sweep_fragments import load_sweep_libraries
 from runner.service.tokens import Sessions, Tokens
 from runner.service.uploads import Upload, Uploads
@@ -58,7 +58,7 @@ class Ready(BaseModel):
     """Each thing that it needs, and whether that is so."""
 
 
-def create_app(settings: Settings) -> FastAPI:
+def create_app(settings: ServiceSettings) -> FastAPI:
     """Return the application.
 
     Raises:
@@ -126,7 +126,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     """Open what lives as long as the service, and close it in the opposite order."""
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     app.state.stopping.clear()
-    settings: Settings = app.state.settings
+    settings: ServiceSettings = app.state.settings
     limits = settings.limits
 
     def log_upload(upload: Upload) -> None:

@@ -22,7 +22,7 @@ from runner.service.jobs.queue import JobQueue
 from runner.service.pictures import PictureStreams
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ALWAYS, ResponseCache
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.service.uploads import Uploads
 
 Shown = TypeVar("Shown")
@@ -40,7 +40,7 @@ def _state(name: str) -> object:
     return Depends(get)
 
 
-SettingsOf = Annotated[Settings, _state("settings")]
+SettingsOf = Annotated[ServiceSettings, _state("settings")]
 CatalogueOf = Annotated[Catalogue, _state("catalogue")]
 ProcessesOf = Annotated[ProcessPool, _state("processes")]
 SweepProcesses = Annotated[ProcessPool, _state("sweep_processes")]

@@ -25,7 +25,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from runner.errors import RunnerError
 from runner.service.errors import Refused, Unauthorized
 from runner.service.problems import status_of
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.service.tokens import COOKIE, Sessions, Token, Tokens
 
 SAFE_METHODS: Final = ("GET", "HEAD", "OPTIONS")
@@ -56,7 +56,7 @@ class Guard:
     def __init__(
         self,
         app: ASGIApp,
-        settings: Settings,
+        settings: ServiceSettings,
         tokens: Tokens,
         sessions: Sessions,
         refusal: Callable[[Request, RunnerError], Response],

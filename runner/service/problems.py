@@ -30,7 +30,7 @@ from runner.errors import (
 )
 from runner.service.errors import RequestError
 from runner.service.logs import LOG
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.util.processes import CallFailed
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
@@ -46,7 +46,7 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
 }
 
 
-class Problem(BaseModel):
+class HttpProblem(BaseModel):
     """One thing that is wrong."""
 
     path: str | None = None
@@ -60,7 +60,7 @@ class ErrorBody(BaseModel):
     """What is wrong, and what to do."""
 
     message: str
-    problems: list[Problem] = []
+    problems: list[HttpProblem] = []
 
 
 class ErrorResponse(BaseModel):
@@ -93,13 +93,13 @@ def status_of(error: RunnerError) -> HTTPStatus:
     return next((_STATUS[kind] for kind in kinds), HTTPStatus.BAD_REQUEST)
 
 
-def error_body(error: RunnerError, settings: Settings) -> ErrorBody:
+def error_body(error: RunnerError, settings: ServiceSettings) -> ErrorBody:
     """Return an error's message, and the problems of a configuration with their lines and keys."""
     message = settings.without_folders(full_message(error))
     if not isinstance(error, ConfigError):
         return ErrorBody(message=message)
     problems = [
-        Problem(
+        HttpProblem(
             path=detail.path or None,
             line=detail.line or None,
             message=settings.without_folders(detail.message),
@@ -149,7 +149,7 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
     assert isinstance(error, RequestValidationError)
     problems = [
-        Problem(path=".".join(map(str, each["loc"])), message=str(each["msg"])) for each in error.errors()
+        HttpProblem(path=".".join(map(str, each["loc"])), message=str(each["msg"])) for each in error.errors()
     ]
     message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
     return json_error(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))

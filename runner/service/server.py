@@ -15,7 +15,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from runner.errors import RunnerError
 from runner.service.logs import FLOODS
-from runner.service.settings import Limits, Settings
+from runner.service.settings import ServiceLimits, ServiceSettings
 
 MAX_HEAD_BYTES: Final = 64 << 10
 """Size of a request's target and headers."""
@@ -32,7 +32,7 @@ _DISCARD: Final = struct.pack("ii", 1, 0)
 """The option SO_LINGER: discard unsent data when the socket is closed."""
 
 
-def bind(settings: Settings) -> socket.socket:
+def bind(settings: ServiceSettings) -> socket.socket:
     """Return the socket that the service will listen on, so that its port is known before it starts.
 
     Raises:
@@ -54,7 +54,7 @@ def url_of(listening: socket.socket) -> str:
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
-def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
+def serve(app: FastAPI, settings: ServiceSettings, listening: socket.socket) -> None:
     """Serve until SIGINT or SIGTERM, then complete running requests."""
     config = uvicorn.Config(
         app,
@@ -83,7 +83,7 @@ def serve(app: FastAPI, settings: Settings, listening: socket.socket) -> None:
         loop.run(run())
 
 
-def max_connections(limits: Limits) -> int:
+def max_connections(limits: ServiceLimits) -> int:
     """Return the maximum number of connections; each may need a second descriptor, for a file it reads."""
     try:
         import resource
@@ -113,7 +113,7 @@ class _Server(uvicorn.Server):
         self._stopping.set()
 
 
-def _protocol(limits: Limits) -> type[HttpToolsProtocol]:
+def _protocol(limits: ServiceLimits) -> type[HttpToolsProtocol]:
     """Return uvicorn's HTTP/1.1 with limits on the head of a request and on slow clients.
 
     Uvicorn itself has no such limits, see docs/decisions/uvicorn-limits.md.

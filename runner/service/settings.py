@@ -30,7 +30,7 @@ def without_folders(text: str, *folders: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Limits:
+class ServiceLimits:
     """What a client may use at most; more is refused, with a message."""
 
     body_bytes: int = MB
@@ -68,7 +68,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Settings:
+class ServiceSettings:
     """The settings of the service."""
 
     recordings: tuple[Path, ...]
@@ -86,7 +86,7 @@ class Settings:
     """Processes that run jobs at the same time."""
     ray: str | None = None
     """The address of a Ray cluster that runs the jobs; None for processes of this machine."""
-    limits: Limits = Limits()
+    limits: ServiceLimits = ServiceLimits()
 
     def __post_init__(self) -> None:
         if not self.recordings:

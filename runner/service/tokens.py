@@ -71,7 +71,7 @@ class Token:
 
 
 @dataclass(frozen=True)
-class Session:
+class LoginSession:
     """What is stored of a session."""
 
     sha256: Digest
@@ -181,12 +181,12 @@ class Sessions:
 
     def __init__(self, tokens: Tokens) -> None:
         self._tokens = tokens
-        self._file = _RecordsFile(tokens.path.with_name(SESSIONS_FILE), "sessions", Session)
+        self._file = _RecordsFile(tokens.path.with_name(SESSIONS_FILE), "sessions", LoginSession)
 
     def begin(self, token: Token) -> str:
         """Return the secret of a new session of a token."""
         secret = secrets.token_urlsafe(32)
-        session = Session(_digest(secret), token.id, time.time() + SESSION_SECONDS)
+        session = LoginSession(_digest(secret), token.id, time.time() + SESSION_SECONDS)
         self._file.change(lambda sessions: [*self._current(sessions), session][-MAX_SESSIONS:])
         return secret
 
@@ -203,7 +203,7 @@ class Sessions:
         digest = _digest(secret)
         self._file.change(lambda sessions: [old for old in self._current(sessions) if old.sha256 != digest])
 
-    def _current(self, sessions: tuple[Session, ...]) -> list[Session]:
+    def _current(self, sessions: tuple[LoginSession, ...]) -> list[LoginSession]:
         """Return the sessions that have not ended and whose token exists."""
         ids, now = {token.id for token in self._tokens.all()}, time.time()
         return [session for session in sessions if session.token_id in ids and session.expires > now]

@@ -38,7 +38,7 @@ from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
 from runner.service.previews import Previews
 from runner.service.processes import ProcessPool, lower_priority
-from runner.service.settings import Limits, without_folders
+from runner.service.settings import ServiceLimits, without_folders
 from runner.service.tokens import Digest
 from runner.util.files import hash_of, require_room, storage_errors, write_all, write_object
 from runner.util.processes import CallFailed
@@ -94,7 +94,9 @@ class Uploads:
     that was verified, by another thread.
     """
 
-    def __init__(self, recordings: Path, limits: Limits, on_verified: Callable[[Upload], object]) -> None:
+    def __init__(
+        self, recordings: Path, limits: ServiceLimits, on_verified: Callable[[Upload], object]
+    ) -> None:
         self._recordings, self._limits, self._on_verified = recordings, limits, on_verified
         self._folder, self._previews = recordings / FOLDER, Previews(recordings)
         self._lock = threading.RLock()

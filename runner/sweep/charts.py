@@ -39,7 +39,7 @@ _MAX_NOTE_LENGTH: Final = 175
 
 
 @dataclass(frozen=True, eq=False)
-class Axis:
+class ParameterAxis:
     """A parameter of a sweep, and the values that its trials have."""
 
     path: str
@@ -51,12 +51,12 @@ class Axis:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class ChartPicture:
     """Trials that have results, and their parameters."""
 
     trials: tuple[Ranked, ...]
     """The best first."""
-    axes: tuple[Axis, ...]
+    axes: tuple[ParameterAxis, ...]
     values: Values
     """The median of each trial."""
     ranges: Values
@@ -79,7 +79,7 @@ class Picture:
         return text
 
 
-def picture_of(results: Results) -> Picture:
+def picture_of(results: Results) -> ChartPicture:
     """Return the trials of a sweep that can be drawn.
 
     Raises:
@@ -94,7 +94,7 @@ def picture_of(results: Results) -> Picture:
     parameters, objective = results.sweep.file.parameters, results.sweep.objective
     values, ranges = figures[is_drawn, 0], figures[is_drawn, 1:]
     at = f"first at {objective.level:g}, episodes" if objective.at == "first_over" else objective.at
-    return Picture(
+    return ChartPicture(
         trials=drawn,
         axes=tuple(
             _axis(path, parameter, drawn)
@@ -142,17 +142,19 @@ def _nothing_to_draw(results: Results) -> str:
     return f"the sweep {results.sweep.name!r}: nothing to draw, as {reason}."
 
 
-def _axis(path: str, parameter: Range | list[object], trials: Sequence[Ranked]) -> Axis:
+def _axis(path: str, parameter: Range | list[object], trials: Sequence[Ranked]) -> ParameterAxis:
     if isinstance(parameter, Range):
-        return Axis(path, (), parameter.log, np.array([trial.values.get(path, np.nan) for trial in trials]))
+        return ParameterAxis(
+            path, (), parameter.log, np.array([trial.values.get(path, np.nan) for trial in trials])
+        )
     choices = list(map(json.dumps, parameter))
     numbers = [
         choices.index(json.dumps(trial.values[path])) if path in trial.values else np.nan for trial in trials
     ]
-    return Axis(path, tuple(map(value_text, parameter)), False, np.array(numbers))
+    return ParameterAxis(path, tuple(map(value_text, parameter)), False, np.array(numbers))
 
 
-def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Panel) -> Canvas:
+def sweep_sheet(title: str, picture: ChartPicture, groups: Sequence[Group], panel: Panel) -> Canvas:
     """Return one sheet: the objective along each parameter, parallel coordinates, and learning curves.
 
     The curves are those of groups of runs, in one panel.
@@ -183,13 +185,13 @@ def sweep_sheet(title: str, picture: Picture, groups: Sequence[Group], panel: Pa
     return sheet
 
 
-def picture_plots(picture: Picture) -> list[Plot]:
+def picture_plots(picture: ChartPicture) -> list[Plot]:
     """Return the trials for a page: along each parameter, and in parallel coordinates."""
     along = [Plot(axis.path, parameter_chart(picture, axis).svg(), False) for axis in picture.axes]
     return [*along, Plot("All parameters", parallel_chart(picture).svg(), True)]
 
 
-def parameter_chart(picture: Picture, axis: Axis) -> Chart:
+def parameter_chart(picture: ChartPicture, axis: ParameterAxis) -> Chart:
     """Return the objective of the trials against a parameter, the best trial in another colour.
 
     Pruned trials are hollow.
@@ -219,9 +221,9 @@ def parameter_chart(picture: Picture, axis: Axis) -> Chart:
     return chart
 
 
-def parallel_chart(picture: Picture) -> Chart:
+def parallel_chart(picture: ChartPicture) -> Chart:
     """Return parallel coordinates: each trial a line over all parameters to its objective."""
-    axes = [*picture.axes, Axis(picture.objective, (), picture.log, picture.values)]
+    axes = [*picture.axes, ParameterAxis(picture.objective, (), picture.log, picture.values)]
     lines = np.array([_unit(axis.values, axis.log, axis.choices) for axis in axes]).T
     places = np.arange(len(axes), dtype=np.float64)
     x = Scale(-0.1, len(axes) - 0.75, 10.0, 580.0)
@@ -249,7 +251,7 @@ def _trial_line(chart: Chart, heights: Values, colour: str, width: float, opacit
     chart.line(places, heights[is_used], colour, width=width, opacity=opacity)
 
 
-def _label_column(chart: Chart, column: int, axis: Axis) -> None:
+def _label_column(chart: Chart, column: int, axis: ParameterAxis) -> None:
     """Write the choices, or the lowest and the highest value, next to an axis of parallel coordinates."""
     if axis.choices:
         ends, texts = (

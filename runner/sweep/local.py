@@ -61,8 +61,8 @@ class LocalWorkers(Generic[T, R]):
         self._context = process_context(PRELOADED)
         with starting_processes():  # an event starts one that tracks it
             self._stopping = self._context.Event()
-        self._idle: list[_Worker[R]] = []
-        self._busy: dict[object, tuple[_Worker[R], T]] = {}
+        self._idle: list[_SweepWorker[R]] = []
+        self._busy: dict[object, tuple[_SweepWorker[R], T]] = {}
 
     @property
     def idle(self) -> int:
@@ -78,7 +78,7 @@ class LocalWorkers(Generic[T, R]):
                 break
             worker.end()
         else:
-            worker = _Worker[R](self._context, self._stopping)
+            worker = _SweepWorker[R](self._context, self._stopping)
             worker.send(local)  # `collect` notices if it is dead already
         self._busy[worker.pipe] = worker, task
 
@@ -108,7 +108,7 @@ class LocalWorkers(Generic[T, R]):
             worker.end()
 
 
-class _Worker(Generic[R]):
+class _SweepWorker(Generic[R]):
     """A process and the pipe to it."""
 
     def __init__(self, context: Any, stopping: Event) -> None:

@@ -147,7 +147,7 @@ class Pruning(ConfigSection):
     )
 
 
-class Limits(ConfigSection):
+class SweepLimits(ConfigSection):
     """Limits at which a sweep stops; it can be resumed after they are raised."""
 
     runs: Count | None = Field(default=None, description="Maximum number of runs.")
@@ -194,7 +194,7 @@ class SweepFile(ConfigSection):
     pruning: Pruning | None = Field(
         default=None, description="When to stop runs that fall behind; null: never."
     )
-    limits: Limits = Field(default=Limits(), description="Limits at which the sweep stops.")
+    limits: SweepLimits = Field(default=SweepLimits(), description="Limits at which the sweep stops.")
     recording: Json = Field(
         default_factory=lambda: {"steps": "none"},
         description="Overrides of the base's `recording`. By default steps are not recorded; `dualtaxi "

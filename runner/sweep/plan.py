@@ -16,7 +16,7 @@ from runner.execution.estimate import estimate, free_bytes
 from runner.execution.session import run_job
 from runner.recording.reader import open_recording
 from runner.runs.run import create_run
-from runner.sweep.model import Limits, Sweep
+from runner.sweep.model import Sweep, SweepLimits
 from runner.sweep.objective import curve_of
 from runner.sweep.running import Limit, SweepStatus
 from runner.sweep.search import Search
@@ -109,7 +109,7 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
         )
 
 
-def limit_of(limits: Limits, plan: Plan, recordings: Path, before: int) -> Limit:
+def limit_of(limits: SweepLimits, plan: Plan, recordings: Path, before: int) -> Limit:
     """Return the function that gives the reason why a task may not be started, if there is one.
 
     `before` is the number of runs of the sweep that existed before.

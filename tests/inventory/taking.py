@@ -18,7 +18,7 @@ from runner.debugging.explanation_files import explanations_in
 from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.inventory.fixture import make_runs, same_everywhere
 from tests.inventory.forms import ADDRESSES, COMMANDS, REPORTS, ROUTE_RUNS, ROUTES
 from tests.inventory.reading import (
@@ -138,7 +138,7 @@ def take_commands(shop: Shop, _: WebDriver) -> Lines:
 
 def take_routes(shop: Shop, _: WebDriver) -> Lines:
     """Return every route with its parameters, and the keys of JSON answers."""
-    settings = Settings(recordings=(shop.recordings,), tokens=shop.folder / "tokens.json")
+    settings = ServiceSettings(recordings=(shop.recordings,), tokens=shop.folder / "tokens.json")
     described = create_app(settings).openapi()["paths"]
     routes: Lines = {
         f"{method.upper()} {path}": sorted(

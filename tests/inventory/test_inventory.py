@@ -11,7 +11,7 @@ import pytest
 
 from runner.service import login, pages
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.browsing import chromium_programs
 from tests.doors import commands, routes
 from tests.inventory.forms import ADDRESSES, COMMANDS, PARTS, ROUTES, UNTYPED
@@ -42,7 +42,7 @@ def test_every_page_is_inventoried():
 
 
 def test_every_route_with_json_is_inventoried(tmp_path):
-    app = create_app(Settings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json"))
+    app = create_app(ServiceSettings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json"))
     answers = {
         path.removeprefix("/api/v1"): methods["get"]["responses"]["200"].get("content", {})
         for path, methods in app.openapi()["paths"].items()

@@ -35,7 +35,7 @@ from runner.replay.trust import require_listed
 from runner.runs.marks import MARK_FILE
 from runner.runs.run import Run
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.doors import commands, routes
 
 TRAP = """\
@@ -282,7 +282,7 @@ def test_every_command_is_walked_or_reads_no_run():
 def test_no_command_makes_what_a_stranger_chose(name, strangers, trap, tmp_path, monkeypatch):
     (tmp_path / "policy_of_doors.py").write_text("def policy(*_):\n    return lambda observation: 0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("runner.export.rerun.viewer.Viewer", None)
+    monkeypatch.setattr("runner.export.rerun.viewer.RerunViewer", None)
     for run in ("function", "writing", "job"):
         own = shutil.copytree(strangers, tmp_path / run / "runs")
         filled = {"RUN": run, "RECORDING": str(strangers / run / "recording.mcap")}
@@ -397,7 +397,7 @@ ENDLESS = ("/events",)
 def service(strangers, tmp_path, trap):
     """Return a service of a copy of the strangers' recordings, which starts where the traps are."""
     own = Path(shutil.copytree(strangers, tmp_path / "runs"))
-    app = create_app(Settings((own,), tokens=tmp_path / "tokens.json", workers=1))
+    app = create_app(ServiceSettings((own,), tokens=tmp_path / "tokens.json", workers=1))
     here = {"base_url": "http://localhost", "headers": {"Origin": "http://localhost"}}
     with TestClient(app, raise_server_exceptions=False, **here) as client:
         yield client

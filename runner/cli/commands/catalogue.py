@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from runner.cli.command import Command, Group, option
+from runner.cli.command import Command, CommandGroup, option
 from runner.cli.options import (
     filter_argument,
     folders_option,
@@ -162,7 +162,7 @@ class _Contents(NamedTuple):
     problems: list[str]
 
 
-@click.group("index", cls=Group)
+@click.group("index", cls=CommandGroup)
 def index_command() -> None:
     """Manage the index of runs, which makes listing them quick.
 

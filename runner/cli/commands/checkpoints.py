@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from runner.cli.command import Command, Group, argument, option
+from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     checkpoint_option,
     episode_option,
@@ -68,7 +68,7 @@ def checkpoints_command(
     draw(table(*_HEADINGS, rows=rows, left=_LEFT))
 
 
-@click.group("checkpoint", cls=Group)
+@click.group("checkpoint", cls=CommandGroup)
 def checkpoint_command() -> None:
     """Get a checkpoint of a run.
 

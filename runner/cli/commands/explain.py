@@ -27,13 +27,13 @@ from runner.cli.progress import total_line
 from runner.util.humanize import counted, duration
 
 if TYPE_CHECKING:
-    from runner.debugging.game import Plan
+    from runner.debugging.game import SamplingPlan
 
 
 class _Planned(Exception):
     """The plan, when nothing more than it was wanted."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: SamplingPlan) -> None:
         super().__init__()
         self.plan = plan
 
@@ -92,7 +92,7 @@ def explain_command(
 
     require_one("as_json", "as_markdown")
 
-    def planned(plan: Plan) -> None:
+    def planned(plan: SamplingPlan) -> None:
         if dry_run:
             raise _Planned(plan)
         say(_in_words(plan))
@@ -132,7 +132,7 @@ def explain_command(
         print_sections(sections(explanation), as_markdown)
 
 
-def _in_words(plan: Plan) -> str:
+def _in_words(plan: SamplingPlan) -> str:
     """Return what will be trained, and how long it takes."""
     runs, most = plan.mixtures * plan.seeds, plan.most_mixtures * plan.seeds
     reused = f", {plan.known:,} of them trained already" if plan.known else ""

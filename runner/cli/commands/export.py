@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.command import Group, option
+from runner.cli.command import CommandGroup, option
 from runner.cli.commands import export_film, export_tables, export_tools
 from runner.cli.options import Writing, run_argument, selection_options, writing_options
 from runner.cli.output import say
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from runner.export.rerun.selection import Request, Selection
 
 
-@click.group("export", cls=Group)
+@click.group("export", cls=CommandGroup)
 def export_command() -> None:
     """Export a run for other programs.
 

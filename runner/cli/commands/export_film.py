@@ -92,14 +92,14 @@ def command(
         raise click.UsageError("--whole is for a grid: the film of one episode is always whole.")
     from runner.export import film
     from runner.export.encoder import format_of
-    from runner.export.pictures import Pictures, Source, source_of
+    from runner.export.pictures import Pictures, PictureSource, source_of
 
     with opened_run(run_name, to.recordings) as (run, recording):
         path = to.path(run.file_stem)
         format_of(path)
         require_new(path, to.force)
         shown = _ranked(recording, grid) if grid else [chosen.resolved(recording)]
-        is_scene = source_of(recording, shown[0].phase, trust)[0] is Source.SCENE
+        is_scene = source_of(recording, shown[0].phase, trust)[0] is PictureSource.SCENE
         speed = fps or (_SCENE_FPS if is_scene else _FPS)
         if path.suffix.lower() == ".gif" and speed > _MAX_GIF_FPS:
             raise click.UsageError(f"--fps: found {speed:g}, expected at most {_MAX_GIF_FPS} of a GIF.")

@@ -77,14 +77,14 @@ def play_command(
       dualtaxi play k3v9m2xq --best
       dualtaxi play k3v9m2xq --episode 0 | less
     """
-    from runner.cli.episode import Episode
+    from runner.cli.episode import ShownEpisode
     from runner.export.values import Values
     from runner.recording.reader import open_recording
 
     run, terminal = find_recorded(run_name, recordings), console()
     with open_recording(run.recording) as recording, contextlib.ExitStack() as stack:
         at = chosen.resolved(recording)
-        played = Episode(recording, at, f"{run.title}: {at.title}")
+        played = ShownEpisode(recording, at, f"{run.title}: {at.title}")
         if as_json:
             for step in played.steps():
                 print_json(step, indent=None)

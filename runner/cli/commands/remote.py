@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli import error_as_json, exit_code_of
-from runner.cli.command import Group, argument, option, record
+from runner.cli.command import CommandGroup, argument, option, record
 from runner.cli.options import json_option, limit_option, recordings_option, workers_option
 from runner.cli.output import draw, facts, print_json, print_result, say, table
 from runner.cli.parameter_types import FILE, ConfigName, RunName
@@ -81,7 +81,7 @@ def server_options(
 _job_argument = argument(metavar="JOB", type=click.IntRange(1))
 
 
-@click.group("remote", cls=Group)
+@click.group("remote", cls=CommandGroup)
 def remote_command() -> None:
     """Upload and download runs, and submit and control jobs on a server (`dualtaxi serve`).
 

@@ -11,7 +11,7 @@ from runner.cli.command import Command, option
 from runner.cli.options import served_folders_option, workers_option
 from runner.cli.output import echo, say
 from runner.cli.parameter_types import FILE
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.util.extras import require
 from runner.util.files import storage_errors
 
@@ -74,7 +74,7 @@ def serve_command(
     from runner.service.jobs.store import LOCK_FILE, lock_folder
     from runner.service.server import bind, serve, url_of
 
-    settings = Settings(
+    settings = ServiceSettings(
         recordings=recordings,
         host=host,
         port=port,

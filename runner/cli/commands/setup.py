@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 from click.shell_completion import get_completion_class
 
-from runner.cli.command import Command, Group, argument
+from runner.cli.command import Command, CommandGroup, argument
 from runner.cli.options import config_argument, json_option, output_option, set_option
 from runner.cli.output import draw, echo, print_json, print_written, say, table
 from runner.cli.parameter_types import DIRECTORY, SHIPPED
@@ -42,7 +42,7 @@ def init_command(
     say(f"Next: {change}dualtaxi run configs/quick.yaml")
 
 
-@click.group("config", cls=Group)
+@click.group("config", cls=CommandGroup)
 def config_command() -> None:
     """List, copy and check configurations; print their schema.
 

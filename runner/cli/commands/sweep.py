@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.command import Group, argument, option
+from runner.cli.command import CommandGroup, argument, option
 from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from runner.sweep.trials import Trials
 
 
-@click.group("sweep", cls=Group)
+@click.group("sweep", cls=CommandGroup)
 def sweep_command() -> None:
     """Run an experiment with many values, and rank them.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import click
 
-from runner.cli.command import Group, argument, option
+from runner.cli.command import CommandGroup, argument, option
 from runner.cli.options import json_option
 from runner.cli.output import draw, echo, print_json, say, table
 from runner.service.settings import tokens_file
 
 
-@click.group("token", cls=Group)
+@click.group("token", cls=CommandGroup)
 def token_command() -> None:
     """Create, list and revoke access tokens.
 

@@ -85,7 +85,7 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Shape:
+class ChartShape:
     """A polygon if it is filled, else a line, through points [n, 2]."""
 
     points: Values
@@ -133,7 +133,7 @@ class Cells:
     fill: str
 
 
-Mark = Shape | Markers | Cells | Text
+Mark = ChartShape | Markers | Cells | Text
 
 
 @dataclass
@@ -150,8 +150,8 @@ class Canvas:
         self.marks.append(Text(x, y, text, anchor, **style))
 
     def shape(self, points: Sequence[Sequence[float]] | Values, **style: Any) -> None:
-        """Draw a line or a polygon; the style has the other fields of `Shape`."""
-        self.marks.append(Shape(np.asarray(points, np.float64), **style))
+        """Draw a line or a polygon; the style has the other fields of `ChartShape`."""
+        self.marks.append(ChartShape(np.asarray(points, np.float64), **style))
 
     def cells(self, rectangles: Values, fill: str) -> None:
         """Fill rectangles [n, 4]: x and y of the upper left corner, width and height."""
@@ -308,7 +308,7 @@ def _svg_of(mark: Mark, paints: dict[str, str]) -> str:
         "stroke": paints.get(mark.stroke, mark.stroke),
         "opacity": f"{mark.opacity:g}" if mark.opacity != 1 else "",
     }
-    if isinstance(mark, Shape):
+    if isinstance(mark, ChartShape):
         d = "M" + "L".join(f"{x:.1f},{y:.1f}" for x, y in mark.points.tolist()) + ("z" if mark.fill else "")
         attributes["stroke-width"] = f"{mark.width:g}" if mark.stroke and mark.width != 1 else ""
         attributes["stroke-dasharray"] = DASHES[mark.dash % len(DASHES)]

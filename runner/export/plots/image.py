@@ -8,7 +8,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 from runner.drawing import palette
 from runner.errors import RunnerError
-from runner.export.plots.chart import DASHES, MARKERS, Canvas, Cells, Mark, Shape, Text
+from runner.export.plots.chart import DASHES, MARKERS, Canvas, Cells, ChartShape, Mark, Text
 from runner.util.extras import require
 
 if TYPE_CHECKING:
@@ -86,11 +86,11 @@ def _add_to_figure(mpl: ModuleType, figure: Figure, mark: Mark, transform: Trans
             figure.add_artist(own)
         return
     style: dict[str, object] = {"alpha": mark.opacity, "transform": transform}
-    if isinstance(mark, Shape) and mark.fill:
+    if isinstance(mark, ChartShape) and mark.fill:
         edge = {"edgecolor": mark.stroke or "none", "linewidth": mark.width}
         figure.add_artist(mpl.patches.Polygon(mark.points, facecolor=mark.fill, **edge, **style))
         return
-    if isinstance(mark, Shape):
+    if isinstance(mark, ChartShape):
         dashes = [float(length) / mark.width for length in DASHES[mark.dash % len(DASHES)].split()]
         style |= {"color": mark.stroke, "linewidth": mark.width, "linestyle": (0, dashes) if dashes else "-"}
     else:

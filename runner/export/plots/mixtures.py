@@ -19,7 +19,7 @@ _ROW: Final = 20.0
 _MAX_NAME: Final = 38
 
 
-class Column(NamedTuple):
+class BarColumn(NamedTuple):
     """A mixture: the settings that are changed in it, and its values, one a seed."""
 
     changed: Collection[str]
@@ -49,7 +49,7 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
     return chart
 
 
-def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[Column]) -> Chart:
+def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn]) -> Chart:
     """Return each mixture as a column: its values and their mean, and below a dot for what is changed."""
     values = np.array([value for one in columns for value in one.values])
     bottom, last = 170.0, 184.0 + 16 * len(names)

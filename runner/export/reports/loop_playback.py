@@ -20,7 +20,7 @@ from runner.environments.naming import spoken
 from runner.errors import RecordingError, shortened
 from runner.export.reports.player_data import (
     Playback,
-    Series,
+    PlayerSeries,
     Words,
     frame_times,
     logged_near,
@@ -165,7 +165,7 @@ def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPa
 
 def _extras(
     recording: Recording, phase: str, steps: Ints, notes: list[str]
-) -> tuple[list[Words], list[Series]]:
+) -> tuple[list[Words], list[PlayerSeries]]:
     """Return the values that the loop recorded with these steps, each at the frame before its step.
 
     Texts and arrays of varying length are words, all others series of numbers.
@@ -187,7 +187,7 @@ def _extras(
             continue
         for own, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
             numbers = [None if value is None else short(value) for value in column.tolist()]
-            series.append(Series(agent, "extras", own, [*numbers, None]))
+            series.append(PlayerSeries(agent, "extras", own, [*numbers, None]))
     return texts, series
 
 
@@ -234,7 +234,7 @@ def _sizes(shape: tuple[int, ...]) -> str:
 
 def _frames(
     parts: Sequence[_ShownPart], observations: Sequence[Sequence[Column]]
-) -> tuple[list[Words], list[Series]]:
+) -> tuple[list[Words], list[PlayerSeries]]:
     """Return the texts and the numbers of T + 1 frames.
 
     The observations are columns of each part: at first those before the steps, none if unknown.
@@ -250,5 +250,5 @@ def _frames(
         numbers = np.concatenate(columns).astype(np.float64)
         for name, own in zip(part.names, numbers.T.tolist(), strict=True):
             values = [*([] if observations[0] else [None]), *map(short, own)]
-            series.append(Series(part.agent, "observation", name or "observation", values))
+            series.append(PlayerSeries(part.agent, "observation", name or "observation", values))
     return texts, series

@@ -33,7 +33,7 @@ _HALFWAY: Final = 0.05
 
 
 @dataclass(frozen=True)
-class Stage:
+class MapStage:
     """A moment of learning, and the tables then."""
 
     title: str
@@ -54,18 +54,18 @@ class MapRow:
     high: float
 
 
-def stages_of(recording: Recording) -> list[Stage]:
+def stages_of(recording: Recording) -> list[MapStage]:
     """Return the tables before, in the middle of and after learning; fewer where they are the same.
 
     The middle is the snapshot nearest to half of the episodes; without one between the first and the last,
     the steps up to there are replayed, if they were recorded. A loop's are those of its first table's name.
     """
-    by_step: dict[int, Stage] = {}
+    by_step: dict[int, MapStage] = {}
     name = ""
     for table in recording.snapshots() if recording.has_tables else recorded_tables(recording):
         if isinstance(table, Snapshot) and table.name != (name := name or table.name):
             continue
-        stage = by_step.setdefault(table.step, Stage("", table.episode, table.step, []))
+        stage = by_step.setdefault(table.step, MapStage("", table.episode, table.step, []))
         stage.tables.append(np.asarray(table.values, np.float64))
     whole = [stage for stage in by_step.values() if len(stage.tables) == len(recording.agents)]
     if not whole:
@@ -86,7 +86,7 @@ def stages_of(recording: Recording) -> list[Stage]:
     return list(unique.values())
 
 
-def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int) -> list[MapRow]:
+def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int) -> list[MapRow]:
     """Return the maps for the situation of a state; none without a scene or a mover."""
     drawing = drawing_of(mdp)
     if drawing is None or not stages:
@@ -114,16 +114,16 @@ def situation_in_words(mdp: Mdp, state: int, free: Sequence[int]) -> str:
     return ", ".join(word for i, word in enumerate(words) if i not in free)
 
 
-def _replayed(recording: Recording, episode: int) -> Stage | None:
+def _replayed(recording: Recording, episode: int) -> MapStage | None:
     try:
         step = step_of_episode(recording, episode)
-        return Stage("", episode, step, tables_at(recording, step))
+        return MapStage("", episode, step, tables_at(recording, step))
     except RecordingError:
         return None
 
 
 def _pair_row(
-    mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int, movers: list[int], learner: int
+    mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int, movers: list[int], learner: int
 ) -> MapRow:
     """Return the highest value for each pair of cells of two movers."""
     assert mdp.scene is not None
@@ -137,7 +137,9 @@ def _pair_row(
     return _row(title, explanation, mdp, stages, state, movers, learner)
 
 
-def _policy_row(mdp: Mdp, learners: Sequence[str], stages: Sequence[Stage], state: int, mover: int) -> MapRow:
+def _policy_row(
+    mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int, mover: int
+) -> MapRow:
     """Return the greedy action and the highest value of one mover in each cell."""
     assert mdp.scene is not None
     thing = mdp.scene["things"][mover]
@@ -153,7 +155,7 @@ def _row(
     title: str,
     explanation: str,
     mdp: Mdp,
-    stages: Sequence[Stage],
+    stages: Sequence[MapStage],
     state: int,
     movers: list[int],
     learner: int,

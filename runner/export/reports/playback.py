@@ -29,8 +29,8 @@ from runner.environments.naming import (
 from runner.errors import RecordingError
 from runner.export.reports.loop_playback import loop_playback
 from runner.export.reports.player_data import (
-    Grid,
     Playback,
+    PlayerGrid,
     Words,
     frame_times,
     logged_near,
@@ -105,7 +105,9 @@ def tabular_playback(
     distinct, state_of = np.unique(np.append(shown["state"], shown["next_state"][-1]), return_inverse=True)
     grid = None
     if drawing is not None:
-        grid = Grid(drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), state_of.tolist())
+        grid = PlayerGrid(
+            drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), state_of.tolist()
+        )
     states = [str(word) for word in states_in_words(mdp)[distinct]]
     named, actions = agent_actions_in_words(mdp), shown["action"].tolist()
     taken = [actions] * len(values)

@@ -46,7 +46,7 @@ class Words:
 
 
 @dataclass(frozen=True)
-class Series:
+class PlayerSeries:
     """A number at each frame."""
 
     agent: str
@@ -68,7 +68,7 @@ class Logged:
 
 
 @dataclass(frozen=True)
-class Grid:
+class PlayerGrid:
     """The places of the things of a scene."""
 
     places: list[list[int]]
@@ -101,7 +101,7 @@ class Playback:
     """Parts of states or observations that are texts, for each frame."""
     time: list[int]
     """The number of steps of the run before each frame, in training and evaluation together."""
-    series: list[Series] = field(default_factory=list)
+    series: list[PlayerSeries] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     """What is left out, a sentence each."""
     logged: list[Logged] = field(default_factory=list)
@@ -115,7 +115,7 @@ class Playback:
     """The names of the actions of each Q-table."""
     values: list[Json] = field(default_factory=list)
     """For each Q-table the highest values before each step, and that of the action taken."""
-    grid: Grid | None = None
+    grid: PlayerGrid | None = None
     trail: int = svg.TRAIL
     """The number of places that a trail joins."""
 

@@ -35,7 +35,7 @@ from runner.recording.run_file import RecentTraining, has_environment
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReportReplay:
     """The episodes that the page of a run replays."""
 
     titles: list[str]
@@ -77,7 +77,7 @@ class ReportedRun:
     provenance: Mapping[str, str]
     notes: list[str]
     maps: list[MapRow]
-    replay: Replay | None
+    replay: ReportReplay | None
     has_tables: bool
 
 
@@ -136,7 +136,7 @@ def _run(
     environment = recording.environment
     episodes = _episodes(recording, chosen)
     replay = _replay(recording, episodes, progress)
-    drawing = None if environment["scene"] is None else svg.Drawing(environment["scene"])
+    drawing = None if environment["scene"] is None else svg.SvgDrawing(environment["scene"])
     return ReportedRun(
         number=number,
         id=recording.run_id,
@@ -250,7 +250,7 @@ def _maps(recording: Recording, episode: EpisodeRef | None) -> list[MapRow]:
 
 def _replay(
     recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Callable[[str], None]
-) -> Replay | None:
+) -> ReportReplay | None:
     """Return what the page replays; None if no episode can be."""
     shown = []
     for at, names in episodes.items():
@@ -263,7 +263,7 @@ def _replay(
         return None
     picture, key, first, scene = "", "", shown[0][1], recording.environment["scene"]
     if first.grid is not None and scene is not None:
-        drawing = svg.Drawing(scene)
+        drawing = svg.SvgDrawing(scene)
         places = np.array(first.grid.places, np.int16)[first.grid.at[:1]].reshape(1, -1, 3)
         picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
         key = drawing.key()
@@ -276,7 +276,7 @@ def _replay(
             own.picture_note = own.picture_note or picture_note(recording, at.phase)[1]
         has_frames = has_frames or bool(own.pictures)
         data.append(asdict(episode) | asdict(own))
-    return Replay([episode.title for _, episode in shown], picture, key, embedded(data), has_frames)
+    return ReportReplay([episode.title for _, episode in shown], picture, key, embedded(data), has_frames)
 
 
 def _title(runs: Sequence[ReportedRun]) -> str:

@@ -20,7 +20,7 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.scene import Scene
-from runner.export.rerun.tracks import Column, Floats, Points, Track
+from runner.export.rerun.tracks import ComponentColumn, Floats, Points, Track
 from runner.util.arrays import Ints, Records
 
 MAX_REWARDS: Final = 2_000
@@ -36,7 +36,7 @@ MOVER_LABEL_Y: Final = -0.5
 PASSENGER_LABEL_Y: Final = 0.12
 
 
-class Labels:
+class GridLabels:
     """Texts and colours, numbered, and the numbers and points of what is written at each step.
 
     `value_range` is the lowest and the highest value of the tables.
@@ -103,7 +103,9 @@ class Labels:
         # As Arrow, because Rerun is slow to convert thousands of labels.
         empty: Any = rr.AnnotationContext([]).context
         context = pa.array([classes], empty.as_arrow_array().type)
-        return Track(f"{root}/", static=[[Column(rr.AnnotationContext.descriptor_context(), context)]])
+        return Track(
+            f"{root}/", static=[[ComponentColumn(rr.AnnotationContext.descriptor_context(), context)]]
+        )
 
     @cached_property
     def points(self) -> Points:

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from runner.export.rerun.selection import MAX_MEMBERS
-from runner.export.rerun.tracks import View, Writer
+from runner.export.rerun.tracks import TrackView, Writer
 from runner.recording import schema
 from runner.recording.metrics import METRICS
 
@@ -122,7 +122,7 @@ def _group(run: Writer, *groups: str) -> list[rrb.View]:
 
 
 def _drawn(
-    view: View, origin: str, entities: Iterable[str], last: int, focus: tuple[int, int] | None = None
+    view: TrackView, origin: str, entities: Iterable[str], last: int, focus: tuple[int, int] | None = None
 ) -> rrb.View:
     """Return a view; lines over the whole run, or over the focus."""
     options = dict(view.options)

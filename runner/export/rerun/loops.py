@@ -28,7 +28,7 @@ from runner.export.rerun.tracks import (
     Row,
     Times,
     Track,
-    View,
+    TrackView,
     Writer,
     grouped,
     rows_of,
@@ -49,7 +49,7 @@ MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
 FRAMES_SENT: Final = 64
 """Pictures sent at once."""
-LOG: Final = View("log", "Log", rrb.TextLogView)
+LOG: Final = TrackView("log", "Log", rrb.TextLogView)
 _NAMED: Final = {"picture": ("pictures", rrb.Spatial2DView), "array": ("array", rrb.TensorView)}
 """Entities of what is logged by name: the group and the kind of their views."""
 OBSERVED: Final = {"observation": observed, "action": acted}
@@ -109,7 +109,7 @@ class LoopTracks:
                 own = rows[names == name]
                 times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
                 values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
-                yield Track(f"{self._root}/logged/{name}", times, values, style, View("logged", view))
+                yield Track(f"{self._root}/logged/{name}", times, values, style, TrackView("logged", view))
         texts = (
             ("log", (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")))
             for text in recording.table(schema.LOG_TOPIC).decoded()
@@ -124,7 +124,9 @@ class LoopTracks:
         """Return a track of what was logged once under a name, in a view of its own."""
         group, kind = _NAMED[folder]
         name = entity_name(name)
-        return rows_of(f"{self._root}/{folder}/{name}", [(_step(log_time), shown)], View(group, name, kind))
+        return rows_of(
+            f"{self._root}/{folder}/{name}", [(_step(log_time), shown)], TrackView(group, name, kind)
+        )
 
     def _episodes(self, phase: str) -> Iterator[Track]:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
@@ -179,7 +181,7 @@ class LoopTracks:
             yield self._line(phase, member, quantity, times, numbers, names)
         elif is_given.any():
             bars = zip(times["step"][is_given].tolist(), map(rr.BarChart, numbers[is_given]), strict=True)
-            view = View("bars", f"{member.name} {name}".strip(), rrb.BarChartView)
+            view = TrackView("bars", f"{member.name} {name}".strip(), rrb.BarChartView)
             yield rows_of(self._entity(phase, member.name, quantity), list(bars), view)
 
     def _objects(self, phase: str, member: Member, name: str, values: Array, steps: Array) -> Iterator[Track]:
@@ -187,14 +189,14 @@ class LoopTracks:
         entity = self._entity(phase, member.name, f"extra/{entity_name(name)}")
         title, placed = f"{member.name} {name}".strip(), [*zip(steps.tolist(), values.tolist(), strict=True)]
         if texts := [(step, rr.TextDocument(text)) for step, text in placed if isinstance(text, str)]:
-            yield rows_of(entity, texts, View("texts", title, rrb.TextDocumentView))
+            yield rows_of(entity, texts, TrackView("texts", title, rrb.TextDocumentView))
         bars = [
             (step, rr.BarChart(array.ravel().astype(np.float64)))
             for step, array in placed
             if not isinstance(array, str) and array.size
         ]
         if bars:
-            yield rows_of(entity, bars, View("bars", title, rrb.BarChartView))
+            yield rows_of(entity, bars, TrackView("bars", title, rrb.BarChartView))
 
     def _line(
         self,
@@ -229,7 +231,7 @@ class LoopTracks:
             title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
         if member.name and len(names) > 1:
             tab, title = title.capitalize(), f"{member.name} {title}"
-        view = View(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
+        view = TrackView(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
         return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
     def _recorded_frames(self, phase: str) -> Iterator[tuple[int, Row]]:
@@ -253,7 +255,9 @@ class LoopTracks:
         recording = self._recording
         sources = {number: pictures.source_of(recording, phase, self._trust, number) for number in episodes}
         notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
-        chosen = [number for number, (source, _) in sources.items() if source is pictures.Source.REDRAWN]
+        chosen = [
+            number for number, (source, _) in sources.items() if source is pictures.PictureSource.REDRAWN
+        ]
         number, times, environment, rows = 0, [0], 0, []
         try:
             for number, t, pixels in redrawn(recording, phase, chosen, self._trust) if chosen else ():
@@ -290,7 +294,7 @@ class LoopTracks:
 
     def _frames(self, phase: str, environment: int, rows: Sequence[Row]) -> Track:
         parts = [phase, *filter(None, [self._environments[environment]]), "frame"]
-        return rows_of(self._entity(*parts), rows, View(phase, " ".join(parts), rrb.Spatial2DView))
+        return rows_of(self._entity(*parts), rows, TrackView(phase, " ".join(parts), rrb.Spatial2DView))
 
     def _entity(self, *parts: str) -> str:
         return "/".join([self._root, *filter(None, parts)])

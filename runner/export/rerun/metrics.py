@@ -14,7 +14,7 @@ import rerun.blueprint as rrb
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.tracks import Colour, Floats, Source, Times, Track, View, scalars, times_of
+from runner.export.rerun.tracks import Colour, Floats, Times, Track, TrackSource, TrackView, scalars, times_of
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
@@ -22,7 +22,7 @@ from runner.recording.reader import Recording
 from runner.util.arrays import Array
 
 SCHEDULES: Final = ("epsilon", "step_size", "discount")
-EVENTS: Final = View(
+EVENTS: Final = TrackView(
     "events",
     "Events",
     rrb.TextLogView,
@@ -35,7 +35,7 @@ Lines = tuple[str, Times, Array, Sequence[str]]
 """The path of an entity, its times, the values of its lines, [rows, lines], and their names."""
 
 
-def metric_tracks(source: Source) -> Iterator[Track]:
+def metric_tracks(source: TrackSource) -> Iterator[Track]:
     """Yield the tracks of all metrics of a job."""
     recording, evaluations = source.recording, source.recording.eval.all_metrics()
     reports = sorted([*recording.train.all_metrics(), *evaluations], key=lambda row: int(row["log_time"]))
@@ -57,7 +57,7 @@ def metric_tracks(source: Source) -> Iterator[Track]:
         label = f"{recording.run_id} " if source.tint else ""
         static = [series_lines([label + name for name in names], colours, width)]
         options = {"plot_legend": rrb.PlotLegend(visible=True)}
-        views = [View("plots", title, options=options) for title, paths in PLOTS if path in paths]
+        views = [TrackView("plots", title, options=options) for title, paths in PLOTS if path in paths]
         yield Track(f"{source.root}/{path}", times, scalars(values), static, *views)
     if evaluations:
         lines = [

@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
-from runner.export.rerun.labels import Labels
+from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.metrics import series_lines
 from runner.export.rerun.scene import Scene, crossing_lines
 from runner.export.rerun.steps import Batch
@@ -25,7 +25,7 @@ from runner.export.rerun.tracks import (
     GREY,
     Floats,
     Track,
-    View,
+    TrackView,
     agent_colours,
     columns,
     grey_text,
@@ -132,7 +132,7 @@ class ValueReader:
 class ValueTracks:
     """Makes the table of values of one phase: its numbers as text are rounded, its scalars exact."""
 
-    def __init__(self, root: str, phase: str, labels: Labels) -> None:
+    def __init__(self, root: str, phase: str, labels: GridLabels) -> None:
         self._entity, self._labels, mdp = f"{root}/{phase}/q", labels, labels.mdp
         agents, self._own_actions = len(mdp.agents), mdp.own_actions
         self._agent = np.repeat(np.arange(agents), mdp.action_counts)
@@ -156,7 +156,7 @@ class ValueTracks:
         points = np.stack((xs, np.array(ys) - LABEL_RISE), axis=1)
         bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, float(y[-1]) + 0.9))
         name = "Q-values of this state, before the move"
-        view = View("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
+        view = TrackView("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
         words_style = rr.Points2D(points, labels=texts, colors=tints, radii=0.0, show_labels=True)
         style = [
             rr.LineStrips2D.from_fields(colors=agent_colours(self._agent.tolist()), radii=0.22),
@@ -198,7 +198,7 @@ class ValueTracks:
 class MapTracks:
     """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
-    def __init__(self, root: str, phase: str, labels: Labels, learner: int) -> None:
+    def __init__(self, root: str, phase: str, labels: GridLabels, learner: int) -> None:
         scene, mdp, name = labels.scene, labels.mdp, labels.learners[learner]
         assert scene is not None
         assert scene.placements is not None
@@ -243,7 +243,7 @@ class MapTracks:
         }
         bounds = rrb.VisualBounds2D(x_range=(-0.5, width + 0.5), y_range=(-3.2, height + 0.5))
         title = f"{spoken(name)}: max Q, greedy moves"
-        view = View("values", title, rrb.Spatial2DView, {"visual_bounds": bounds})
+        view = TrackView("values", title, rrb.Spatial2DView, {"visual_bounds": bounds})
         self.still = [Track(entity, static=[static], view=view) for entity, static in parts.items()]
         """What never changes; the frame for both phases and all learners."""
 

@@ -10,7 +10,7 @@ import numpy as np
 import rerun as rr
 
 from runner.environments.naming import spoken
-from runner.export.rerun.labels import Labels
+from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.loops import LoopTracks
 from runner.export.rerun.metrics import EVENTS, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
@@ -49,7 +49,7 @@ class RunReader:
         if not (selection.steps and (scene or self._is_job)):
             return
         bounds = [0.0, *(b for q in recording.snapshots() for b in (q.values.min(), q.values.max()))]
-        labels = self._labels = Labels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
+        labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
         for phase, spans in selection.by_phase.items():
             if spans:
                 self._steps[phase] = StepTracks(root, phase, source.title, labels)

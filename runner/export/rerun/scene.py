@@ -17,7 +17,7 @@ from runner.drawing.svg import VEHICLES, wall_ends
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names
 from runner.environments.scene import SceneDescription
-from runner.export.rerun.tracks import GREY, Track, View, pairs
+from runner.export.rerun.tracks import GREY, Track, TrackView, pairs
 from runner.util.arrays import Ints
 
 _SPACING: Final = 0.34
@@ -26,7 +26,7 @@ _BLOCKED_ARROW: Final = 0.34
 """Length of the arrow of a move that led nowhere."""
 
 
-class Shape(NamedTuple):
+class SceneShape(NamedTuple):
     """A box filled by its thick, rounded line; lengths are in cells."""
 
     offset: tuple[float, float]
@@ -37,15 +37,15 @@ class Shape(NamedTuple):
 
 
 CAR: Final = (
-    Shape((-0.02, -0.1), (0.07, 0.025), 0.05),
-    Shape((0.0, 0.02), (0.15, 0.025), 0.055),
-    Shape((-0.1, 0.1), (0.01, 0.01), 0.04, palette.MIDTONE),
-    Shape((0.1, 0.1), (0.01, 0.01), 0.04, palette.MIDTONE),
+    SceneShape((-0.02, -0.1), (0.07, 0.025), 0.05),
+    SceneShape((0.0, 0.02), (0.15, 0.025), 0.055),
+    SceneShape((-0.1, 0.1), (0.01, 0.01), 0.04, palette.MIDTONE),
+    SceneShape((0.1, 0.1), (0.01, 0.01), 0.04, palette.MIDTONE),
 )
-PAWN: Final = (Shape((0.0, -0.12), (0.02, 0.02), 0.07), Shape((0.0, 0.05), (0.05, 0.05), 0.06))
+PAWN: Final = (SceneShape((0.0, -0.12), (0.02, 0.02), 0.07), SceneShape((0.0, 0.05), (0.05, 0.05), 0.06))
 PERSON: Final = (
-    Shape((0.0, -0.09), (0.01, 0.01), 0.04, palette.PASSENGER),
-    Shape((0.0, 0.03), (0.02, 0.03), 0.045, palette.PASSENGER),
+    SceneShape((0.0, -0.09), (0.01, 0.01), 0.04, palette.PASSENGER),
+    SceneShape((0.0, 0.03), (0.02, 0.03), 0.045, palette.PASSENGER),
 )
 
 
@@ -71,7 +71,7 @@ class Scene:
         self.mover_points = np.ascontiguousarray(centres[:, self.movers] + offsets)
         """[S, movers, 2]: where each mover is drawn."""
         passengers = centres[:, self.passengers] + np.array([0.2, 0.26], np.float32)
-        shapes: list[tuple[int, Shape]] = []
+        shapes: list[tuple[int, SceneShape]] = []
         for i, mover in enumerate(self.movers):
             rides = carriers[:, self.passengers, None] == mover
             passengers = np.where(rides, self.mover_points[:, i : i + 1], passengers)
@@ -158,7 +158,7 @@ class Placements:
         return pixels.reshape(rows, rows, columns, columns).transpose(1, 0, 3, 2).reshape(-1)
 
 
-def background(root: str, scene: Scene, view: View) -> Iterator[Track]:
+def background(root: str, scene: Scene, view: TrackView) -> Iterator[Track]:
     """Yield cells, walls and landmarks."""
     rows, columns = scene.rows, scene.columns
     lines = crossing_lines(range(rows + 1), range(columns + 1))

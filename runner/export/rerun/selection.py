@@ -54,7 +54,7 @@ class Request:
 
 
 @dataclass(frozen=True, eq=False)
-class Episodes:
+class SelectedEpisodes:
     """The steps of each episode of a phase; the last episode may not have ended."""
 
     start: Ints
@@ -156,14 +156,14 @@ def select(recording: Recording, request: Request) -> Selection:
     return selection
 
 
-def episodes_of(recording: Recording, phase: str) -> Episodes:
+def episodes_of(recording: Recording, phase: str) -> SelectedEpisodes:
     """Return the episodes of a phase that have steps."""
     own, n = recording.phase(phase), recording.environments
     total, records = own.steps.count() if own.steps else 0, own.episodes.array()
     begin, last = (records[name].astype(np.int64) for name in ("first_step", "last_step"))
     if n > 1:  # from the beginning of a round to the end of one
         place = records["environment"].astype(np.int64)
-        return Episodes(begin - place, last - place + n, len(records))
+        return SelectedEpisodes(begin - place, last - place + n, len(records))
     first = np.full(own.episodes.count() + 1, -1, np.int64)
     first[0], number = 0, records["episode"].astype(np.int64)
     is_counted = number < len(first) - 1
@@ -174,10 +174,12 @@ def episodes_of(recording: Recording, phase: str) -> Episodes:
     first = first[first <= total]
     ended = len(first) - 1
     first = np.append(first, total) if total > first[-1] else first
-    return Episodes(first[:-1], first[1:], ended)
+    return SelectedEpisodes(first[:-1], first[1:], ended)
 
 
-def evaluations_with_steps(recording: Recording, train: Episodes, evals: Episodes) -> list[Evaluation]:
+def evaluations_with_steps(
+    recording: Recording, train: SelectedEpisodes, evals: SelectedEpisodes
+) -> list[Evaluation]:
     """Return the evaluations that have steps; of a job including an incomplete one."""
     if not recording.eval.has_metrics:
         return evaluations_of(recording)

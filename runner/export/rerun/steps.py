@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from runner.drawing import palette
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import events_in_words, states_in_words
-from runner.export.rerun.labels import Labels
+from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.metrics import phase_colours, series_lines
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.tracks import (
@@ -26,7 +26,7 @@ from runner.export.rerun.tracks import (
     Points,
     Times,
     Track,
-    View,
+    TrackView,
     agent_colours,
     columns,
     grey_text,
@@ -74,7 +74,7 @@ class Batch(NamedTuple):
 class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
 
-    def __init__(self, root: str, phase: str, title: str, labels: Labels) -> None:
+    def __init__(self, root: str, phase: str, title: str, labels: GridLabels) -> None:
         path = self.path = f"{root}/{phase}"
         self._phase, self._labels = phase, labels
         self._states = states_in_words(labels.mdp)
@@ -99,7 +99,7 @@ class StepTracks:
             goal = palette.rgb(palette.GOAL)
             parts["grid/goal"] = [rr.Boxes2D.from_fields(colors=[goal], radii=0.04, show_labels=True)]
         else:
-            view = View("grid", f"{title}: state and action", has_focus=True)
+            view = TrackView("grid", f"{title}: state and action", has_focus=True)
             for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
                 parts[name] = [series_lines([f"{name} ({phase})"], [colour])]
         self.still = [Track(f"{path}/{part}", static=static, view=view) for part, static in parts.items()]
@@ -208,10 +208,10 @@ def _entry(mdp: Mdp, mask: int, ending: int) -> tuple[str, str]:
     return ", ".join(filter(None, (text, end))), "WARN" if is_bad else "INFO"
 
 
-def grid_view(title: str, scene: Scene) -> View:
+def grid_view(title: str, scene: Scene) -> TrackView:
     """Return the view of the grid."""
     bounds = rrb.VisualBounds2D(
         x_range=(-GRID_MARGIN, scene.columns + GRID_MARGIN),
         y_range=(-GRID_MARGIN - 0.1, scene.rows + GRID_MARGIN + 0.1),
     )
-    return View("grid", title, rrb.Spatial2DView, {"visual_bounds": bounds})
+    return TrackView("grid", title, rrb.Spatial2DView, {"visual_bounds": bounds})

@@ -38,7 +38,7 @@ Times = dict[str, Array]
 """[n] numbers by timeline."""
 
 
-class View(NamedTuple):
+class TrackView(NamedTuple):
     """A view of the viewer, of all tracks that name it."""
 
     group: str
@@ -59,11 +59,11 @@ class Track:
     columns: Iterable[Any] = ()
     """Components of as many rows as there are times."""
     static: Sequence[Any] = ()
-    view: View | None = None
+    view: TrackView | None = None
 
 
 @dataclass(frozen=True)
-class Source:
+class TrackSource:
     """A run to export."""
 
     recording: Recording
@@ -79,13 +79,13 @@ class Writer:
     """Sends the tracks of a run to a stream, and keeps which views they have."""
 
     stream: rr.RecordingStream
-    source: Source
+    source: TrackSource
     focus: tuple[int, int] | None = None
     """First and last step shown in views that have a focus; None for the whole run."""
     last: int = 0
     """The last step of the run, or else of its lines that were sent."""
     entities: set[str] = field(default_factory=set)
-    views: dict[tuple[str, str], tuple[View, dict[str, None]]] = field(default_factory=dict)
+    views: dict[tuple[str, str], tuple[TrackView, dict[str, None]]] = field(default_factory=dict)
     """By group and name, each with its entities."""
     _queued: int = 0
 
@@ -110,7 +110,7 @@ class Writer:
                     self._queued = 0
 
 
-class Column(NamedTuple):
+class ComponentColumn(NamedTuple):
     """An Arrow array with the interface of Rerun's `ComponentColumn`, which would copy it."""
 
     descriptor: rr.ComponentDescriptor
@@ -139,7 +139,7 @@ def times_of(log_time: ArrayLike, **timelines: Array) -> Times:
     return {"step": steps, **{name: each.astype(np.int64) for name, each in timelines.items()}}
 
 
-def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> list[Column]:
+def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> list[ComponentColumn]:
     """Return the columns of n rows of a class such as `rerun.Points2D`, without one object per row.
 
     The parts are, by component, text or numbers [n, instances], points [n, instances, 2], line strips
@@ -158,23 +158,23 @@ def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> l
         if flat.ndim == 3 or flat.dtype == np.uint8:
             kind = _BLOB if flat.dtype == np.uint8 else _STRIP
             items = _listed(np.full(len(flat), flat.shape[1]), items, kind)
-        made.append(Column(getattr(archetype, f"descriptor_{name}")(), _listed(counts, items)))
+        made.append(ComponentColumn(getattr(archetype, f"descriptor_{name}")(), _listed(counts, items)))
     return made
 
 
-def scalars(values: Array) -> list[Column]:
+def scalars(values: Array) -> list[ComponentColumn]:
     """Return the column of series, [n, series]."""
     return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
 
 
-def rows_of(entity: str, rows: Sequence[Row], view: View | None = None) -> Track:
+def rows_of(entity: str, rows: Sequence[Row], view: TrackView | None = None) -> Track:
     """Return a track of one archetype a row, given with its step; all have the same components."""
     parts = zip(*(archetype.as_component_batches() for _, archetype in rows), strict=True)
     made = []
     for batches in parts:
         items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
         array = _listed(np.ones(len(rows), np.int64), items)
-        made.append(Column(batches[0].component_descriptor(), array))
+        made.append(ComponentColumn(batches[0].component_descriptor(), array))
     return Track(entity, {"step": np.array([step for step, _ in rows])}, made, view=view)
 
 

@@ -81,7 +81,7 @@ def check_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-class Viewer:
+class RerunViewer:
     """A viewer that listens on a port of loopback, and writes to a log.
 
     The options are more arguments of its command line.
@@ -149,10 +149,10 @@ class Viewer:
 
 
 @contextlib.contextmanager
-def viewer(port: int, *options: str) -> Iterator[Viewer]:
+def viewer(port: int, *options: str) -> Iterator[RerunViewer]:
     """Start a viewer that ends with the block."""
     with tempfile.TemporaryDirectory() as folder:
-        started = Viewer(Path(folder) / "viewer.log", port, *options)
+        started = RerunViewer(Path(folder) / "viewer.log", port, *options)
         try:
             yield started
         finally:
@@ -196,7 +196,7 @@ def open_window(path: Path, step: int, port: int) -> None:
 
 
 @contextlib.contextmanager
-def web_viewer(port: int, path: Path | None = None) -> Iterator[tuple[Viewer, str]]:
+def web_viewer(port: int, path: Path | None = None) -> Iterator[tuple[RerunViewer, str]]:
     """Serve the web viewer on loopback, and a file; yield the viewer and the address to open."""
     data = free_port()
     files = [str(path.resolve())] if path else []

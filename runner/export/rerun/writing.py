@@ -14,14 +14,17 @@ from runner.drawing import palette
 from runner.export.rerun.layout import blueprint
 from runner.export.rerun.runs import RunReader
 from runner.export.rerun.selection import Request, Selection, select
-from runner.export.rerun.tracks import Source, Writer, new_stream
+from runner.export.rerun.tracks import TrackSource, Writer, new_stream
 from runner.recording.reader import Recording
 from runner.runs.run import Run
 from runner.util.files import replacing, storage_errors
 
 
 def export(
-    sources: Sequence[Source], request: Request, path: Path, stage: Callable[[str], None] = lambda _: None
+    sources: Sequence[TrackSource],
+    request: Request,
+    path: Path,
+    stage: Callable[[str], None] = lambda _: None,
 ) -> list[Selection]:
     """Write runs to an `.rrd` file; return the selection of each. `stage` is called with what takes long."""
     selections = [select(source.recording, request) for source in sources]
@@ -56,7 +59,7 @@ def export_runs(
     colours = itertools.cycle(palette.COMPARED)
     sources = []
     for run, recording in zip(runs, recordings, strict=True):
-        source = Source(recording, f"{run.title} ({run.run_id})")
+        source = TrackSource(recording, f"{run.title} ({run.run_id})")
         if len(runs) > 1:
             source = dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
         sources.append(source)

@@ -19,7 +19,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.computed import Curves
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.util.values import finite
 
 router = APIRouter(
@@ -47,7 +47,7 @@ def explanation(pair: Part, metric: Part, settings: SettingsOf) -> dict[str, obj
     return values
 
 
-def found_explanation(pair: str, metric: str, settings: Settings) -> Explanation:
+def found_explanation(pair: str, metric: str, settings: ServiceSettings) -> Explanation:
     """Return an explanation in the recordings folders.
 
     Raises:

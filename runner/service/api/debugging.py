@@ -12,7 +12,7 @@ from runner.analysis.episodes import EXPECTED
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
 from runner.debugging.what_if import what_if_in
 from runner.service import computed, fragments
-from runner.service.api.replay import STEPS, Part, Start, Steps
+from runner.service.api.replay import STEPS, ReplayPart, Start, Steps
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.problems import RUN_ERRORS, error_docs
 
@@ -26,7 +26,7 @@ At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:30
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 
 
-class WhatIf(BaseModel):
+class WhatIfAnswer(BaseModel):
     """The actions at a step, and where each leads."""
 
     run_id: str
@@ -48,7 +48,7 @@ class WhatIf(BaseModel):
     notes: list[str]
 
 
-@router.get("/what-if/{at}", response_model=WhatIf, summary="Where each joint action at a step leads.")
+@router.get("/what-if/{at}", response_model=WhatIfAnswer, summary="Where each joint action at a step leads.")
 async def what_if(
     run: RecordedRun,
     compute: ComputationOf,
@@ -67,7 +67,9 @@ async def what_if(
 
 
 @router.get(
-    "/what-if/{at}/{action}", response_model=Part, summary="A part of the episode to which an action leads."
+    "/what-if/{at}/{action}",
+    response_model=ReplayPart,
+    summary="A part of the episode to which an action leads.",
 )
 async def branch(
     run: RecordedRun,

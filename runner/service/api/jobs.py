@@ -19,7 +19,7 @@ from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused
 from runner.service.jobs.checking import DEFAULT_SOURCE
 from runner.service.jobs.queue import JobQueue, QueueStatus
-from runner.service.jobs.store import CheckedJob, Job, Kind, State
+from runner.service.jobs.store import CheckedJob, Kind, QueuedJob, State
 from runner.service.problems import error_docs, media_docs
 
 POLL_SECONDS: Final = 0.25
@@ -287,13 +287,13 @@ def _as_text(event: JobEvent) -> str:
     return f"{head}event: {event.kind}\ndata: {json.dumps(event.as_json(), ensure_ascii=False)}\n\n"
 
 
-def created(job: Job, request: Request, response: Response) -> JobResponse:
+def created(job: QueuedJob, request: Request, response: Response) -> JobResponse:
     """Return the response about a new job, with its address in the header `location`."""
     response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
     return job_response(job)
 
 
-def job_response(job: Job) -> JobResponse:
+def job_response(job: QueuedJob) -> JobResponse:
     """Return the response about a job."""
     begun = [{"seed": seed, "run_id": run_id} for seed, run_id in job.started_runs.items()]
     progress = job.progress if job.state == "running" else None

@@ -15,7 +15,7 @@ from runner.service.errors import Refused
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
-from runner.service.jobs.store import CheckedJob, Job
+from runner.service.jobs.store import CheckedJob, QueuedJob
 from runner.service.problems import RUN_ERRORS
 
 router = APIRouter(tags=["jobs"], responses=RUN_ERRORS)
@@ -47,14 +47,14 @@ async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, respons
     return created(job, request, response)
 
 
-async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Job:
+async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> QueuedJob:
     """Check an explanation, and queue it."""
     what = f"{question.a} and {question.b}"
     checked = await jobs.checker.call(what, check_explanation, question, jobs.recordings)
     return await _queue(jobs, checked, question.workers)
 
 
-async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Job:
+async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> QueuedJob:
     """Check a branch of training, and queue it."""
     if run.folder.resolve().parent != jobs.recordings.resolve():  # where jobs would not find it
         raise Refused(
@@ -64,5 +64,5 @@ async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Jo
     return await _queue(jobs, await jobs.checker.call(f"run {run.run_id}", check_branch, run, question))
 
 
-async def _queue(jobs: JobQueue, checked: CheckedJob, workers: int | None = None) -> Job:
+async def _queue(jobs: JobQueue, checked: CheckedJob, workers: int | None = None) -> QueuedJob:
     return await run_in_threadpool(jobs.add, write_yaml(checked.values), checked, workers)

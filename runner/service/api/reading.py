@@ -83,7 +83,7 @@ class Histograms(BaseModel):
     """What is left out, a sentence each."""
 
 
-class Records(BaseModel):
+class RecordsPage(BaseModel):
     """Some records of a run, one object each."""
 
     run_id: str
@@ -139,7 +139,7 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
     @router.get(
         f"/{kind}",
         name=kind,
-        response_model=Records,
+        response_model=RecordsPage,
         responses=BUSY_ERRORS,
         summary=summary,
         description=description,

@@ -51,7 +51,7 @@ Steps = Annotated[int, Query(ge=1, le=MAX_STEPS, description="Maximum number of 
 Pictures = Annotated[int, Query(ge=1, le=1000, description="Maximum number of pictures.")]
 
 
-class Part(BaseModel):
+class ReplayPart(BaseModel):
     """A part of an episode, and the scene of its environment if it has one."""
 
     episode: Playback
@@ -63,7 +63,7 @@ class Part(BaseModel):
 
 
 def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: str) -> None:
-    @router.get(path, name=kind, response_model=Part, summary=f"A part of a {kind}, to be replayed.")
+    @router.get(path, name=kind, response_model=ReplayPart, summary=f"A part of a {kind}, to be replayed.")
     async def part(
         run: RecordedRun,
         compute: ComputationOf,

@@ -21,7 +21,7 @@ from runner.service.computed import as_json
 from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.util.values import Json
 
 router = APIRouter(tags=["runs"])
@@ -123,7 +123,7 @@ def one_run(run: FoundRun, settings: SettingsOf) -> Response:
     return Response(as_json(summary_of(run, settings)), media_type="application/json")
 
 
-def summary_of(run: Run, settings: Settings) -> dict[str, object]:
+def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
     """Return everything about a run except its series; only `run.json` if its recording cannot be read."""
     problems: list[str] = []
     error = run.summary.error

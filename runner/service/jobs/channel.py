@@ -14,7 +14,7 @@ from runner.client.jobs import EventData
 from runner.errors import RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run
-from runner.service.jobs.store import Job, read_values
+from runner.service.jobs.store import QueuedJob, read_values
 
 T = TypeVar("T")
 REPORT_SECONDS: Final = 0.25
@@ -27,7 +27,7 @@ class JobSpec:
     """A job, its folder, and where to do it."""
 
     folder: Path
-    job: Job
+    job: QueuedJob
     ray: str | None = None
     """The address of the Ray cluster that this process belongs to; None if it belongs to none."""
 

@@ -11,7 +11,7 @@ from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
 from runner.service.jobs.checking import JobChecker
-from runner.service.jobs.store import WITHOUT_RUNS, CheckedJob, Job, JobStore, now
+from runner.service.jobs.store import WITHOUT_RUNS, CheckedJob, JobStore, QueuedJob, now
 from runner.service.jobs.workers import WorkerPool
 from runner.util.humanize import size
 
@@ -57,7 +57,7 @@ class JobQueue:
         self.checker.close()
         self.store.close()
 
-    def add(self, text: str, checked: CheckedJob, workers: int | None = None) -> Job:
+    def add(self, text: str, checked: CheckedJob, workers: int | None = None) -> QueuedJob:
         """Queue a text that was checked.
 
         `workers` are what it asks for, by default all for a sweep or an explanation. A job gets no more than
@@ -82,7 +82,7 @@ class JobQueue:
                 self.store.report(job.number, LogEvent(line))
             return job
 
-    def cancel(self, number: int) -> Job:
+    def cancel(self, number: int) -> QueuedJob:
         """Cancel a job; its worker closes its recording, which stays.
 
         Raises:
@@ -94,7 +94,7 @@ class JobQueue:
                 raise JobStateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
             return self.store.update(number, state="cancelled", ended=now())
 
-    def resume(self, number: int, accept_changes: bool = False) -> Job:
+    def resume(self, number: int, accept_changes: bool = False) -> QueuedJob:
         """Queue a failed or cancelled job again; it continues where it stopped.
 
         Runs that other code started are resumed only if the changes are accepted.

@@ -67,7 +67,7 @@ class CheckedJob:
 
 
 @dataclass(frozen=True)
-class Job:
+class QueuedJob:
     """A submitted job and its state. Times are in UTC, as ISO 8601; empty if they have not come."""
 
     number: int
@@ -108,7 +108,7 @@ class Job:
         return dict(sorted(islice(self.run_ids.items(), self.begun)))
 
 
-_STORED: Final = TypeAdapter(Job)
+_STORED: Final = TypeAdapter(QueuedJob)
 
 
 class JobStore:
@@ -125,7 +125,7 @@ class JobStore:
         self.lock = threading.RLock()
         """Held by methods that change jobs, and by callers over several calls that belong together; not by
         methods that read, as no other thread changes a job or a dictionary of jobs meanwhile."""
-        self._jobs: dict[int, Job] = {}
+        self._jobs: dict[int, QueuedJob] = {}
         self._log_sizes: dict[int, int] = {}
         self._file_lock = lock_folder(recordings, LOCK_FILE)
         try:
@@ -141,11 +141,11 @@ class JobStore:
         """Release the folder for other processes."""
         self._file_lock.release()
 
-    def jobs(self) -> list[Job]:
+    def jobs(self) -> list[QueuedJob]:
         """Return all jobs, in the order of submission."""
         return list(self._jobs.values())
 
-    def job(self, number: int) -> Job:
+    def job(self, number: int) -> QueuedJob:
         """Return a job.
 
         Raises:
@@ -161,7 +161,7 @@ class JobStore:
         job = self._jobs.get(number)
         return job is not None and job.state == "running"
 
-    def add(self, checked: CheckedJob, submitted: str, workers: int = 1) -> Job:
+    def add(self, checked: CheckedJob, submitted: str, workers: int = 1) -> QueuedJob:
         """Append the job that a submitted text means to the queue, on disk, and return it.
 
         Raises:
@@ -177,7 +177,7 @@ class JobStore:
             number = max(self._jobs, default=0) + 1
             seeds = () if checked.kind in WITHOUT_RUNS else from_mapping(checked.values).seeds
             run_ids = {seed: new_run_id(self.recordings) for seed in seeds}
-            job = Job(number, checked.kind, checked.name, checked.runs, now(), workers, run_ids=run_ids)
+            job = QueuedJob(number, checked.kind, checked.name, checked.runs, now(), workers, run_ids=run_ids)
             try:
                 with storage_errors(self.path(number), "free some disk"):
                     self.path(number).mkdir()
@@ -194,7 +194,7 @@ class JobStore:
             self._jobs[job.number] = job
             return job
 
-    def update(self, number: int, **changes: Any) -> Job:
+    def update(self, number: int, **changes: Any) -> QueuedJob:
         """Change fields of a job, and return it; a new state or error is an event.
 
         If the disk is full, the change holds until the next start.
@@ -289,7 +289,7 @@ class JobStore:
             log.write(line)
         self._log_sizes[number] = size + len(line)
 
-    def _write_state(self, job: Job) -> None:
+    def _write_state(self, job: QueuedJob) -> None:
         _write(self.path(job.number, STATE_FILE), _STORED.dump_json(job, exclude={"progress"}))
 
     def path(self, number: int, name: str = "") -> Path:
@@ -305,7 +305,7 @@ def _write(path: Path, data: bytes) -> None:
         os.fsync(stream.fileno())
 
 
-def read_job(folder: Path) -> Job:
+def read_job(folder: Path) -> QueuedJob:
     """Return the job in a folder.
 
     Raises:

@@ -14,7 +14,7 @@ from typing import Any, Final
 from runner.client.jobs import EventData, LogEvent, StateEvent
 from runner.execution.estimate import free_bytes
 from runner.service.jobs.channel import JobSpec
-from runner.service.jobs.store import Job, JobStore, now
+from runner.service.jobs.store import JobStore, QueuedJob, now
 from runner.service.jobs.worker import work
 from runner.service.logs import LOG
 from runner.service.processes import PRELOADED
@@ -34,7 +34,7 @@ RETRY_SECONDS: Final = 5.0
 
 @dataclass
 class _Worker:
-    job: Job
+    job: QueuedJob
     process: BaseProcess
     pipe: Any
     stopped: float | None = None
@@ -121,7 +121,7 @@ class WorkerPool:
         self._start_problem = ""
         self._store.update(job.number, state="running", started=job.started or now(), progress=None)
 
-    def _start_worker(self, job: Job) -> _Worker:
+    def _start_worker(self, job: QueuedJob) -> _Worker:
         """Start the worker process of a job."""
         job = replace(job, workers=self._needed(job))
         spec = JobSpec(self._store.path(job.number), job)
@@ -135,11 +135,11 @@ class WorkerPool:
                 raise
         return _Worker(job, process, ours)
 
-    def _next_job(self) -> Job | None:
+    def _next_job(self) -> QueuedJob | None:
         """Return the job that is started next: jobs start in the order of their numbers."""
         return next((job for job in self._store.jobs() if job.state == "queued"), None)
 
-    def _needed(self, job: Job) -> int:
+    def _needed(self, job: QueuedJob) -> int:
         """Return how many workers a job uses: this server may have fewer than the one it was submitted to."""
         return min(job.workers, self.size)
 

@@ -14,7 +14,7 @@ from runner.service.api.jobs import Number, job_response
 from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
-from runner.service.jobs.store import Job
+from runner.service.jobs.store import QueuedJob
 from runner.service.pages.rendering import page, to_job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
@@ -86,7 +86,7 @@ def _rows(jobs: JobQueue, number: int) -> dict[str, object]:
     }
 
 
-def _seconds(job: Job) -> float | None:
+def _seconds(job: QueuedJob) -> float | None:
     """Return the duration of a job from its first start; None if it is not over, or never started."""
     if not job.is_over or not job.started or not job.ended:
         return None

@@ -50,7 +50,7 @@ T = Annotated[int, Query(ge=0, lt=2**62)]
 
 
 @dataclass(frozen=True)
-class Panel:
+class ReplayPanel:
     """One of several replays on a page, which one slider moves."""
 
     label: str
@@ -75,7 +75,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Stage:
+class ReplayStage:
     """What a page shows of an episode before its script fills in the step."""
 
     title: str
@@ -94,7 +94,7 @@ class Stage:
     """Whether pictures are fetched."""
 
 
-class Evaluation(NamedTuple):
+class EvaluationChoice(NamedTuple):
     """An evaluation that can be replayed."""
 
     after: int
@@ -218,12 +218,12 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
 
 
 def _values(
-    run: Run, at: EpisodeRef, branches: list[Link], stage: Stage | None, problem: str = ""
+    run: Run, at: EpisodeRef, branches: list[Link], stage: ReplayStage | None, problem: str = ""
 ) -> dict[str, object]:
     with open_recording(run.recording) as recording:
         episodes = recording.train.episodes.count()
         environments, is_job = recording.environments, recording.can_train_again
-        evaluations = [Evaluation(one.after, one.stop - one.start) for one in evaluations_of(recording)]
+        evaluations = [EvaluationChoice(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if at.after is None:
         count = episodes
     else:
@@ -248,12 +248,12 @@ def _values(
     }
 
 
-def stage_of(part: JsonView, t: int) -> Stage:
+def stage_of(part: JsonView, t: int) -> ReplayStage:
     """Return the stage of a part of an episode, see `fragments.episode_part`."""
     episode = part["episode"]
     at = min(t, episode["length"])
-    drawing = svg.Drawing(part["scene"]) if episode["grid"] else None
-    return Stage(
+    drawing = svg.SvgDrawing(part["scene"]) if episode["grid"] else None
+    return ReplayStage(
         title=episode["title"],
         description=episode["description"],
         length=episode["length"],
@@ -279,9 +279,9 @@ def _whole(text: str) -> int:
 
 def panel_of(
     recording: Recording, phase: str, source: str, label: str, number: int | None = None, **more: Any
-) -> Panel:
+) -> ReplayPanel:
     """Return the replay of an episode of a phase, whose data has the address `source`."""
     drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
     has_pictures, note = picture_note(recording, phase)
     scene = "" if drawing is None else drawing.frame(None, f"The grid of {label}", style="")
-    return Panel(label, number, source, f"{source}/pictures", scene, has_pictures, note, **more)
+    return ReplayPanel(label, number, source, f"{source}/pictures", scene, has_pictures, note, **more)

@@ -39,7 +39,7 @@ from runner.service.dependencies import (
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import environment_of, last_results, result_of, run_page
 from runner.service.pages.rendering import Form, message_of, page
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.util import humanize
 from runner.util.values import Json
 
@@ -160,14 +160,16 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
     return run_page(request, run, "evaluations", "run_evaluations.html", values)
 
 
-def _overview(request: Request, run: Run, jobs: JobQueue, settings: Settings, problem: str = "") -> Response:
+def _overview(
+    request: Request, run: Run, jobs: JobQueue, settings: ServiceSettings, problem: str = ""
+) -> Response:
     """Return the first page of a run; `problem` is why a request was refused."""
     values = {"status": _status(run, jobs, settings), "problem": problem, "max_note": MAX_NOTE}
     status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
     return run_page(request, run, "", "run_overview.html", values, status)
 
 
-def _status(run: Run, jobs: JobQueue, settings: Settings) -> Status:
+def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
     number, live = _job_of(run, jobs)
     summary = live or (_done_by(run) if not run.can_train_again and run.status == "running" else run.summary)
     episodes = summary.get("episode", summary.get("episodes"))

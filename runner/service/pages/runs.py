@@ -71,7 +71,7 @@ class Heading(NamedTuple):
     """The address of the table sorted by it; empty if it cannot be."""
 
 
-class Cell(NamedTuple):
+class RunCell(NamedTuple):
     """A cell of the table."""
 
     text: str
@@ -81,11 +81,11 @@ class Cell(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Table:
+class RunsTable:
     """The rows of a page."""
 
     headings: list[Heading]
-    rows: list[tuple[str, list[Cell]]]
+    rows: list[tuple[str, list[RunCell]]]
     """Run id and cells."""
     total: int
     """Runs that match the filter."""
@@ -155,7 +155,7 @@ def _values(catalogue: Catalogue, text: str, sort: str, columns: str, number: in
     if is_usual and any(row["mean_return"] is not None for row in rows):
         shown = [*shown[: shown.index("mean_length")], "mean_return", *shown[shown.index("mean_length") :]]
     folded = FOLDED if is_usual else ()
-    table = Table(
+    table = RunsTable(
         headings=[_heading(column, query, column in folded) for column in shown],
         rows=[(row["id"], [_cell(row, column, column in folded) for column in shown]) for row in rows],
         total=total,
@@ -166,7 +166,7 @@ def _values(catalogue: Catalogue, text: str, sort: str, columns: str, number: in
 
 
 def _search(
-    text: str, sort: str, shown: Sequence[str], query: str, table: Table | None, problem: str = ""
+    text: str, sort: str, shown: Sequence[str], query: str, table: RunsTable | None, problem: str = ""
 ) -> dict[str, object]:
     """Return the values of the page; `query` has the columns as the address contains them."""
     names = dict.fromkeys([*(column for column in shown if column in FIELDS), *FIELDS])
@@ -205,11 +205,11 @@ def _classes(left: bool, folded: bool) -> str:
     return " ".join(name for name, holds in (("text", left), ("fold", folded)) if holds)
 
 
-def _cell(row: IndexRow, column: str, folded: bool) -> Cell:
+def _cell(row: IndexRow, column: str, folded: bool) -> RunCell:
     text, address = as_text(row, column), ""
     if column in ("id", "name"):
         address = f"/runs/{row['id']}"
     elif column == "same_as" and row["same_as"]:
         address = f"/runs/{row['same_as']}"
     kind = _classes(column in FIELDS and field_of(column).kind in _LEFT, folded)
-    return Cell(text[:16] if column == "digest" else text, kind, address, column == "status")
+    return RunCell(text[:16] if column == "digest" else text, kind, address, column == "status")

@@ -66,7 +66,7 @@ seeds: [0, 1]
 """
 
 
-class Problem(NamedTuple):
+class FormProblem(NamedTuple):
     """A mistake in the submitted text."""
 
     line: int | None
@@ -120,18 +120,18 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     return to_job(job.number)
 
 
-def _problems(request: Request, text: str, error: RunnerError) -> list[Problem]:
+def _problems(request: Request, text: str, error: RunnerError) -> list[FormProblem]:
     """Return the mistakes in a text, each with its line."""
     body = error_body(error, request.app.state.settings)
     lines = dict(enumerate(text.splitlines(), 1))
-    problems = [Problem(p.line, p.path, p.message, lines.get(p.line or 0, "")) for p in body.problems]
-    return problems or [Problem(None, None, body.message, "")]
+    problems = [FormProblem(p.line, p.path, p.message, lines.get(p.line or 0, "")) for p in body.problems]
+    return problems or [FormProblem(None, None, body.message, "")]
 
 
 def _values(
     text: str,
     sent: Mapping[str, str] = MappingProxyType({}),
-    problems: Sequence[Problem] = (),
+    problems: Sequence[FormProblem] = (),
     checked: CheckedJob | None = None,
 ) -> dict[str, object]:
     """Return the values of the page; `checked` is what the text means, if it was checked and is valid."""

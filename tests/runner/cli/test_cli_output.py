@@ -8,7 +8,7 @@ from runner.analysis.evaluations import EvaluationRecord, TrainingRecord
 from runner.cli import cli, output
 from runner.cli.evaluations import evaluation_table, spread
 from runner.config import from_mapping
-from runner.drawing.text import Drawing, signs
+from runner.drawing.text import TextDrawing, signs
 from runner.execution.estimate import estimate, step_limit
 from runner.util import humanize
 
@@ -155,7 +155,7 @@ SCENE = {
 
 
 def test_a_drawing_needs_no_colours():
-    drawing = Drawing(SCENE)
+    drawing = TextDrawing(SCENE)
     assert drawing.draw([1, 5, 1, 0], [-1, -1, 0, -1]).plain.splitlines() == [
         "+-----+-----+-----+",
         "|R   *| 1 P       |",

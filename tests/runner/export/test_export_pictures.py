@@ -12,9 +12,9 @@ from PIL import Image
 
 import runner
 from runner.drawing.raster import render_svg
-from runner.drawing.svg import Drawing
+from runner.drawing.svg import SvgDrawing
 from runner.errors import RecordingError
-from runner.export.pictures import Pictures, Source
+from runner.export.pictures import Pictures, PictureSource
 from runner.recording.reader import open_recording
 from runner.runs.marks import MARK_FILE
 from tests.runner.export.making import made_otherwise
@@ -54,10 +54,10 @@ def test_scenes_look_like_the_pictures_of_the_pages(recording):
     mdp, steps = recording.mdp, recording.train.episode_steps(3)[:30]
     shown = Pictures(recording, "train", 3)
     if mdp.scene is None:
-        assert shown.source is Source.VALUES
+        assert shown.source is PictureSource.VALUES
         return
-    assert shown.source is Source.SCENE
-    drawing = Drawing(mdp.scene)
+    assert shown.source is PictureSource.SCENE
+    drawing = SvgDrawing(mdp.scene)
     places = drawing.places(mdp, np.append(steps["state"], steps["next_state"][-1]))
     for picture in shown:
         if picture.t % 7 or picture.t > 30:
@@ -81,7 +81,7 @@ def test_recorded_frames_are_those_that_the_environment_drew(tmp_path):
     with recording:
         for episode in (0, 1, len(drawn) - 1):
             shown = Pictures(recording, "train", episode)
-            assert shown.source is Source.RECORDED
+            assert shown.source is PictureSource.RECORDED
             np.testing.assert_array_equal([picture.pixels for picture in shown], drawn[episode])
 
 
@@ -93,7 +93,7 @@ def test_a_frame_is_shown_until_the_next_recorded_one(tmp_path):
     with recording:
         for episode, frames in enumerate(drawn[:-1]):
             shown = Pictures(recording, "train", episode)
-            assert shown.source is Source.RECORDED
+            assert shown.source is PictureSource.RECORDED
             assert "cannot be imported" in shown.reason  # which is why it is not drawn again
             last = len(frames) - 1
             expected = [frames[t if t == last else t - t % 4] for t in range(last + 1)]
@@ -121,7 +121,7 @@ def test_pictures_drawn_again_are_those_of_the_environment(tmp_path, case):
     with recording:
         for episode in {0, min(1, len(drawn) - 1)}:
             with contextlib.closing(Pictures(recording, "train", episode)) as shown:
-                assert (shown.source, shown.reason) == (Source.REDRAWN, "")
+                assert (shown.source, shown.reason) == (PictureSource.REDRAWN, "")
                 np.testing.assert_array_equal([picture.pixels for picture in shown], drawn[episode])
 
 
@@ -135,13 +135,13 @@ def test_what_a_recording_names_is_imported_if_it_is_trusted_only(tmp_path):
         list(play(rec, 60))
     with open_recording(rec.run.recording) as recording:
         with contextlib.closing(Pictures(recording, "train", 0)) as shown:
-            assert shown.source is Source.REDRAWN
+            assert shown.source is PictureSource.REDRAWN
         (rec.run.folder / MARK_FILE).unlink()
         shown = Pictures(recording, "train", 0)
-        assert shown.source is Source.VALUES
+        assert shown.source is PictureSource.VALUES
         assert "--trust" in shown.reason
         with contextlib.closing(Pictures(recording, "train", 0, trust=True)) as shown:
-            assert shown.source is Source.REDRAWN
+            assert shown.source is PictureSource.REDRAWN
             assert next(shown).pixels.shape == (400, 600, 3)
 
 
@@ -153,7 +153,7 @@ def test_pictures_end_with_a_note_where_the_environment_differs(tmp_path):
         shown = list(Pictures(recording, "train", 0))
         steps = recording.train.episode_steps(0)
         later = Pictures(recording, "train", 1)  # its reset needs those before it
-    assert later.source is Source.VALUES
+    assert later.source is PictureSource.VALUES
     assert "before, at train episode 0, t 4: truncated" in later.reason
     expected = "At step 5 the environment differs from the recording: truncated: recorded False, got True."
     assert shown[-1].note == expected
@@ -170,7 +170,7 @@ def test_values_are_shown_where_the_environment_begins_otherwise(tmp_path):
     other = made_otherwise(rec.run.recording, tmp_path / "other.mcap", kwargs={"gravity": -5.0})
     with open_recording(other) as recording:
         shown = Pictures(recording, "train", 0)
-        assert shown.source is Source.VALUES
+        assert shown.source is PictureSource.VALUES
         assert "first observation" in shown.reason
         assert len(list(shown)) == len(recording.train.episode_steps(0)) + 1
 
@@ -182,7 +182,7 @@ def test_values_are_drawn_as_bars_that_follow_them(tmp_path):
     recording, _ = recorded(tmp_path, Hidden())
     with recording:
         shown = Pictures(recording, "train", 0)
-        assert shown.source is Source.VALUES
+        assert shown.source is PictureSource.VALUES
         assert "cannot be imported" in shown.reason
         frames = [picture.pixels for picture in shown]
         values = recording.train.episode_steps(0)["next_observation"][:, 2]
@@ -201,7 +201,7 @@ def test_observations_that_are_images_are_shown(tmp_path):
     recording, _ = recorded(tmp_path, Camera(), 20)
     with recording:
         shown = Pictures(recording, "train", 0)
-        assert shown.source is Source.OBSERVATION
+        assert shown.source is PictureSource.OBSERVATION
         last = recording.train.episode_steps(0)["next_observation"][:, -1]
         np.testing.assert_array_equal([picture.pixels[..., 0] for picture in shown][1:], last)
 
@@ -215,7 +215,7 @@ def test_games_and_vectors_have_pictures(tmp_path):
     game.close()
     with open_recording(game.run.recording) as recording:
         shown = Pictures(recording, "train", 0)
-        assert shown.source is Source.REDRAWN
+        assert shown.source is PictureSource.REDRAWN
         last = list(shown)[-1]
         assert last.pixels.shape == (700, 700, 3)
         assert last.action == "agent 0 left, agent 1 left, agent 2 left"

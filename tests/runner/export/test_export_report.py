@@ -17,7 +17,7 @@ from selenium.webdriver.support.select import Select
 import runner
 from runner.analysis.episodes import last_whole_evaluation, ranked_trials
 from runner.cli import cli
-from runner.drawing.svg import Drawing, trail_points, transform
+from runner.drawing.svg import SvgDrawing, trail_points, transform
 from runner.environments.naming import agent_actions_in_words, states_in_words
 from runner.export.reports.report import render_report
 from runner.integrations.tensorboard import SummaryWriter
@@ -63,7 +63,7 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
     if recording.mdp.scene is None:
         assert shown["grid"] is None
     else:
-        places = Drawing(recording.mdp.scene).places(recording.mdp, states)
+        places = SvgDrawing(recording.mdp.scene).places(recording.mdp, states)
         assert [shown["grid"]["places"][i] for i in shown["grid"]["at"]] == places.reshape(
             len(states), -1
         ).tolist()
@@ -175,7 +175,7 @@ def test_the_slider_is_moved_by_keys_and_shows_the_recorded_frames(opened, pictu
         _, typical, _ = ranked_trials(recording, last_whole_evaluation(recording))
         steps = recording.eval.episode_steps(typical.number_in(recording))
     states = np.append(steps["state"], steps["next_state"][-1])
-    places = Drawing(mdp.scene).places(mdp, states)
+    places = SvgDrawing(mdp.scene).places(mdp, states)
     choose = Select(driver.find_element(By.CSS_SELECTOR, ".episode"))
     choose.select_by_index(next(i for i, o in enumerate(choose.options) if "ypical trial" in o.text))
     slider = driver.find_element(By.CSS_SELECTOR, ".step")
@@ -188,7 +188,7 @@ def test_the_slider_is_moved_by_keys_and_shows_the_recorded_frames(opened, pictu
         text = driver.find_element(By.CSS_SELECTOR, ".caption").text
         assert words[states[k]] in text.replace("\n", " ")
         assert slider.get_attribute("aria-valuetext") == f"step {k} of {len(steps)}"
-        for mover in Drawing(mdp.scene).movers:
+        for mover in SvgDrawing(mdp.scene).movers:
             trail = driver.find_element(By.CSS_SELECTOR, f'[data-trail="{mover}"]').get_attribute("points")
             assert trail == trail_points(places[: k + 1, mover])
 

@@ -11,11 +11,11 @@ from rerun.chunk import RrdReader
 
 from runner.drawing.palette import COMPARED
 from runner.environments.mdp import events_of
-from runner.export.rerun.labels import Labels
+from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Request
-from runner.export.rerun.tracks import Source
+from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import export
 from runner.recording import schema
@@ -32,7 +32,7 @@ class Exported:
     def __init__(self, recording, path):
         self.recording = recording
         self.path = path
-        (self.selection,) = export([Source(recording, "a run")], Request(everything=True), path)
+        (self.selection,) = export([TrackSource(recording, "a run")], Request(everything=True), path)
         self.store = RrdReader(str(path)).store()
 
     def table(self, entity, component=None):
@@ -186,7 +186,7 @@ def test_the_labels_of_movers_show_illegal_actions(exported):
     scene = scene_of(mdp)
     if scene is None or "collision" not in mdp.event_names:
         return
-    labels, events = Labels(mdp, scene, exported.recording.agents), events_of(mdp, steps)
+    labels, events = GridLabels(mdp, scene, exported.recording.agents), events_of(mdp, steps)
     shown = np.array(labels.texts)[labels.of_steps(steps, events)]
     illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
     assert [("illegal pickup" in label) for label in shown[:, 1]] == illegal.astype(bool).tolist()
@@ -251,7 +251,7 @@ def test_views_show_what_was_sent(exported):
 
 def test_rerun_verifies_the_file(exported, tmp_path):
     path = tmp_path / "some.rrd"
-    export([Source(exported.recording, "a run")], Request(episodes=((0, 2),), evaluations=(20,)), path)
+    export([TrackSource(exported.recording, "a run")], Request(episodes=((0, 2),), evaluations=(20,)), path)
     done = subprocess.run(
         [viewer_program(), "rrd", "verify", path],
         capture_output=True,
@@ -311,7 +311,7 @@ def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
         open_recording(pictured("taxis").recording) as a,
         open_recording(pictured("rivals").recording) as b,
     ):
-        sources = [Source(a, "A", "/a", COMPARED[0]), Source(b, "B", "/b", COMPARED[1])]
+        sources = [TrackSource(a, "A", "/a", COMPARED[0]), TrackSource(b, "B", "/b", COMPARED[1])]
         export(sources, Request(), tmp_path / "both.rrd")
     views = [[f"/{run}/{path}" for run in "ab" for path in paths] for _, paths in PLOTS]
     check_lines(tmp_path / "both.rrd", views)

@@ -16,12 +16,11 @@ import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.errors import RecordingError
 from runner.export.encoded import encoded_picture
-from runner.export.pictures import Pictures
-from runner.export.pictures import Source as PictureSource
+from runner.export.pictures import Pictures, PictureSource
 from runner.export.rerun import selection
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request, select
-from runner.export.rerun.tracks import Source
+from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.writing import export, export_runs
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
@@ -57,7 +56,7 @@ class Exported:
     """An export, read back."""
 
     def __init__(self, recording, path, **request):
-        (self.selection,) = export([Source(recording, "a run")], Request(**request), path)
+        (self.selection,) = export([TrackSource(recording, "a run")], Request(**request), path)
         self._chunks = RrdReader(str(path)).store().stream().to_chunks()
 
     @property

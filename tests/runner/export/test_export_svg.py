@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from runner.drawing import palette, svg, svg_maps
-from runner.drawing.svg import CELL, MARGIN, Drawing
+from runner.drawing.svg import CELL, MARGIN, SvgDrawing
 from runner.export.reports.maps import maps_of, situation, stages_of
 from runner.recording.reader import open_recording
 
@@ -24,7 +24,7 @@ def scene(recording):
 
 
 def test_a_frame_is_svg_with_all_cells_walls_landmarks_and_things(scene):
-    drawing = Drawing(scene.scene)
+    drawing = SvgDrawing(scene.scene)
     places = drawing.places(scene, np.arange(4))
     root = ElementTree.fromstring(drawing.frame(places[3], 'a "title" & <more>', places))
     assert root.get("aria-label") == 'a "title" & <more>'
@@ -37,7 +37,7 @@ def test_a_frame_is_svg_with_all_cells_walls_landmarks_and_things(scene):
 
 
 def test_things_are_drawn_in_their_cells_and_passengers_on_what_carries_them(scene):
-    drawing, states = Drawing(scene.scene), np.arange(scene.states)
+    drawing, states = SvgDrawing(scene.scene), np.arange(scene.states)
     places = drawing.places(scene, states)
     columns = scene.scene["columns"]
     for number, _ in enumerate(scene.scene["things"]):
@@ -57,12 +57,12 @@ def test_no_two_movers_are_drawn_on_top_of_each_other(pictured):
 
     with open_recording(pictured("taxis").recording) as opened:
         mdp = opened.mdp
-    places = Drawing(mdp.scene).places(mdp, np.arange(mdp.states))
+    places = SvgDrawing(mdp.scene).places(mdp, np.arange(mdp.states))
     assert (places[:, 0, :2] != places[:, 1, :2]).any(axis=1).all()
 
 
 def test_the_key_names_everything(scene):
-    key = Drawing(scene.scene).key()
+    key = SvgDrawing(scene.scene).key()
     assert key[0].isupper()
     assert key.endswith(".")
     assert all(thing["label"] in key for thing in scene.scene["things"])

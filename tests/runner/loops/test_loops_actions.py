@@ -32,7 +32,7 @@ from runner.recording.recorder import Recorder
 from runner.replay.steps import whole_steps
 from runner.runs.marks import MARK_FILE
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.waiting import until
 
 
@@ -175,7 +175,7 @@ def test_replays_make_its_steps_again(tmp_path):
     said("export", "film", "actions", "--best", "-o", str(tmp_path / "x.gif"))
     text, _ = render_report([runner.list_runs(tmp_path)[0].recording])
     assert "No episode of run" not in text
-    settings = Settings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
+    settings = ServiceSettings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
     with TestClient(create_app(settings), base_url="http://localhost") as client:
         addresses = [f"/api/v1/runs/{name}/replay/train/2" for name in ("all", "actions")]
         first, again = (client.get(address).json()["episode"] for address in addresses)

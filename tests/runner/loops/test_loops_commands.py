@@ -18,7 +18,7 @@ from runner.analysis.series import read_series
 from runner.recording.reader import open_recording
 from runner.recording.run_file import Summary
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.runner.loops.making import dualtaxi, make, play
 
 
@@ -82,7 +82,7 @@ def test_a_report_of_a_loop_has_no_learning_section(folder, tmp_path):
 
 
 def test_pages_of_a_loop_show_its_evaluations_and_link_to_their_replays(folder, tmp_path):
-    settings = Settings(recordings=(folder,), tokens=tmp_path / "tokens.json")
+    settings = ServiceSettings(recordings=(folder,), tokens=tmp_path / "tokens.json")
     with TestClient(create_app(settings), base_url="http://localhost") as client:
 
         def page(address):
@@ -183,7 +183,7 @@ def test_the_table_of_a_loop_is_its_latest_snapshot(tmp_path):
         refused = dualtaxi(tmp_path, "qtable", "table", *words)
         assert (refused.exit_code, message in refused.output) == (2, True)
     dualtaxi(tmp_path, "report", "table", "-o", tmp_path / "report.html")
-    settings = Settings(recordings=(tmp_path,))
+    settings = ServiceSettings(recordings=(tmp_path,))
     with TestClient(create_app(settings), base_url="http://localhost") as client:
         head = client.get(f"/runs/{rec.run.run_id}").text
         page = client.get(f"/runs/{rec.run.run_id}/learned").text

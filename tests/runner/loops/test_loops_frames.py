@@ -16,7 +16,7 @@ import runner
 from runner.archive.restoring import restore
 from runner.errors import CannotRedo, ConfigError
 from runner.export.encoded import encoded_pictures
-from runner.export.pictures import Pictures, Source
+from runner.export.pictures import Pictures, PictureSource
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
@@ -28,7 +28,7 @@ from tests.runner.loops.making import Rooms, counting, play, record_counting
 def shown_states(recording, phase, episode):
     """Return the state that each picture of an episode shows."""
     with contextlib.closing(Pictures(recording, phase, episode)) as shown:
-        assert shown.source is Source.RECORDED
+        assert shown.source is PictureSource.RECORDED
         return [picture.pixels[0, 0].tolist() for picture in shown]
 
 
@@ -85,7 +85,7 @@ def test_frames_of_chosen_environments(tmp_path):
         for number, episode in enumerate(recording.train.episodes.array()):
             with contextlib.closing(Pictures(recording, "train", number)) as shown:
                 is_chosen = int(episode["last_step"]) % N == 2
-                assert shown.source is (Source.RECORDED if is_chosen else Source.VALUES)
+                assert shown.source is (PictureSource.RECORDED if is_chosen else PictureSource.VALUES)
             if is_chosen:
                 assert len(encoded_states(path, "train", number)) == episode["length"] + 1
             else:
@@ -106,7 +106,7 @@ def test_a_game_has_a_frame_each_step(tmp_path):
     with open_recording(rec.run.recording) as recording:
         for number, frames in enumerate(seen):
             with contextlib.closing(Pictures(recording, "train", number)) as shown:
-                assert shown.source is Source.RECORDED
+                assert shown.source is PictureSource.RECORDED
                 found = [picture.pixels for picture in shown]
             assert len(found) == len(frames) == 6
             assert all(map(np.array_equal, found, frames))

@@ -21,7 +21,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.analysis.episodes import EpisodeRef
-from runner.cli.episode import Episode
+from runner.cli.episode import ShownEpisode
 from runner.environments.layers import name_of
 from runner.errors import ConfigError, RecordingError
 from runner.execution.verify import verify
@@ -368,7 +368,7 @@ def test_the_agents_of_a_game_have_names_of_actions(tmp_path):
         assert recording.train.action_names("agent_1") == ("no action", "left", "right", "down", "up")
         assert recording.train.action_names() == ()
         described, _ = describer(recording, "train")(next(recording.train.transitions()))
-        (first, *_) = Episode(recording, EpisodeRef(0), "").steps()
+        (first, *_) = ShownEpisode(recording, EpisodeRef(0), "").steps()
     assert described == "agent 0 no action, agent 1 right, agent 2 up"
     assert first["action_in_words"] == {"agent_0": "no action", "agent_1": "right", "agent_2": "up"}
 

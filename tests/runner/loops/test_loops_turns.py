@@ -13,7 +13,7 @@ import runner
 from runner.analysis.diff import diff
 from runner.errors import ConfigError
 from runner.execution.verify import check_integrity, verify
-from runner.export.pictures import Pictures, Source
+from runner.export.pictures import Pictures, PictureSource
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import dualtaxi
 
@@ -101,7 +101,7 @@ def test_pages_films_and_diffs_show_games_in_turns(tmp_path):
         runs.append(rec.run)
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
         shown = Pictures(a, "train", 0)
-        assert shown.source is Source.REDRAWN
+        assert shown.source is PictureSource.REDRAWN
         assert [picture.action[:8] for picture in shown][1:3] == ["player 1", "player 2"]
         found = diff(a, b).divergence
         assert (found.episode, found.t, found.field) == (0, 0, "action.player_1")

@@ -19,7 +19,7 @@ from runner.recording.composition import composition_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.runner.loops.making import dualtaxi
 
 
@@ -86,7 +86,7 @@ def test_every_view_of_a_run_states_it(tmp_path):
     verified = json.loads(dualtaxi(tmp_path, "verify", rec.run.run_id, "--json").output)
     assert (verified["verdict"], verified["environment"]) == ("reproduced", shown["environment"])
     assert words in render_report([rec.run.recording])[0]
-    settings = Settings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
+    settings = ServiceSettings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
     with TestClient(create_app(settings), base_url="http://localhost") as client:
         assert words in client.get(f"/runs/{rec.run.run_id}").text
 

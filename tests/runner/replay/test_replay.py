@@ -13,7 +13,7 @@ from runner.archive.writing import write_archive
 from runner.cli import cli
 from runner.errors import RecordingError
 from runner.export.rerun.selection import Request
-from runner.export.rerun.tracks import Source
+from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -25,7 +25,7 @@ FAR = 4_000_000_000
 
 
 def exported(recording, path):
-    (selection,) = export([Source(recording, "a run")], Request(everything=True), path)
+    (selection,) = export([TrackSource(recording, "a run")], Request(everything=True), path)
     return selection
 
 

@@ -18,7 +18,7 @@ from gymnasium.wrappers.vector import NormalizeObservation as NormalizeVector
 import runner
 from runner.errors import RecordingError
 from runner.execution.verify import verify
-from runner.export.pictures import Source, source_of
+from runner.export.pictures import PictureSource, source_of
 from runner.recording.reader import open_recording
 from runner.replay.environment import rerun, rerun_in_child
 from tests.runner.loops.making import drive, parallel
@@ -287,7 +287,7 @@ def test_a_child_process_draws_the_pictures_of_an_episode(tmp_path):
     blocks = list(rerun_in_child(path, "train", [3], render=True))
     with open_recording(path) as recording:
         steps = recording.train.episode_steps(3)
-        assert source_of(recording, "train") == (Source.REDRAWN, "")
+        assert source_of(recording, "train") == (PictureSource.REDRAWN, "")
         (in_process,) = (b for b in rerun(recording, "train", [3], render=True) if b.starts)
     frames = [frame for block in blocks for frame in block.frames]
     assert len(frames) == sum(map(len, blocks)) == len(steps)

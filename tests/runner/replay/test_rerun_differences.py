@@ -14,7 +14,7 @@ import pytest
 import runner
 from runner.errors import CannotRedo
 from runner.execution.verify import verify
-from runner.export.pictures import Source, source_of
+from runner.export.pictures import PictureSource, source_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
 from runner.replay.environment import rerun, rerun_in_child
@@ -240,7 +240,7 @@ def test_an_environment_of_the_script_itself_cannot_be_made_again(tmp_path):
     )
     with open_recording(path) as recording:
         source, reason = source_of(recording, "train")
-        assert source is Source.VALUES
+        assert source is PictureSource.VALUES
         assert "JSON cannot hold" in reason
         with pytest.raises(CannotRedo, match="JSON cannot hold"):
             next(rerun(recording))

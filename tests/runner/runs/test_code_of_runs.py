@@ -270,7 +270,7 @@ def test_pages_escape_code(project):
     from fastapi.testclient import TestClient
 
     from runner.service.app import create_app
-    from runner.service.settings import Settings
+    from runner.service.settings import ServiceSettings
 
     evil = "<script>alert(1)</script>"
     code = Code(
@@ -278,7 +278,7 @@ def test_pages_escape_code(project):
     )
     path = with_code(project, code, **{"git.branch": evil, "code.script": "a.py"})
     other = job_in(project)
-    settings = Settings(recordings=(path.parent.parent,), tokens=project.parent / "tokens.json")
+    settings = ServiceSettings(recordings=(path.parent.parent,), tokens=project.parent / "tokens.json")
     with TestClient(create_app(settings), base_url="http://localhost") as client:
         for address in (
             f"/runs/{path.parent.name}/code",

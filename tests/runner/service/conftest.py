@@ -18,7 +18,7 @@ from uploading import start
 import runner
 from runner.client.outbox import outbox_folder
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from runner.service.uploads import Uploads
 
 if TYPE_CHECKING:
@@ -60,8 +60,8 @@ def recordings(recorded: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def settings(recordings: Path, tmp_path: Path) -> Settings:
-    return Settings(recordings=(recordings,), tokens=tmp_path / "tokens.json")
+def settings(recordings: Path, tmp_path: Path) -> ServiceSettings:
+    return ServiceSettings(recordings=(recordings,), tokens=tmp_path / "tokens.json")
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def connect() -> Iterator[Callable[..., TestClient]]:
     """Return a function that connects a client to a service; by default as a page of its own."""
     opened = []
 
-    def make(settings: Settings, **headers: str) -> TestClient:
+    def make(settings: ServiceSettings, **headers: str) -> TestClient:
         client = TestClient(
             create_app(settings),
             base_url="http://localhost",
@@ -85,7 +85,7 @@ def connect() -> Iterator[Callable[..., TestClient]]:
 
 
 @pytest.fixture
-def client(connect: Callable[..., TestClient], settings: Settings) -> TestClient:
+def client(connect: Callable[..., TestClient], settings: ServiceSettings) -> TestClient:
     """Return a client of a service over those runs."""
     return connect(settings)
 

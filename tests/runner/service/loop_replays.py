@@ -19,7 +19,7 @@ from runner.recording.reader import open_recording
 from runner.runs.marks import MARK_FILE
 from runner.runs.resolve import find_run
 from runner.service.app import create_app
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 from tests.runner.loops.making import Rooms
 
 
@@ -70,7 +70,7 @@ def record_loops(folder: Path) -> None:
 @contextlib.contextmanager
 def serving(folder: Path) -> Iterator[TestClient]:
     """Yield a client of a service for the runs of a folder."""
-    settings = Settings(recordings=(folder,), tokens=folder.with_name("tokens.json"))
+    settings = ServiceSettings(recordings=(folder,), tokens=folder.with_name("tokens.json"))
     with TestClient(create_app(settings), base_url="http://localhost") as client:
         yield client
 

@@ -15,7 +15,7 @@ from runner.runs.resolve import find_run
 from runner.runs.run import Run
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.store import JobStore
-from runner.service.settings import Settings
+from runner.service.settings import ServiceSettings
 
 BRANCH = "/api/v1/runs/first/branch"
 
@@ -107,7 +107,7 @@ def test_a_branch_whose_parent_was_removed_fails_and_leaves_no_run(connect, reco
         job = store.add(checked, "")
     before = {run.run_id for run in list_runs(recordings)} - {parent.run_id}
     shutil.rmtree(parent.folder)
-    client = connect(Settings(recordings=(recordings,), tokens=tmp_path / "tokens.json"))
+    client = connect(ServiceSettings(recordings=(recordings,), tokens=tmp_path / "tokens.json"))
     for _ in range(2):
         ended = finished(client, job.number)
         assert (ended["state"], ended["begun"]) == ("failed", [])

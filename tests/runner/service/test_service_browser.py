@@ -14,7 +14,7 @@ from selenium.webdriver.common.keys import Keys
 from served import Served, wait
 
 import runner
-from runner.drawing.svg import Drawing, transform
+from runner.drawing.svg import SvgDrawing, transform
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 
@@ -214,7 +214,7 @@ def test_any_episode_is_scrubbed_and_each_step_has_an_address(page, folder, addr
         mdp = recording.mdp
         steps = recording.phase(phase).episode_steps(number)
     states = np.append(steps["state"], steps["next_state"][-1])
-    places = Drawing(mdp.scene).places(mdp, states)
+    places = SvgDrawing(mdp.scene).places(mdp, states)
     slider = browser.find_element(By.CSS_SELECTOR, ".step")
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".choice ol"))
 

@@ -21,14 +21,14 @@ from runner.cli import cli
 from runner.runs.catalogue.database import index_path
 from runner.service.app import create_app
 from runner.service.server import bind, serve
-from runner.service.settings import Limits
+from runner.service.settings import ServiceLimits
 from tests.waiting import until
 
 
 @pytest.fixture
 def impatient(settings):
     """Return the port of a service with timeouts of half a second."""
-    limits = Limits(header_seconds=0.5, idle_seconds=0.5, keep_alive_seconds=1, stop_seconds=1)
+    limits = ServiceLimits(header_seconds=0.5, idle_seconds=0.5, keep_alive_seconds=1, stop_seconds=1)
     settings = dataclasses.replace(settings, port=0, limits=limits)
     app, listening = create_app(settings), bind(settings)
     ended = threading.Thread(target=serve, args=(app, settings, listening), daemon=True)

@@ -18,7 +18,7 @@ from runner.cli import cli
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs.resolve import find_run
-from runner.service.settings import Limits
+from runner.service.settings import ServiceLimits
 
 RUN = "/api/v1/runs/first"
 
@@ -49,7 +49,7 @@ def test_a_run_is_described_as_by_show(client, recordings):
 
 
 def test_a_range_of_records_that_is_too_long_is_refused(connect, settings):
-    client = connect(dataclasses.replace(settings, limits=Limits(page_records=3)))
+    client = connect(dataclasses.replace(settings, limits=ServiceLimits(page_records=3)))
     assert len(client.get(f"{RUN}/evaluations", params={"start": 1, "stop": 4}).json()["records"]) == 3
     answer = client.get(f"{RUN}/evaluations", params={"stop": 10**9})
     assert answer.status_code == 422

@@ -23,7 +23,7 @@ from runner.runs.resolve import find_run
 from runner.service import logs
 from runner.service.app import create_app
 from runner.service.guard import POLICY, is_allowed_host, is_same_origin
-from runner.service.settings import Limits, tokens_file
+from runner.service.settings import ServiceLimits, tokens_file
 from runner.service.tokens import READ, WRITE, Tokens
 
 RUNS, RUN = "/api/v1/runs", "/api/v1/runs/first"
@@ -248,7 +248,7 @@ def test_every_response_has_the_policy(client, path):
 
 
 def test_a_body_that_is_too_long_is_refused(connect, settings):
-    client = connect(dataclasses.replace(settings, limits=Limits(body_bytes=1000)))
+    client = connect(dataclasses.replace(settings, limits=ServiceLimits(body_bytes=1000)))
     answer = client.patch(RUN, json={"note": "x" * 2000})
     assert answer.status_code == 413
     assert "1,000 bytes" in answer.json()["error"]["message"]

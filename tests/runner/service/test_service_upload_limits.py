@@ -14,7 +14,7 @@ from uploading import ANNA, BEN, begin, grow, over, send, start, visible
 
 from runner.errors import StorageError
 from runner.service.errors import Busy, TooManyUploads, UploadTooLarge
-from runner.service.settings import Limits
+from runner.service.settings import ServiceLimits
 from runner.service.uploads import FOLDER, Uploads
 from tests.waiting import until
 
@@ -131,7 +131,7 @@ def test_an_upload_is_stored_although_a_report_of_it_fails(lake, tmp_path):
     def fail(upload):
         raise RuntimeError(upload.id)
 
-    uploads = Uploads(tmp_path / "runs", Limits(spare_bytes=0), fail)
+    uploads = Uploads(tmp_path / "runs", ServiceLimits(spare_bytes=0), fail)
     assert send(uploads, lake.recording.read_bytes()).state == "stored"
     uploads.close()
 

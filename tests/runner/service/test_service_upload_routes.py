@@ -9,7 +9,7 @@ import pytest
 from blake3 import blake3
 
 from runner.runs.listing import list_runs
-from runner.service.settings import Limits
+from runner.service.settings import ServiceLimits
 from runner.service.tokens import Tokens
 from tests.waiting import until
 
@@ -107,7 +107,7 @@ def test_a_refused_run_has_a_message_and_is_not_listed(connect, elsewhere, data)
 
 
 def test_more_bytes_than_announced_are_refused(connect, elsewhere, data):
-    client = connect(replace(elsewhere, limits=Limits(upload_bytes=100_000)))
+    client = connect(replace(elsewhere, limits=ServiceLimits(upload_bytes=100_000)))
     too_large = put(client, "0" * 64, size=100_001)
     assert (too_large.status_code, "100,000" in message(too_large)) == (413, True)
     upload = begin(client, data[:1000])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from blake3 import blake3
 
-from runner.service.settings import Limits
+from runner.service.settings import ServiceLimits
 from runner.service.uploads import Uploads, UploadSource
 from tests.waiting import until
 
@@ -19,7 +19,7 @@ BEN = "ben"
 
 def start(folder: Path, **limits) -> Uploads:
     """Return the uploads of a service, with the default limits but for these."""
-    return Uploads(folder, Limits(**limits), lambda _: None)
+    return Uploads(folder, ServiceLimits(**limits), lambda _: None)
 
 
 def source(data: bytes, **more) -> UploadSource:

@@ -146,7 +146,7 @@ def test_a_task_whose_worker_dies_twice_fails_and_the_sweep_continues(tmp_path):
 
 
 def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
-    real, gone = local._Worker.send, []
+    real, gone = local._SweepWorker.send, []
 
     def send(worker, task):
         if not gone:
@@ -155,7 +155,7 @@ def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
             worker._process.join()
         return real(worker, task)
 
-    monkeypatch.setattr(local._Worker, "send", send)
+    monkeypatch.setattr(local._SweepWorker, "send", send)
     folder, trials, _ = done
     expected = trials.done[0].results[0]
     objective = Objective(metric="mean_length")
