@@ -16,7 +16,7 @@ from typing import Final
 
 import uvicorn
 
-from runner.cli import main
+from runner.__main__ import main
 
 VARIABLE: Final = "WATCHED"
 TICK_SECONDS: Final = 0.01
