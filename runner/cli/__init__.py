@@ -29,6 +29,7 @@ from runner.errors import (
 )
 from runner.util import __version__
 from runner.util.humanize import printable
+from runner.util.plugins import VIEWS
 
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Run": {
@@ -184,25 +185,39 @@ def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem
 class LazyGroup(CommandGroup):
     """The commands of `COMMANDS`, each imported when it is invoked."""
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+    plugins = VIEWS
+
+    def shipped(self) -> list[str]:
         """Return the names, section by section."""
         return [name for section in COMMANDS.values() for name in section]
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command."""
         for section in COMMANDS.values():
             if cmd_name in section:
                 module = importlib.import_module(f"runner.cli.commands.{section[cmd_name][0]}")
                 command: click.Command = getattr(module, f"{cmd_name}_command")
                 return command
-        return None
+        return super().get_command(ctx, cmd_name)
+
+    def plugin(self, name: str) -> click.Command:
+        """Return the command of a view that an installed package adds."""
+        from runner.cli.views import command_of
+        from runner.views import installed_view
+
+        return command_of(installed_view(name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections from their short help, without an import."""
         width = max(len(name) for name in self.list_commands(ctx))
-        for title, section in COMMANDS.items():
-            with formatter.section(title):
-                formatter.write_dl([(f"{name:{width}}", text) for name, (_, text) in section.items()])
+        sections: dict[str, list[tuple[str, str]]] = {
+            title: [(name, text) for name, (_, text) in commands.items()]
+            for title, commands in COMMANDS.items()
+        }
+        for title, rows in (sections | {"Installed": self.installed_rows()}).items():
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl([(f"{name:{width}}", text) for name, text in rows])
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Note whether the command prints JSON before it is parsed: a usage error is JSON too."""

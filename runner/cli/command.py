@@ -17,6 +17,7 @@ from typing import Any
 import click
 
 from runner.errors import nearest
+from runner.util.plugins import plugin_names
 
 _MAX_SHORT_HELP = 200
 
@@ -108,14 +109,35 @@ class CommandGroup(click.Group):
     """A group of such commands, which suggests the nearest name for an unknown one."""
 
     command_class = Command
+    plugins = ""
+    """The entry points by which installed packages add commands; empty for none."""
 
     def __init__(self, name: str | None, **attributes: Any) -> None:
         super().__init__(name, **attributes)
         self.help = _with_examples(self.help)
 
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        """Return the names in the order of definition."""
+    def shipped(self) -> list[str]:
+        """Return the names of the commands of this package, in the order of definition."""
         return list(self.commands)
+
+    def installed(self) -> dict[str, str]:
+        """Return the names of commands that other packages add, and the package of each."""
+        names = plugin_names(self.plugins) if self.plugins else {}
+        return {name: package for name, package in names.items() if name not in self.shipped()}
+
+    def plugin(self, name: str) -> click.Command:
+        """Import a command that another package adds."""
+        raise NotImplementedError
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Return the names, those that other packages add last."""
+        return [*self.shipped(), *self.installed()]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command."""
+        if (command := super().get_command(ctx, cmd_name)) is None and cmd_name in self.installed():
+            return self.plugin(cmd_name)
+        return command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -123,7 +145,7 @@ class CommandGroup(click.Group):
         """Find a command, or suggest one."""
         names = self.list_commands(ctx)
         if args[0] not in names and not args[0].startswith("-") and not ctx.resilient_parsing:
-            commands = {name: self.get_command(ctx, name) for name in names}
+            commands = {name: self.get_command(ctx, name) for name in self.shipped()}
             inside = [
                 f" Did you mean '{name} {args[0]}'?"
                 for name, command in commands.items()
@@ -135,7 +157,10 @@ class CommandGroup(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002
         """List the commands with the first sentence of their help, wrapped instead of cut off."""
+        texts = {name: command.get_short_help_str(_MAX_SHORT_HELP) for name, command in self.commands.items()}
         with formatter.section("Commands"):
-            formatter.write_dl(
-                [(name, each.get_short_help_str(_MAX_SHORT_HELP)) for name, each in self.commands.items()]
-            )
+            formatter.write_dl([*texts.items(), *self.installed_rows()])
+
+    def installed_rows(self) -> list[tuple[str, str]]:
+        """Return the rows of the help about the commands that other packages add."""
+        return [(name, f"From the package {package}.") for name, package in self.installed().items()]

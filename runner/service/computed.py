@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -38,6 +39,7 @@ from runner.analysis.series import (
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import svg_file
 from runner.export.plots.style import CurveStyle
+from runner.export.plugin import installed_export
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
@@ -247,6 +249,14 @@ def answer_file(path: Path, question: Callable[..., FileAnswer], values: Given) 
     with open_recording(path) as recording, io.BytesIO() as stream:
         question(recording, **dict(values)).write(stream)
         return stream.getvalue()
+
+
+def installed_file(path: Path, name: str) -> bytes:
+    """Return the file that an export of an installed package makes of a recording."""
+    with tempfile.TemporaryDirectory() as folder, open_recording(path) as recording:
+        file = Path(folder) / "export"
+        installed_export(name).write(recording, file)
+        return file.read_bytes()
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

@@ -17,10 +17,10 @@ from runner.runs.run import Run
 from runner.service import computed, fragments
 from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
-from runner.service.pages.frame import run_page
+from runner.service.pages.frame import installed_names, run_page
 from runner.service.pages.rendering import message_of
 from runner.service.problems import RUN_ERRORS, error_docs, media_docs
-from runner.views import VIEWS
+from runner.views import VIEWS, installed_view
 from runner.views.view import Given, Input, View
 
 api = APIRouter(
@@ -120,5 +120,5 @@ def _page(request: Request, run: Run, shown: dict[str, Any], status: HTTPStatus)
     )
 
 
-for _view in VIEWS.values():
+for _view in (*VIEWS.values(), *map(installed_view, installed_names())):
     _add_routes(_view)

@@ -1,13 +1,25 @@
 """Views: questions about a recording, each asked once; commands, API routes and pages are derived of them.
 
-A view is a module with a `VIEW`. It imports heavy packages in its function, so that help is quick.
+A view is a module with a `VIEW`. It imports heavy packages in its function, so that help is quick. Installed
+packages add views by entry points, see `runner.util.plugins`.
 """
 
 from __future__ import annotations
 
 from typing import Final
 
+from runner.util import plugins
 from runner.views import qtable, when, why
+from runner.views.view import View
 
 VIEWS: Final = {module.VIEW.name: module.VIEW for module in (qtable, when, why)}
 """Name of a view -> the view."""
+
+
+def installed_view(name: str) -> View:
+    """Return the view of this name that an installed package adds.
+
+    Raises:
+        RunnerError: it cannot be imported.
+    """
+    return plugins.load_plugin(plugins.VIEWS, name, View)

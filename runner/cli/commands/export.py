@@ -7,21 +7,49 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli.command import CommandGroup, option
+from runner.cli.command import Command, CommandGroup, option
 from runner.cli.commands import export_film, export_tables, export_tools
 from runner.cli.options import Writing, run_argument, selection_options, writing_options
 from runner.cli.output import say
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
-from runner.export.places import require_new
+from runner.export.places import new_file, require_new
+from runner.export.plugin import installed_export
 from runner.export.rerun.viewer import require_rerun
 from runner.util.humanize import duration, size
+from runner.util.plugins import EXPORTS
 
 if TYPE_CHECKING:
     from runner.export.rerun.selection import Request, Selection
 
 
-@click.group("export", cls=CommandGroup)
+class ExportGroup(CommandGroup):
+    """The exports, with those that installed packages add."""
+
+    plugins = EXPORTS
+
+    def plugin(self, name: str) -> Command:
+        """Return the command of an export that an installed package adds."""
+        added = installed_export(name)
+
+        def call(run_name: str, to: Writing) -> None:
+            from runner.recording.reader import open_recording
+
+            run = find_recorded(run_name, to.recordings)
+            path = to.path(run.file_stem)
+            with (
+                new_file(path, to.force) as temporary,
+                open_recording(run.recording) as recording,
+                stage_line(f"exporting {run.run_id}"),
+            ):
+                added.write(recording, temporary)
+            to.report(f"{path}  {size(path.stat().st_size)}", path)
+
+        to = writing_options(f"NAME-RUN{added.ending}", f"FILE{added.ending}")
+        return Command(name, call, {"run_name": run_argument, "to": to}, help=added.help)
+
+
+@click.group("export", cls=ExportGroup)
 def export_command() -> None:
     """Export a run for other programs.
 

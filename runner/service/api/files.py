@@ -9,18 +9,28 @@ import pathlib
 from dataclasses import replace
 from http import HTTPStatus
 from typing import Annotated, Final
+from urllib.parse import quote
 
 from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from runner.errors import RunNotFound
+from runner.export.plugin import installed_export
 from runner.export.rerun.selection import Request
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.dependencies import CacheOf, InTurn, ProcessesOf, RecordedRun, recording_state
+from runner.service.dependencies import (
+    CacheOf,
+    ComputationOf,
+    InTurn,
+    ProcessesOf,
+    RecordedRun,
+    recording_state,
+)
 from runner.service.errors import Refused
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
+from runner.util.plugins import EXPORTS, plugin_names
 from runner.util.processes import CallFailed
 from runner.util.values import Ranges, ranges_in
 
@@ -139,6 +149,26 @@ async def replay(
     )
     path = await replay_of([run], cache, processes, request)
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
+
+
+@router.get(
+    "/exports/{name}",
+    response_class=Response,
+    responses=FILE | BUSY_ERRORS,
+    summary="The run as an export of an installed package writes it.",
+)
+async def installed(
+    run: RecordedRun, compute: ComputationOf, name: Annotated[str, Path(max_length=100)]
+) -> Response:
+    """Return what `dualtaxi export NAME` writes."""
+    if name not in plugin_names(EXPORTS):
+        raise RunNotFound(
+            f"no installed package adds an export {name!r}; `dualtaxi export --help` lists them."
+        )
+    file_name = f"{run.file_stem}{installed_export(name).ending}"
+    body = await compute(computed.installed_file, run.recording, name, alone=True)
+    headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(file_name)}"}
+    return Response(body, media_type=MEDIA, headers=headers)
 
 
 async def replay_of(

@@ -21,6 +21,8 @@ from runner.recording.run_file import EvaluationMetrics, Summary, has_environmen
 from runner.runs.run import Run
 from runner.service.pages.rendering import page
 from runner.util import humanize
+from runner.util.plugins import VIEWS, plugin_names
+from runner.views import installed_view
 
 TABS: Final = (
     ("", "Overview"),
@@ -38,6 +40,11 @@ TABS: Final = (
     ("console", "Console"),
     ("rerun", "Rerun"),
 )
+
+
+def installed_names() -> list[str]:
+    """Return the names of the views that installed packages add; those of shipped pages stay as they are."""
+    return [name for name in plugin_names(VIEWS) if name not in dict(TABS)]
 
 
 @dataclass(frozen=True)
@@ -90,7 +97,10 @@ def head_of(run: Run) -> RunHead:
         created=run.created.isoformat(),
         tags=run.tags,
         note=run.note,
-        tabs=tuple(tab for tab in TABS if has_tab.get(tab[0], True)),
+        tabs=(
+            *(tab for tab in TABS if has_tab.get(tab[0], True)),
+            *((name, installed_view(name).title) for name in installed_names()),
+        ),
     )
 
 

@@ -19,6 +19,7 @@ from runner.service.dependencies import FoundRun, OpenRecording, RecordedRun, Se
 from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import message_of
 from runner.util import humanize
+from runner.util.plugins import EXPORTS, plugin_names
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -82,7 +83,13 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
             ]
     except RecordingError as error:
         facts["Recording"] = settings.without_folders(str(error))
-    values = {"yaml": write_yaml(run.file.config), "facts": facts, "provenance": provenance, "log": log}
+    values = {
+        "yaml": write_yaml(run.file.config),
+        "facts": facts,
+        "provenance": provenance,
+        "log": log,
+        "exports": list(plugin_names(EXPORTS)),
+    }
     return run_page(request, run, "config", "run_config.html", values)
 
 
