@@ -103,6 +103,31 @@ class CatalogueIndex:
         select = f"SELECT {', '.join(columns)} FROM runs WHERE root = ? AND entry = ?"
         return [row for place in places for row in _as_rows(self._database.execute(select, place))], total
 
+    def page_by_name(
+        self, sort: str = "", *, limit: int, offset: int = 0
+    ) -> tuple[list[tuple[IndexRow, int]], int]:
+        """Return the first run of each name, the number of its runs, and how many names there are.
+
+        Args:
+            sort: a field that runs, and so the names, are sorted by, as for `order_of`; by default the newest
+                come first.
+            limit: the maximum number of names.
+        """
+        column, descending = (_sort_keys(sort) or [(Sql("created"), True)])[0]
+        best = f"{'MAX' if descending else 'MIN'}({column.text})"  # SQLite takes root and entry of that row
+        condition = f"FROM runs WHERE root {self._is_here} AND id IS NOT NULL"
+        places = self._database.execute(
+            f"SELECT root, entry, COUNT(*), {best} AS best {condition} GROUP BY name "
+            f"ORDER BY best {'DESC' if descending else 'ASC'} NULLS LAST, name LIMIT ? OFFSET ?",
+            (*column.values, *self.roots, limit, offset),
+        ).fetchall()
+        select = "SELECT * FROM runs WHERE root = ? AND entry = ?"
+        rows = [next(_as_rows(self._database.execute(select, place))) for *place, _, _ in places]
+        (names,) = self._database.execute(
+            f"SELECT COUNT(*) FROM (SELECT 1 {condition} GROUP BY name)", self.roots
+        ).fetchone()
+        return list(zip(rows, (runs for *_, runs, _ in places), strict=True)), int(names)
+
     def originals(self, digests: Sequence[str] | None = None) -> dict[str, tuple[str, str, str]]:
         """Return root, entry and id of the first run with each content that was recorded twice or more.
 
@@ -267,7 +292,15 @@ def order_of(text: str) -> list[Sql]:
 
     Missing values come last. A value of the configuration is a field too: `config.discount`.
     """
-    order = []
+    return [
+        Sql(f"{column.text} {'DESC' if descending else 'ASC'} NULLS LAST", column.values)
+        for column, descending in _sort_keys(text)
+    ]
+
+
+def _sort_keys(text: str) -> list[tuple[Sql, bool]]:
+    """Return the columns of an order, and whether their largest values come first."""
+    keys = []
     for name in filter(None, (part.strip() for part in text.split(","))):
         descending, wanted = name.startswith("-"), name.removeprefix("-")
         if wanted.startswith(SETTING):
@@ -276,8 +309,8 @@ def order_of(text: str) -> list[Sql]:
             field = field_of(wanted)
             column = Sql(field.stored[0])
             descending ^= field.kind is ColumnKind.AGE
-        order.append(Sql(f"{column.text} {'DESC' if descending else 'ASC'} NULLS LAST", column.values))
-    return order
+        keys.append((column, descending))
+    return keys
 
 
 def _look(

@@ -89,14 +89,17 @@ class Compared:
 
 
 def chosen_runs(
-    catalogue: CatalogueOf, run: Annotated[list[str] | None, Query(max_length=100)] = None
+    catalogue: CatalogueOf,
+    run: Annotated[list[str] | None, Query(max_length=100)] = None,
+    name: Annotated[list[str] | None, Query(max_length=100)] = None,
 ) -> list[Run]:
-    """Return the runs to compare.
+    """Return the runs to compare: single ones, and all runs of some names.
 
     Raises:
         RunnerError: there are fewer than two of them, or too many.
     """
-    names = list(dict.fromkeys(run or []))
+    ids = [found.run_id for each in name or () for found in catalogue.find_all(each)]
+    names = list(dict.fromkeys([*(run or ()), *ids]))
     if not 2 <= len(names) <= MAX_RUNS:
         raise RunnerError(
             f"found {counted(len(names), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."

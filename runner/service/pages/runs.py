@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
@@ -80,17 +80,28 @@ class RunCell(NamedTuple):
     is_status: bool
 
 
+class RunRow(NamedTuple):
+    """A row of the table: a run, or the first one of all runs of a name."""
+
+    id: str
+    name: str
+    runs: int
+    """Number of the runs that the row stands for."""
+    cells: list[RunCell]
+
+
 @dataclass(frozen=True)
 class RunsTable:
     """The rows of a page."""
 
     headings: list[Heading]
-    rows: list[tuple[str, list[RunCell]]]
-    """Run id and cells."""
+    rows: list[RunRow]
     total: int
     """Runs that match the filter."""
     all_runs: int
     paging: Paging
+    other_grouping: str
+    """The address of the same runs, grouped by name if they are not, else one a row; empty with a filter."""
 
 
 @router.get("/")
@@ -107,13 +118,16 @@ async def runs(
     filter: Annotated[str, Query(max_length=3000)] = "",  # noqa: A002
     sort: Annotated[str, Query(max_length=1000)] = "",
     columns: Annotated[list[str] | None, Query(max_length=100)] = None,
+    group: Literal["name", "none"] = "name",
     page: Annotated[int, Query(ge=1, lt=10**8)] = 1,
 ) -> Response:
-    """Show the runs that match a filter."""
+    """Show the runs that match a filter; without one, those of a name in a row."""
     viewer, status = viewer_of(request), HTTPStatus.OK
 
     def make() -> bytes:
-        values = _values(catalogue, filter, sort, ",".join(columns or ()), page)
+        values = _values(
+            catalogue, filter, sort, ",".join(columns or ()), group == "name" and not filter, page
+        )
         return render("/runs", viewer, "runs.html", values)
 
     try:
@@ -141,26 +155,43 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
     return page(request, "disk.html", values)
 
 
-def _values(catalogue: Catalogue, text: str, sort: str, columns: str, number: int) -> dict[str, object]:
+def _values(
+    catalogue: Catalogue, text: str, sort: str, columns: str, by_name: bool, number: int
+) -> dict[str, object]:
     chosen, order = parse(text), order_of(sort)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
     is_usual = list(shown) == list(USUAL)
 
-    def work(index: CatalogueIndex) -> tuple[list[IndexRow], int, int]:
-        shown_rows, total = index.page(chosen, *order, limit=ROWS, offset=(number - 1) * ROWS)
-        return index.with_same_as(shown_rows), total, index.count(Filter(None)) if text else total
+    def work(index: CatalogueIndex) -> tuple[list[tuple[IndexRow, int]], int, int, int]:
+        offset, all_runs = (number - 1) * ROWS, index.count()
+        if by_name:
+            named, names = index.page_by_name(sort, limit=ROWS, offset=offset)
+            return named, names, all_runs, all_runs
+        shown_rows, total = index.page(chosen, *order, limit=ROWS, offset=offset)
+        return [(row, 1) for row in index.with_same_as(shown_rows)], total, total, all_runs
 
-    rows, total, all_runs = catalogue.read(work)
-    query = {"filter": text, "sort": sort, "columns": "" if is_usual else ",".join(shown)}
+    counted, pages_of, total, all_runs = catalogue.read(work)
+    rows = [row for row, _ in counted]
+    grouping = "" if by_name or text else "none"
+    query = {"filter": text, "sort": sort, "columns": "" if is_usual else ",".join(shown), "group": grouping}
     if is_usual and any(row["mean_return"] is not None for row in rows):
         shown = [*shown[: shown.index("mean_length")], "mean_return", *shown[shown.index("mean_length") :]]
     folded = FOLDED if is_usual else ()
     table = RunsTable(
         headings=[_heading(column, query, column in folded) for column in shown],
-        rows=[(row["id"], [_cell(row, column, column in folded) for column in shown]) for row in rows],
+        rows=[
+            RunRow(
+                row["id"],
+                row["name"],
+                runs,
+                [_cell(row, column, column in folded, runs) for column in shown],
+            )
+            for row, runs in counted
+        ],
         total=total,
         all_runs=all_runs,
-        paging=Paging(number, total, ROWS, link("/runs", query)),
+        paging=Paging(number, pages_of, ROWS, link("/runs", query)),
+        other_grouping="" if text else link("/runs", {**query, "group": "none" if by_name else "name"}),
     )
     return _search(text, sort, shown, query["columns"], table)
 
@@ -205,9 +236,12 @@ def _classes(left: bool, folded: bool) -> str:
     return " ".join(name for name, holds in (("text", left), ("fold", folded)) if holds)
 
 
-def _cell(row: IndexRow, column: str, folded: bool) -> RunCell:
+def _cell(row: IndexRow, column: str, folded: bool, runs: int) -> RunCell:
+    """Return a cell of a run; where it stands for several, their name leads to them."""
     text, address = as_text(row, column), ""
-    if column in ("id", "name"):
+    if column == "name" and runs > 1:
+        text, address = f"{text} ({runs:,} runs)", link("/runs", {"filter": f"name == {row['name']!r}"})
+    elif column in ("id", "name"):
         address = f"/runs/{row['id']}"
     elif column == "same_as" and row["same_as"]:
         address = f"/runs/{row['same_as']}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import html
 import json
 import re
 import shutil
@@ -40,6 +41,26 @@ def test_runs_are_searched_sorted_and_their_columns_chosen(client):
     assert "1 of 2 run" in page
     assert re.search(r"<a[^>]*>second</a></td><td>0.99</td>", page)
     assert "first</a>" not in page
+
+
+def test_runs_of_a_name_are_one_row_that_opens_sorts_and_is_compared(client, recordings):
+    changes = ["name=many", "episodes=60", "seeds=[1, 2, 3]", "evaluation.every=20"]
+    runs = list(runner.run_all("quick", overrides=changes, recordings=recordings))
+    page = until(lambda page: "5 runs" in page, lambda: page_of(client, "/runs"))
+    assert page.count("<tr>") == 4
+    (address,) = re.findall(r'href="([^"]+)">many \(3 runs\)</a>', page)
+    opened = page_of(client, html.unescape(address))
+    assert "3 of 5 runs" in opened
+    assert opened.count("<tr>") == 4
+    shown = [
+        re.findall(r">(many|first|second)\b", page_of(client, f"/runs?sort={sort}"))
+        for sort in ("name", "-name")
+    ]
+    assert shown == [["first", "many", "second"], ["second", "many", "first"]]
+    assert page_of(client, "/runs?group=none").count("<tr>") == 6
+    compared = page_of(client, "/compare?name=many&run=first")
+    assert all(f"/runs/{run.run_id}" in compared for run in runs)
+    assert "/runs/second" not in compared
 
 
 def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(client):

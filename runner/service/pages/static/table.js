@@ -3,7 +3,8 @@ const form = document.querySelector("[data-rows]");
 const search = document.querySelector("[data-focus]");
 
 function chosen() {
-  return form.querySelectorAll("input[name=run]:checked").length;
+  const boxes = form.querySelectorAll("tbody input:checked");
+  return [...boxes].reduce((runs, box) => runs + Number(box.dataset.runs ?? 1), 0);
 }
 
 function update() {
@@ -36,7 +37,7 @@ document.addEventListener("keydown", (event) => {
   if (event.key === "j") step(1);
   if (event.key === "k") step(-1);
   if (event.key === "x") {
-    const box = document.activeElement.closest("tr")?.querySelector("input[name=run]");
+    const box = document.activeElement.closest("tr")?.querySelector("input");
     if (box) {
       box.checked = !box.checked;
       update();
