@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,7 @@ class Export:
     """Help of the command; its first line says what the file is."""
 
 
+@cache  # reading the metadata of all packages takes 0.1 s
 def installed_export(name: str) -> Export:
     """Return the export of this name that an installed package adds.
 

@@ -6,6 +6,7 @@ packages add views by entry points, see `runner.util.plugins`.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final
 
 from runner.util import plugins
@@ -16,6 +17,7 @@ VIEWS: Final = {module.VIEW.name: module.VIEW for module in (qtable, when, why)}
 """Name of a view -> the view."""
 
 
+@cache  # reading the metadata of all packages takes 0.1 s
 def installed_view(name: str) -> View:
     """Return the view of this name that an installed package adds.
 

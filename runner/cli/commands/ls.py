@@ -20,7 +20,7 @@ from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
     FIELDS,
     HEADINGS,
-    ColumnKind,
+    LEFT_KINDS,
     as_json,
     as_text,
     columns_of,
@@ -62,14 +62,6 @@ _DEFAULT_COLUMNS: Final = (
 """Columns of the table, unless they hold nothing of interest."""
 _OPTIONAL: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
 """Columns left out where a terminal is narrow, in this order."""
-_LEFT: Final = (
-    ColumnKind.START,
-    ColumnKind.TEXT,
-    ColumnKind.STATUS,
-    ColumnKind.PROSE,
-    ColumnKind.TAGS,
-    ColumnKind.DATE,
-)
 _SHRINKING: Final = (
     "name",
     "config",
@@ -286,7 +278,7 @@ def _fitting(rows: Sequence[Row], columns: Sequence[str]) -> list[str]:
 def _print_table(rows: Sequence[Row], columns: Sequence[str]) -> None:
     """Print a table, fitted to the terminal if there is one; ids are never truncated."""
     headings = [HEADINGS.get(column, column) for column in columns]
-    left = [column not in FIELDS or FIELDS[column].kind in _LEFT for column in columns]
+    left = [column not in FIELDS or FIELDS[column].kind in LEFT_KINDS for column in columns]
     cells = [[_cell(row, column) for column in columns] for row in rows]
     if not console().is_terminal:
         echo("\n".join(aligned([headings, *cells], left)))

@@ -39,6 +39,8 @@ class ColumnKind(enum.Enum):
 
 
 TEXT_KINDS: Final = (ColumnKind.START, ColumnKind.TEXT, ColumnKind.STATUS, ColumnKind.PROSE, ColumnKind.TAGS)
+LEFT_KINDS: Final = (*TEXT_KINDS, ColumnKind.DATE)
+"""The kinds that tables align to the left."""
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from runner.errors import RunnerError
 from runner.runs.catalogue.columns import (
     FIELDS,
     HEADINGS,
+    LEFT_KINDS,
     SETTING,
     ColumnKind,
     IndexRow,
@@ -46,14 +47,6 @@ USUAL: Final = (
 FOLDED: Final = ("id", "seed", "tag", "episodes")
 """Columns that a narrow screen leaves out, unless the columns were chosen."""
 ROWS: Final = 50
-_LEFT: Final = (
-    ColumnKind.START,
-    ColumnKind.TEXT,
-    ColumnKind.STATUS,
-    ColumnKind.PROSE,
-    ColumnKind.TAGS,
-    ColumnKind.DATE,
-)
 _FALLING: Final = (ColumnKind.NUMBER, ColumnKind.SIZE, ColumnKind.DATE)
 """Kinds whose largest values come first after a click on the heading."""
 
@@ -224,7 +217,7 @@ def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:
     return Heading(
         text=HEADINGS.get(column, column).replace("_", " "),
         meaning="" if is_setting or not is_sortable else field_of(column).meaning,
-        kind=_classes(not is_setting and kind in _LEFT, folded),
+        kind=_classes(not is_setting and kind in LEFT_KINDS, folded),
         sorted={rising: "ascending", falling: "descending"}.get(query["sort"]),
         address=link("/runs", {**query, "sort": second if query["sort"] == first else first})
         if is_sortable
@@ -245,5 +238,5 @@ def _cell(row: IndexRow, column: str, folded: bool, runs: int) -> RunCell:
         address = f"/runs/{row['id']}"
     elif column == "same_as" and row["same_as"]:
         address = f"/runs/{row['same_as']}"
-    kind = _classes(column in FIELDS and field_of(column).kind in _LEFT, folded)
+    kind = _classes(column in FIELDS and field_of(column).kind in LEFT_KINDS, folded)
     return RunCell(text[:16] if column == "digest" else text, kind, address, column == "status")
