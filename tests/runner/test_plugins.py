@@ -82,7 +82,7 @@ def test_a_plugin_that_cannot_be_used_is_named(environment, run):
     module.write_text("import no_such_module")
     message = dualtaxi("longest", str(run.folder), code=2)
     assert "longest: long_episodes:LONGEST of the package long-episodes cannot be imported" in message
-    module.write_text("LONGEST = LENGTHS = 3  # another size, as Python compiles it anew by size and second")
+    module.write_text("LONGEST = LENGTHS = 3  # Python compiles a file again if its size differs")
     message = dualtaxi("longest", str(run.folder), code=2)
     assert (
         "longest: found 3 at long_episodes:LONGEST of the package long-episodes, expected a View" in message
