@@ -73,30 +73,35 @@ class Topic:
 
 _BOOL, _BYTES, _STRING = Pb.TYPE_BOOL, Pb.TYPE_BYTES, Pb.TYPE_STRING
 _DOUBLE, _FIXED32, _SFIXED64 = Pb.TYPE_DOUBLE, Pb.TYPE_FIXED32, Pb.TYPE_SFIXED64
-_FIXED64 = Pb.TYPE_FIXED64
+_FIXED64, _MESSAGE, _ENUM = Pb.TYPE_FIXED64, Pb.TYPE_MESSAGE, Pb.TYPE_ENUM
+
+
+def _fields(first: int = 1, /, **kinds: int | list[int]) -> tuple[Field, ...]:
+    """Return fields numbered from `first` on, in this order; a kind in a list is that of a repeated field."""
+    return tuple(
+        Field(number, name, kind[0], repeated=True) if isinstance(kind, list) else Field(number, name, kind)
+        for number, (name, kind) in enumerate(kinds.items(), first)
+    )
+
 
 # The order of the fields is the one that compresses best: fields that change together are adjacent.
 STEP = MessageType(
     "Step",
-    (
-        Field(1, "state", _FIXED32),
-        Field(2, "action", _FIXED32),
-        Field(3, "next_state", _FIXED32),
-        Field(4, "rewards", _DOUBLE, repeated=True),
-        Field(5, "step", _SFIXED64),
-        Field(6, "explored", _FIXED32),
-        Field(7, "episode", _SFIXED64),
-        Field(8, "t", _FIXED32),
-        Field(9, "terminated", _BOOL),
-        Field(10, "truncated", _BOOL),
+    _fields(
+        state=_FIXED32,
+        action=_FIXED32,
+        next_state=_FIXED32,
+        rewards=[_DOUBLE],
+        step=_SFIXED64,
+        explored=_FIXED32,
+        episode=_SFIXED64,
+        t=_FIXED32,
+        terminated=_BOOL,
+        truncated=_BOOL,
     ),
 )
 """A step of a job, or of a loop over states; `layout` has the fields of other steps."""
-AGENT_FIELDS: Final = (
-    Field(11, "acted", _FIXED32),
-    Field(12, "agents_terminated", _FIXED32),
-    Field(13, "agents_truncated", _FIXED32),
-)
+AGENT_FIELDS: Final = _fields(11, acted=_FIXED32, agents_terminated=_FIXED32, agents_truncated=_FIXED32)
 """More fields of a step in a game of several agents: bit i is agent i."""
 ENVIRONMENT_OF_STEP: Final = Field(14, "environment", _FIXED32)
 TAKEN: Final = Field(15, "taken", _BOOL)
@@ -106,224 +111,179 @@ EPISODE = MessageType(
     (
         Field(1, "episode", _SFIXED64),
         Field(10, "first_step", _SFIXED64),
-        Field(2, "last_step", _SFIXED64),
-        Field(3, "length", _FIXED32),
-        Field(4, "penalties", _FIXED32),
-        Field(5, "returns", _DOUBLE, repeated=True),
-        Field(6, "events", _FIXED32, repeated=True),
-        Field(7, "success", _BOOL),
-        Field(8, "terminated", _BOOL),
-        Field(9, "truncated", _BOOL),
+        *_fields(
+            2,
+            last_step=_SFIXED64,
+            length=_FIXED32,
+            penalties=_FIXED32,
+            returns=[_DOUBLE],
+            events=[_FIXED32],
+            success=_BOOL,
+            terminated=_BOOL,
+            truncated=_BOOL,
+        ),
     ),
 )
 ENVIRONMENT_OF_EPISODE: Final = Field(11, "environment", _FIXED32)
 """One more field of an episode where environments take turns."""
-_TRAINING_SIDE = (
-    Field(1, "step", _SFIXED64),
-    Field(2, "episode", _SFIXED64),
-    Field(3, "mean_length", _DOUBLE),
-    Field(4, "rewards", _DOUBLE, repeated=True),
-    Field(5, "reward_counts", _SFIXED64, repeated=True),
-    Field(6, "zero_cells", _SFIXED64, repeated=True),
-    Field(7, "percent_filled", _DOUBLE, repeated=True),
-    Field(8, "epsilon", _DOUBLE),
-    Field(9, "step_size", _DOUBLE),
-    Field(10, "discount", _DOUBLE),
+_TRAINING_SIDE = _fields(
+    step=_SFIXED64,
+    episode=_SFIXED64,
+    mean_length=_DOUBLE,
+    rewards=[_DOUBLE],
+    reward_counts=[_SFIXED64],
+    zero_cells=[_SFIXED64],
+    percent_filled=[_DOUBLE],
+    epsilon=_DOUBLE,
+    step_size=_DOUBLE,
+    discount=_DOUBLE,
 )
 TRAIN_METRICS = MessageType("TrainMetrics", _TRAINING_SIDE)
 _EVALUATION_SIDE = (
-    Field(11, "evaluation", _SFIXED64),
-    Field(12, "trials", _SFIXED64),
-    Field(13, "successes", _SFIXED64),
+    *_fields(11, evaluation=_SFIXED64, trials=_SFIXED64, successes=_SFIXED64),
     Field(17, "terminations", _SFIXED64),
     Field(19, "events", _SFIXED64, repeated=True),
-    *(Field(each.number, each.field, _DOUBLE, each.per_agent) for each in METRICS),
+    *(Field(metric.number, metric.field, _DOUBLE, metric.per_agent) for metric in METRICS),
 )
 EVAL_METRICS = MessageType(
     "EvalMetrics", (*_TRAINING_SIDE, *sorted(_EVALUATION_SIDE, key=lambda field: field.number))
 )
 OPTIMALITY = MessageType(
     "Optimality",
-    (
-        Field(1, "step", _SFIXED64),
-        Field(2, "episode", _SFIXED64),
-        Field(3, "evaluation", _SFIXED64),
-        Field(4, "starts", _SFIXED64),
-        Field(5, "success_percent", _DOUBLE),
-        Field(6, "timeout_percent", _DOUBLE),
-        Field(7, "mean_length", _DOUBLE),
-        Field(8, "mean_penalties", _DOUBLE),
-        Field(9, "mean_returns", _DOUBLE, repeated=True),
-        Field(10, "values", _DOUBLE, repeated=True),
-        Field(11, "best_responses", _DOUBLE, repeated=True),
-        Field(12, "optimal_value", _DOUBLE),
-        Field(13, "optimal_success_percent", _DOUBLE),
-        Field(14, "optimal_mean_length", _DOUBLE),
-        Field(15, "cycle_states", _SFIXED64, repeated=True),
-        Field(16, "cycle_lengths", _SFIXED64, repeated=True),
-        Field(17, "cycle_percents", _DOUBLE, repeated=True),
+    _fields(
+        step=_SFIXED64,
+        episode=_SFIXED64,
+        evaluation=_SFIXED64,
+        starts=_SFIXED64,
+        success_percent=_DOUBLE,
+        timeout_percent=_DOUBLE,
+        mean_length=_DOUBLE,
+        mean_penalties=_DOUBLE,
+        mean_returns=[_DOUBLE],
+        values=[_DOUBLE],
+        best_responses=[_DOUBLE],
+        optimal_value=_DOUBLE,
+        optimal_success_percent=_DOUBLE,
+        optimal_mean_length=_DOUBLE,
+        cycle_states=[_SFIXED64],
+        cycle_lengths=[_SFIXED64],
+        cycle_percents=[_DOUBLE],
     ),
 )
 """Exact measures of the greedy policy over all start states; cycles by their lowest state."""
 Q_TABLE = MessageType(
     "QTable",
-    (
-        Field(1, "step", _SFIXED64),
-        Field(2, "episode", _SFIXED64),
-        Field(3, "agent", _STRING),
-        Field(4, "table", _FIXED32),
-        Field(5, "shape", _FIXED32, repeated=True),
-        Field(6, "dtype", _STRING),
-        Field(7, "data", _BYTES),
+    _fields(
+        step=_SFIXED64,
+        episode=_SFIXED64,
+        agent=_STRING,
+        table=_FIXED32,
+        shape=[_FIXED32],
+        dtype=_STRING,
+        data=_BYTES,
     ),
 )
 LOG = MessageType(
     "Log",
-    (
-        Field(1, "timestamp", Pb.TYPE_MESSAGE),
-        Field(2, "level", Pb.TYPE_ENUM),
-        Field(3, "message", _STRING),
-        Field(4, "name", _STRING),
-        Field(5, "file", _STRING),
-        Field(6, "line", _FIXED32),
-    ),
+    _fields(timestamp=_MESSAGE, level=_ENUM, message=_STRING, name=_STRING, file=_STRING, line=_FIXED32),
     package="foxglove",
 )
 """Foxglove's own log message, so that viewers show it as text."""
 
 RESET = MessageType(
     "Reset",
-    (
-        Field(1, "observation", _BYTES),
-        Field(2, "reset", _SFIXED64),
-        Field(3, "episode", _SFIXED64),
-        Field(4, "step", _SFIXED64),
-        Field(5, "environment", _FIXED32),
-        Field(6, "seed", _FIXED64),
-        Field(7, "seeded", _BOOL),
+    _fields(
+        observation=_BYTES,
+        reset=_SFIXED64,
+        episode=_SFIXED64,
+        step=_SFIXED64,
+        environment=_FIXED32,
+        seed=_FIXED64,
+        seeded=_BOOL,
     ),
 )
 RESET_STATE = MessageType(
     "ResetState",
-    (
-        Field(1, "reset", _SFIXED64),
-        Field(2, "environment", _FIXED32),
-        Field(3, "np_random_seed", _BYTES),
-        Field(4, "bit_generator", _BYTES),
-        Field(5, "ale_state", _BYTES),
+    _fields(
+        reset=_SFIXED64, environment=_FIXED32, np_random_seed=_BYTES, bit_generator=_BYTES, ale_state=_BYTES
     ),
 )
 """What a reset without a seed depends on; `reset_states` describes its fields."""
 RESET_OPTIONS = MessageType(
-    "ResetOptions",
-    (
-        Field(1, "reset", _SFIXED64),
-        Field(2, "json", _STRING),
-        Field(3, "large_seed", _STRING),
-        Field(4, "resets", _FIXED32),
-    ),
+    "ResetOptions", _fields(reset=_SFIXED64, json=_STRING, large_seed=_STRING, resets=_FIXED32)
 )
 """What a reset was called with, if there is more than a seed; `reset_options` describes its fields."""
-INFO = MessageType("Info", (Field(1, "step", _SFIXED64), Field(2, "reset", _BOOL), Field(3, "json", _STRING)))
+INFO = MessageType("Info", _fields(step=_SFIXED64, reset=_BOOL, json=_STRING))
 SCALAR = MessageType(
     "Scalar",
-    (
-        Field(1, "name", _STRING),
-        Field(2, "value", _DOUBLE),
-        Field(3, "phase", _STRING),
-        Field(4, "step", _SFIXED64),
-        Field(5, "episode", _SFIXED64),
-    ),
+    _fields(name=_STRING, value=_DOUBLE, phase=_STRING, step=_SFIXED64, episode=_SFIXED64),
 )
 ARRAY = MessageType(
     "Array",
-    (
-        Field(1, "name", _STRING),
-        Field(2, "phase", _STRING),
-        Field(3, "step", _SFIXED64),
-        Field(4, "episode", _SFIXED64),
-        Field(5, "shape", _FIXED32, repeated=True),
-        Field(6, "dtype", _STRING),
-        Field(7, "data", _BYTES),
+    _fields(
+        name=_STRING,
+        phase=_STRING,
+        step=_SFIXED64,
+        episode=_SFIXED64,
+        shape=[_FIXED32],
+        dtype=_STRING,
+        data=_BYTES,
     ),
 )
 IMAGE = MessageType(
     "CompressedImage",
-    (
-        Field(1, "timestamp", Pb.TYPE_MESSAGE),
-        Field(2, "data", _BYTES),
-        Field(3, "format", _STRING),
-        Field(4, "frame_id", _STRING),
-    ),
+    _fields(timestamp=_MESSAGE, data=_BYTES, format=_STRING, frame_id=_STRING),
     package="foxglove",
 )
 """Foxglove's own image message, so that viewers show it as a picture."""
 
-EXTRA_COLUMNS = MessageType("ExtraColumns", (Field(1, "json", _STRING), Field(2, "layout", _FIXED32)))
+EXTRA_COLUMNS = MessageType("ExtraColumns", _fields(json=_STRING, layout=_FIXED32))
 """The names of extras, with dtypes and shapes: the description of a `Dict` space, and its number."""
 EXTRA = MessageType("Extra", (Field(3, "step", _SFIXED64, dtype=np.dtype("<i8")),), varies=True)
 """The values that a loop recorded with a step; `extras` adds the fields of a layout's names."""
 CHECKPOINT = MessageType(
     "Checkpoint",
-    (
-        Field(1, "name", _STRING),
-        Field(2, "phase", _STRING),
-        Field(3, "step", _SFIXED64),
-        Field(4, "episode", _SFIXED64),
-        Field(5, "digest", _STRING),
-        Field(6, "size", _SFIXED64),
-        Field(7, "format", _STRING),
+    _fields(
+        name=_STRING,
+        phase=_STRING,
+        step=_SFIXED64,
+        episode=_SFIXED64,
+        digest=_STRING,
+        size=_SFIXED64,
+        format=_STRING,
     ),
 )
 """A reference to content in the store next to the recordings, by its BLAKE3."""
-CLOCK = MessageType("Clock", (Field(1, "started", _DOUBLE), Field(2, "seconds", _DOUBLE)))
+CLOCK = MessageType("Clock", _fields(started=_DOUBLE, seconds=_DOUBLE))
 """How much time had passed at its position; `clock` describes its fields."""
-_HOST_FIELDS = (
-    "started",
-    "seconds",
-    "cpu_percent",
-    "memory_bytes",
-    "host_cpu_percent",
-    "host_memory_bytes",
-    "host_memory_total",
-    "disk_read_bytes",
-    "disk_written_bytes",
-    "disk_free_bytes",
-    "network_received_bytes",
-    "network_sent_bytes",
-    "gpu_percent",
-    "gpu_memory_bytes",
-    "gpu_memory_total",
-)
 HOST = MessageType(
     "Host",
-    tuple(
-        Field(number, name, _DOUBLE, repeated=name.startswith("gpu_"))
-        for number, name in enumerate(_HOST_FIELDS, 1)
+    _fields(
+        started=_DOUBLE,
+        seconds=_DOUBLE,
+        cpu_percent=_DOUBLE,
+        memory_bytes=_DOUBLE,
+        host_cpu_percent=_DOUBLE,
+        host_memory_bytes=_DOUBLE,
+        host_memory_total=_DOUBLE,
+        disk_read_bytes=_DOUBLE,
+        disk_written_bytes=_DOUBLE,
+        disk_free_bytes=_DOUBLE,
+        network_received_bytes=_DOUBLE,
+        network_sent_bytes=_DOUBLE,
+        gpu_percent=[_DOUBLE],
+        gpu_memory_bytes=[_DOUBLE],
+        gpu_memory_total=[_DOUBLE],
     ),
 )
 """What the process and its host used at a moment; NaN is unknown. `host` describes its fields."""
 CONSOLE = MessageType(
     "Console",
-    (
-        Field(1, "started", _DOUBLE),
-        Field(2, "seconds", _DOUBLE),
-        Field(3, "stream", _FIXED32),
-        Field(4, "line", _SFIXED64),
-        Field(5, "text", _STRING),
-    ),
+    _fields(started=_DOUBLE, seconds=_DOUBLE, stream=_FIXED32, line=_SFIXED64, text=_STRING),
 )
-"""A line of the process's output; one of the same number, stream and session replaces it."""
+"""A line of the process's output; a later line of the same number, stream and session replaces it."""
 
-ACTIONS = MessageType(
-    "Actions",
-    (
-        Field(1, "step", _SFIXED64),
-        Field(2, "count", _FIXED32),
-        Field(3, "data", _BYTES),
-        Field(4, "digests", _BYTES),
-    ),
-)
+ACTIONS = MessageType("Actions", _fields(step=_SFIXED64, count=_FIXED32, data=_BYTES, digests=_BYTES))
 """A block of steps of which only the actions were recorded; `actions` describes its columns."""
 
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
