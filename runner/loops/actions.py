@@ -14,7 +14,7 @@ from gymnasium.wrappers import StickyAction
 from runner.environments.gym_types import Space
 from runner.environments.naming import spoken
 from runner.errors import ConfigError, nearest, shortened
-from runner.recording.gym_spaces import comes_from_text, value_of
+from runner.recording.gym_spaces import recorded_space, value_of
 from runner.recording.maker import MAX_NAMES
 from runner.recording.spaces import Value
 from runner.util.values import is_text
@@ -117,7 +117,7 @@ def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], 
         if isinstance(given, str) and given in space:
             return given
         raise ConfigError(f"{where}: found {_short(given)}, expected a text of {space}")
-    if comes_from_text(space):
+    if recorded_space(space).comes_from_text:
         return _parsed_json(space, given, where)
     try:
         values = given.split(",") if isinstance(given, str) else given

@@ -14,7 +14,7 @@ from runner.environments.gym_types import Space
 from runner.environments.loading import mdp_of
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.recording.gym_spaces import describe_space, parts_of
+from runner.recording.gym_spaces import checked_leaves, recorded_space
 from runner.recording.layout import Layout, layout_of
 from runner.recording.metadata import Attachments, environment_attachments
 from runner.util.jsonable import as_json
@@ -55,8 +55,8 @@ class Described:
     """The kind of recording, a key of `schema.KINDS`."""
 
     def __post_init__(self) -> None:
-        parts_of(self.observation, "the observation space")
-        parts_of(self.action, "the action space")
+        checked_leaves(self.observation, "the observation space")
+        checked_leaves(self.action, "the action space")
 
     @property
     def recorded_action(self) -> Space:
@@ -67,12 +67,12 @@ class Described:
     def _spaces(self) -> dict[str, Any]:
         """The descriptions of the environment's own spaces."""
         spaces_of = {"observation": self.observation, "action": self.action}
-        return {name: describe_space(space) for name, space in spaces_of.items()}
+        return {name: recorded_space(space).describe() for name, space in spaces_of.items()}
 
     @cached_property
     def recorded_spaces(self) -> dict[str, Any]:
         """The descriptions of both spaces, of actions as they are recorded."""
-        wide = {} if self.wide_action is None else {"action": describe_space(self.wide_action)}
+        wide = {} if self.wide_action is None else {"action": recorded_space(self.wide_action).describe()}
         return self._spaces | wide
 
     @cached_property

@@ -26,7 +26,7 @@ from runner.loops.outcomes import Outcomes
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.actions import ACTION_TOPICS
 from runner.recording.compaction import compacted
-from runner.recording.gym_spaces import can_widen, widened
+from runner.recording.gym_spaces import recorded_space
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, write_description, write_maker, write_result
 from runner.recording.recorder import Recorder
@@ -56,7 +56,7 @@ class LoopRun:
         are not written yet."""
         self._config = options.config(described)
         self._is_described = False
-        self.is_settled = not can_widen(described.action)
+        self.is_settled = not recorded_space(described.action).can_widen()
         """Whether the dtypes of all values are known."""
         self._provenance = provenance_entries(with_command=options.packing.code)
         facts = {"provenance": made_by(self._provenance), "spaces": described.common}
@@ -164,7 +164,7 @@ class LoopRun:
         if self.is_settled:
             return False
         self.is_settled = True
-        wide = widened(self.described.action, action)
+        wide = recorded_space(self.described.action).widened(action)
         if wide is self.described.action:
             return False
         self.described = replace(self.described, wide_action=wide)

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.recording.gym_values import NO_VALUE, Leaf, SpaceValues, leaf_column
+from runner.recording.gym_values import NO_VALUE, Leaf, SpaceValues
 from runner.recording.spaces import Value
 from runner.util.arrays import Array, Records
 
@@ -60,10 +60,10 @@ class _Source:
             fit: called with other values; by default they are fitted.
         """
         value, shape = f"v{len(self._scope)}", batch + leaf.shape
-        inside = whole + "".join(f"[{self.name(key)}]" for key in leaf.part.keys)
+        inside = whole + "".join(f"[{self.name(key)}]" for key in leaf.keys)
         if values.agents:
             zeros = self.name(np.zeros(shape, leaf.base)[()])
-            inside = f"{inside} if {self.name(leaf.part.keys[0])} in {whole} else {zeros}"
+            inside = f"{inside} if {self.name(leaf.keys[0])} in {whole} else {zeros}"
         if scalars is None:
             return f"({inside})"
         test = f"({value} := {inside}).__class__ is ndarray and {value}.dtype is {self.name(leaf.base)}"
@@ -76,7 +76,7 @@ class _Source:
         """Return how the leaves of a value of one environment are packed, and expressions for them."""
         codes, expressions = "", []
         for leaf in values.leaves:
-            code = "" if leaf.shape else _CODES.get(leaf_column(leaf, column).dtype.str, "")
+            code = "" if leaf.shape else _CODES.get(leaf.column_in(column).dtype.str, "")
             scalars: frozenset[type] | None = leaf.exact_scalars
             if not code and not leaf.shape:
                 scalars = frozenset([leaf.base.type])
@@ -114,7 +114,7 @@ def filler(values: SpaceValues, column: Array, batch: tuple[int, ...] = ()) -> P
     for leaf in () if column.dtype.hasobject else values.leaves:
         scalars = frozenset() if batch else leaf.exact_scalars
         expression = source.value("value", values, leaf, scalars, batch)
-        lines.append(f"try: {source.name(leaf_column(leaf, column))}[row] = {expression}")
+        lines.append(f"try: {source.name(leaf.column_in(column))}[row] = {expression}")
         lines.append(f"except NO_VALUE as error: raise {source.name(leaf.refused)}(error) from error")
     function: Put = source.function("row, value", *lines)
     return function

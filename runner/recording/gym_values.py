@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, Final
 
 import numpy as np
 
 from runner.errors import RecordingError
-from runner.recording.gym_leaves import Part
-from runner.recording.gym_spaces import parts_of
+from runner.recording.gym_spaces import Keys, RecordedSpace, checked_leaves
 from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
 from runner.util.arrays import Array, zeros
 
@@ -28,25 +27,40 @@ class Leaf:
     """A part of a space without parts of its own, with the checks that its values pass.
 
     Args:
+        keys: the keys of the `Dict`s and `Tuple`s around it, from the outermost in.
+        space: the part.
         what: `observation` or `action`. An action may have another shape with as many numbers, because only
             the environment knows which shapes it accepts.
         on_rounded: called with a text the first time that a value is rounded.
     """
 
-    def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:
-        self.part = part
-        self._on_rounded = on_rounded
-        self.name = what + "".join(f"[{key!r}]" for key in part.keys)
-        self._what = what
-        self.blank = encode_text("") if part.dtype is None else bytes(part.dtype.itemsize)
+    def __init__(self, keys: Keys, space: RecordedSpace[Any], what: str, on_rounded: OnRounded) -> None:
+        self.keys, self._space, self._what, self._on_rounded = keys, space, what, on_rounded
+        self.name = what + "".join(f"[{key!r}]" for key in keys)
+        self.blank = encode_text("") if space.dtype is None else bytes(space.dtype.itemsize)
         """The bytes of the value of an agent that has none."""
-        if part.dtype is None:
+        if space.dtype is None:
             return
-        self.base = np.dtype(part.dtype.base.str)
-        self.shape = part.dtype.shape
-        self.exact_scalars = frozenset() if self.shape else _exact_scalars(self.base)
-        """Classes whose values are all recorded exactly, or refused by NumPy."""
+        self.base = np.dtype(space.dtype.base.str)
+        self.shape = space.dtype.shape
         self._is_rounded = False
+
+    @cached_property
+    def exact_scalars(self) -> frozenset[type]:
+        """Classes whose values are all recorded exactly, or refused by NumPy."""
+        return frozenset() if self.shape else _exact_scalars(self.base)
+
+    def value_in(self, whole: Value) -> Value:
+        """Return the value of this leaf in a value of the whole space."""
+        for key in self.keys:
+            whole = whole[key]
+        return whole
+
+    def column_in(self, whole: Any) -> Any:
+        """Return the part of a column of whole values that holds the values of this leaf."""
+        for key in self.keys:
+            whole = whole[str(key)]
+        return whole
 
     def fit(self, value: object, batch: tuple[int, ...] = ()) -> Any:
         """Return a value as an array of the leaf's dtype.
@@ -94,9 +108,8 @@ class Leaf:
             if isinstance(values, str | bytes | Mapping) or len(values) != batch[0]:
                 raise ValueError(f"found {type(values).__name__}, expected a batch of {batch[0]}")
             return [piece for value in values for piece in self.pieces(value, batch[1:])]
-        if self.part.text is not None:
-            return [encode_text(self.part.text(values))]
-        return [self.fit(values).tobytes()]
+        is_text = self._space.dtype is None
+        return [encode_text(self._space.text(values)) if is_text else self.fit(values).tobytes()]
 
     def refused(self, reason: object) -> RecordingError:
         """Return the error for a value that is not of the space."""
@@ -107,9 +120,7 @@ class Leaf:
 class StateLeaf(Leaf):
     """A `Discrete` space with the states or the actions of one environment: any whole number is exact."""
 
-    def __init__(self, part: Part, what: str, on_rounded: OnRounded) -> None:
-        super().__init__(part, what, on_rounded)
-        self.exact_scalars = frozenset([int])  # others are converted
+    exact_scalars = frozenset([int])  # others are converted
 
     def fit(self, value: object, batch: tuple[int, ...] = ()) -> int:  # noqa: ARG002
         """Return a whole number, which may stand in an array of one.
@@ -138,8 +149,8 @@ class SpaceValues:
         leaf: type[Leaf] = Leaf,
         is_game: bool = False,
     ) -> None:
-        parts = parts_of(space, "the agents' spaces" if is_game else f"the {what} space")
-        self.leaves = [leaf(part, what, on_rounded) for part in parts]
+        where = "the agents' spaces" if is_game else f"the {what} space"
+        self.leaves = [leaf(*part, what, on_rounded) for part in checked_leaves(space, where)]
         self.agents: tuple[object, ...] = tuple(space.spaces) if is_game else ()
         """All agents of a game."""
 
@@ -165,7 +176,7 @@ class SpaceValues:
         column = zeros(batch, dtype)
         for leaf in self.leaves:
             try:
-                leaf_column(leaf, column)[...] = leaf.fit(leaf.part.of(value), batch)
+                leaf.column_in(column)[...] = leaf.fit(leaf.value_in(value), batch)
             except NO_VALUE as error:
                 raise leaf.refused(error) from error
         return column
@@ -174,7 +185,7 @@ class SpaceValues:
         """Return an unknown value as it stands in a column of this dtype: NaN, and 0 for whole numbers."""
         value = zeros((), dtype)
         for leaf in self.leaves:
-            leaf_column(leaf, value)[...] = np.nan if leaf.base.kind == "f" else 0
+            leaf.column_in(value)[...] = np.nan if leaf.base.kind == "f" else 0
         return value
 
     def to_bytes(self, value: Value, batch: tuple[int, ...] = ()) -> list[bytes]:
@@ -186,10 +197,10 @@ class SpaceValues:
         columns = []
         for leaf in self.leaves:
             try:
-                if self.agents and leaf.part.keys[0] not in value:
+                if self.agents and leaf.keys[0] not in value:
                     columns.append([leaf.blank])
                 else:
-                    columns.append(leaf.pieces(leaf.part.of(value), batch))
+                    columns.append(leaf.pieces(leaf.value_in(value), batch))
             except (*NO_VALUE, AttributeError, RecursionError) as error:
                 raise leaf.refused(error) from error
         whole = [b"".join(pieces[k] for pieces in columns) for k in range(math.prod(batch))]
@@ -204,13 +215,6 @@ def _exact_scalars(base: np.dtype[np.generic]) -> frozenset[type]:
     return frozenset(
         scalars | {bool} | ({int} if base.kind in "iu" else {float} if base.char == "d" else set())
     )
-
-
-def leaf_column(leaf: Leaf, column: Any) -> Any:
-    """Return the part of a column of whole values that holds those of a leaf."""
-    for name in leaf.part.fields:
-        column = column[name]
-    return column
 
 
 def only_number(value: object, what: str, kinds: str = "iubf", expected: str = "a number") -> Array:

@@ -18,7 +18,7 @@ from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
 from runner.recording.fillers import filler
-from runner.recording.gym_spaces import describe_space, value_of
+from runner.recording.gym_spaces import recorded_space, value_of
 from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
@@ -191,7 +191,7 @@ class Stepper:
             CannotRedo: one has other parts, shapes or numbers of values.
         """
         for name, space in (("observation", self.observation_space), ("action", self.action_space)):
-            recorded, found = self._recording.spaces[name], describe_space(space)
+            recorded, found = self._recording.spaces[name], recorded_space(space).describe()
             shapes = [
                 [(leaf.path, leaf.dtype and leaf.dtype.shape) for leaf in recorded_leaves(each, name)]
                 for each in (recorded, found)

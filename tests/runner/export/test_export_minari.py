@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.cli import cli
-from runner.recording.gym_spaces import describe_space, restore_space
+from runner.recording.gym_spaces import recorded_space, restore_space
 from tests.runner.loops.making import NAMES, Rooms, make, play
 
 pytest.importorskip("minari")
@@ -183,4 +183,4 @@ def test_a_phase_without_an_episode_is_refused(tmp_path):
     ids=str,
 )
 def test_a_space_is_restored_from_its_description(space):
-    assert restore_space(describe_space(space)) == space
+    assert restore_space(recorded_space(space).describe()) == space

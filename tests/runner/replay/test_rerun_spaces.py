@@ -10,7 +10,7 @@ from gymnasium import spaces
 import runner
 from runner.errors import CannotRedo, ConfigError
 from runner.execution.verify import check_integrity
-from runner.recording.gym_spaces import text_of, value_of
+from runner.recording.gym_spaces import recorded_space, value_of
 from runner.recording.reader import open_recording
 from tests.runner.replay import varied
 from tests.runner.replay.loops import rerun_steps
@@ -35,11 +35,12 @@ def test_actions_and_observations_of_any_space_come_out_again(name, is_seeded, t
 def test_a_value_comes_back_from_its_text(name):
     space = varied.SPACES[name]
     space.seed(1)
+    recorded = recorded_space(space)
     for _ in range(20):
         value = space.sample()
-        back = value_of(space, text_of(space, value))
+        back = value_of(space, recorded.text(value))
         assert back in space
-        assert text_of(space, back) == text_of(space, value)
+        assert recorded.text(back) == recorded.text(value)
 
 
 @pytest.mark.parametrize("text", ["{", "[9, 1]", "[-1, 0]", "[1]", "3", '{"a": 1}', "[0, [[" + "[" * 9999])
