@@ -33,7 +33,7 @@ from runner.recording.schema import MessageType
 from runner.recording.space_fields import has_one_size, space_field
 from runner.recording.spaces import Description, encode_bytes, encode_text, item_dtype, leaf_dtype, row_dtype
 from runner.recording.spaces import decode as decode_value
-from runner.recording.topic_chunks import TopicChunks
+from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Array, MaskedArray, zeros
 from runner.util.values import is_text, is_whole
@@ -282,7 +282,8 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         """
         for layout, chunks in self.parts:
             is_all = not start and stop is None
-            for rows in chunks.rows() if is_all else chunks.rows_between("step", start, stop):
+            limit = FOREVER if stop is None else stop
+            for rows in chunks.rows() if is_all else chunks.rows_between("step", start, limit):
                 yield self._with_objects(layout, rows) if layout.varying["spaces"] else rows
 
     def _with_objects(self, layout: ExtraLayout, rows: NDArray[np.void]) -> NDArray[np.void]:

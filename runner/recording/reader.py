@@ -48,7 +48,7 @@ from runner.recording.run_file import RecentTraining, run_title
 from runner.recording.schema import Topic, topics_of
 from runner.recording.spaces import decode as decode_value
 from runner.recording.steps import EpisodeSteps, Steps
-from runner.recording.topic_chunks import FOREVER, ChunkFile, TopicChunks, channels_of
+from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.turns import taken
 
 MAX_METRICS: Final = 1 << 17
@@ -111,10 +111,10 @@ class Recording(RunDescription):
             topic = named[0]
         if topic not in self._tables:
             message, lost = self.layout.message(topic), self.lost.get(topic.name, [])
-            chunks = self._file, topic, self._places[topic], message, lost
+            chunks = self.file, topic, self._places[topic], message, lost
             if topic.message is schema.STEP:
                 actions = self.table(topics_of(topic.phase).actions)
-                self._tables[topic] = Steps(*chunks, actions=actions)
+                self._tables[topic] = Steps(*chunks, actions=actions, environments=self.environments)
             elif topic.message in (schema.TRAIN_METRICS, schema.EVAL_METRICS, schema.OPTIMALITY):
                 channel = self.file.index.channels.get(topic.channel)
                 recorded = self.file.index.schemas.get(channel.schema_id) if channel else None
@@ -127,18 +127,9 @@ class Recording(RunDescription):
         return self._tables[topic]
 
     @cached_property
-    def _file(self) -> ChunkFile:
-        return ChunkFile(str(self.path), self.file.index.chunks, self.file, self.environments)
-
-    @cached_property
-    def _channels(self) -> NDArray[np.uint16]:
-        """The channel of each chunk of the file."""
-        return channels_of(self.file.index, self.file, str(self.path))
-
-    @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
         """The numbers of the chunks of the file that hold each topic; of extras, those of all layouts."""
-        channels = self._channels % schema.LAYOUT_STRIDE
+        channels = self.file.channels % schema.LAYOUT_STRIDE
         return {topic: np.flatnonzero(channels == topic.channel) for topic in schema.ALL_TOPICS}
 
     @cached_property
@@ -397,7 +388,7 @@ class Phase:
         table, where = self._recording.table(self.topics.extras), str(self._recording.path)
         layouts = {layout.number: layout for layout in extra_layouts(self._recording)} if table else {}
         schemas, parts = self._recording.file.index.schemas, []
-        channels = self._recording._channels[table.places]
+        channels = self._recording.file.channels[table.places]
         for channel in np.unique(channels).tolist():
             topic = schema.TOPIC_OF[channel]
             layout = layouts.get(channel // schema.LAYOUT_STRIDE)

@@ -14,6 +14,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Final, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, first_channel, unpack_chunk
@@ -44,14 +47,14 @@ class RecordStore:
     """
 
     def __init__(self, path: Path) -> None:
-        self._path = str(path)
+        self.path = str(path)
         try:
             self._stream = open_regular(path)
         except (OSError, ValueError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise RecordingError(f"{path}: cannot be read ({reason}).") from error
         try:
-            self.index = read_index(self._stream, self._path)
+            self.index = read_index(self._stream, self.path)
         except BaseException as error:
             self._stream.close()
             if isinstance(error, OSError):
@@ -112,20 +115,18 @@ class RecordStore:
         """Return a metadata record or an attachment, whose checksum is compared."""
         if name not in places:
             raise RecordingError(
-                f"{self._path}: has no {what} {name!r}; it was cut off, or not written by dualtaxi."
+                f"{self.path}: has no {what} {name!r}; it was cut off, or not written by dualtaxi."
             )
         offset, length = places[name]
         raw = self._raw(offset, length, MAX_METADATA_BYTES if kind is MetadataRecord else MAX_CHUNK_BYTES)
         try:
             record = read_record(raw)
         except RecordingError as error:
-            raise RecordingError(f"{self._path}: {error}.") from error
+            raise RecordingError(f"{self.path}: {error}.") from error
         if not isinstance(record, kind):
             raise self._another(raw)
         if record.name != name:
-            raise RecordingError(
-                f"{self._path}: found {what} {record.name!r} at {offset}, expected {name!r}."
-            )
+            raise RecordingError(f"{self.path}: found {what} {record.name!r} at {offset}, expected {name!r}.")
         return record
 
     def chunk_body(self, entry: ChunkEntry) -> memoryview:
@@ -158,9 +159,23 @@ class RecordStore:
         while pending:
             yield self._result(*pending.popleft())
 
-    def first_channel(self, entry: ChunkEntry) -> int:
-        """Return the channel of a chunk's first message, where no index states it."""
-        return first_channel(self.chunk_body(entry), self._where(entry))
+    @cached_property
+    def channels(self) -> NDArray[np.uint16]:
+        """The channel of each chunk.
+
+        Raises:
+            RecordingError: the recording has no such channel.
+        """
+        chunks = self.index.chunks
+        channels: NDArray[np.uint16] = chunks.columns["channel"].copy()
+        for k in np.flatnonzero(channels == 0).tolist():  # the file was cut off before the chunk's index
+            channels[k] = first_channel(self.chunk_body(chunks[k]), self._where(chunks[k]))
+        for k in np.flatnonzero(~np.isin(channels, list(self.index.channels))).tolist():
+            raise RecordingError(
+                f"{self._where(chunks[k])}: found messages of channel {channels[k]}, which the recording "
+                "does not have."
+            )
+        return channels
 
     @cached_property
     def _threads(self) -> ThreadPoolExecutor:
@@ -191,13 +206,13 @@ class RecordStore:
         return records
 
     def _where(self, entry: ChunkEntry) -> str:
-        return f"{self._path}: chunk at {entry.offset}"
+        return f"{self.path}: chunk at {entry.offset}"
 
     def _raw(self, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> RawRecord:
         """Return a record whose length, with its head, is known."""
         if length > max_bytes:
             raise RecordingError(
-                f"{self._path}: the record at {offset} declares {length:,} bytes, "
+                f"{self.path}: the record at {offset} declares {length:,} bytes, "
                 f"expected at most {max_bytes:,}."
             )
         try:
@@ -205,13 +220,13 @@ class RecordStore:
                 self._stream.seek(offset)
                 head, body = self._stream.read(RECORD_HEAD.size), self._stream.read(length - RECORD_HEAD.size)
         except OSError as error:
-            raise RecordingError(f"{self._path}: cannot be read at {offset} ({error.strerror}).") from error
+            raise RecordingError(f"{self.path}: cannot be read at {offset} ({error.strerror}).") from error
         if len(head) + len(body) != length:
-            raise RecordingError(f"{self._path}: the record at {offset} is cut off.")
+            raise RecordingError(f"{self.path}: the record at {offset} is cut off.")
         raw = RawRecord.of(head, offset, body)
         if raw.length != len(body):
             raise self._another(raw)
         return raw
 
     def _another(self, raw: RawRecord) -> RecordingError:
-        return RecordingError(f"{self._path}: found another record at {raw.offset} than the index says.")
+        return RecordingError(f"{self.path}: found another record at {raw.offset} than the index says.")

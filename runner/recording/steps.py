@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.actions import kept_dtype, unpacked
-from runner.recording.topic_chunks import FOREVER, TopicChunks
+from runner.recording.topic_chunks import FOREVER, TopicChunks, within
 from runner.recording.turns import is_of_environment, taken
 
 
@@ -21,6 +21,8 @@ class Steps(TopicChunks):
 
     actions: TopicChunks
     """The messages of steps of which only the actions were recorded."""
+    environments: int
+    """How many environments take turns."""
 
     @property
     def are_actions(self) -> bool:
@@ -39,8 +41,8 @@ class Steps(TopicChunks):
 
     def round_of(self, number: int) -> range:
         """Return the numbers of the rows in the round of a row: environments of a vector step at once."""
-        start = number - number % self.file.environments
-        return range(start, start + self.file.environments)
+        start = number - number % self.environments
+        return range(start, start + self.environments)
 
     def taken(self) -> Iterator[NDArray[np.void]]:
         """Yield the steps in blocks, as `rows`, without turns at which an environment was only reset."""
@@ -68,19 +70,19 @@ class Steps(TopicChunks):
             RecordingError: they are damaged.
         """
         if not self.are_actions:
-            yield from super().rows(times)
-            return
+            return super().rows(times)
+        if times is None:
+            return self._unpacked()
         # A message has the time of its last step.
-        for block in self._unpacked(times=times and range(times.start, FOREVER)):
-            log_time = block["log_time"]
-            if times is not None and log_time[0] >= times.stop:
-                return
-            yield block if times is None else block[(log_time >= times.start) & (log_time < times.stop)]
+        blocks = self._unpacked(times=range(times.start, FOREVER))
+        return within(blocks, "log_time", max(times.start, 0), max(times.stop, 0))
 
-    def _blocks_from(self, start: int, stop: int) -> Iterator[NDArray[np.void]]:
-        if not self.are_actions:
-            return super()._blocks_from(start, stop)
-        return self._unpacked(chunks=self.actions.chunks_from("step", start))
+    def numbered(self, numbers: range) -> Iterator[NDArray[np.void]]:
+        """Yield the steps of these numbers in blocks, as `rows` does."""
+        if not (self.are_actions and numbers):
+            return super().numbered(numbers)
+        blocks = self._unpacked(chunks=self.actions.chunks_from("step", numbers.start))
+        return within(blocks, "step", numbers.start, numbers.stop)
 
     def _unpacked(
         self, times: range | None = None, chunks: Sequence[int] | None = None
@@ -88,7 +90,7 @@ class Steps(TopicChunks):
         """Yield the steps of each message with actions, as `TopicChunks.messages` selects them."""
         where = f"{self.file.path}: {self.actions.topic.name}"
         for fields in self.actions.decoded(times=times, chunks=chunks):
-            yield unpacked(fields, self.row_dtype, self.file.environments, where)
+            yield unpacked(fields, self.row_dtype, self.environments, where)
 
     @cached_property
     def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
