@@ -24,6 +24,7 @@ from runner.recording import schema
 from runner.recording.actions import ACTION_TOPICS, after_step
 from runner.recording.description import recorded_facts
 from runner.recording.digest import combined_digest
+from runner.recording.observer import Observer
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
@@ -265,7 +266,7 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     """
     topics = {phase: recording.phase(phase).steps.topic for phase in schema.PHASES}
     packing = recorded_packing(recording.config)
-    recorder = Recorder(file, recording.layout, packing)
+    recorder = Recorder(file, recording.layout, packing, observer=Observer(file.path.parent))
     try:
         with closing(Replay(recording, trust)) as replay:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}

@@ -30,6 +30,7 @@ from runner.recording.metadata import (
     write_result,
 )
 from runner.recording.metrics import METRICS, defined_metrics
+from runner.recording.observer import Observer
 from runner.recording.recorder import Recorder
 from runner.recording.reference import Reference
 from runner.recording.reuse import PackedChunks
@@ -329,6 +330,10 @@ def recorder_for(
 ) -> Recorder:
     """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
     options, learners, events = job.config.recording, len(learner.agents), len(learner.mdp.event_names)
+    observer = None
+    if clock and file is not None:
+        console = LineRedactor() if options.console else None
+        observer = Observer(file.path.parent, options.system, console)
     return Recorder(
         file,
         layout_of("job", learners, events),
@@ -337,9 +342,7 @@ def recorder_for(
         reference=reference,
         beat=beat,
         threads=threads,
-        clock=clock,
-        system=options.system,
-        console=LineRedactor() if options.console else None,
+        observer=observer,
         packed=packed,
     )
 

@@ -43,6 +43,7 @@ from runner.recording.messages import (
     log_level,
 )
 from runner.recording.metadata import json_object, layout_of_run, write_result
+from runner.recording.observer import Observer
 from runner.recording.recorder import Recorder
 from runner.recording.reset_options import ResetOptions
 from runner.recording.reset_states import ResetState
@@ -194,6 +195,7 @@ class _Fold:
                 layout,
                 packing=packing,
                 watch=self._outcomes.take_records,
+                observer=Observer(fresh.parent),
             )
             self._recorder = recorder
             try:

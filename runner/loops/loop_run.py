@@ -29,6 +29,7 @@ from runner.recording.compaction import compacted
 from runner.recording.gym_spaces import recorded_space
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, write_description, write_maker, write_result
+from runner.recording.observer import Observer
 from runner.recording.recorder import Recorder
 from runner.recording.schema import Topic
 from runner.recording.syncing import SYNCER
@@ -78,8 +79,11 @@ class LoopRun:
             watch=self._watch,
             before=self.describe,
             grouped=True,
-            system=options.packing.system and not is_shard,
-            console=LineRedactor() if options.packing.console and not is_shard else None,
+            observer=Observer(
+                self.run.folder,
+                options.packing.system and not is_shard,
+                LineRedactor() if options.packing.console and not is_shard else None,
+            ),
         )
         self._actions = (
             ActionRecorder(self.recorder, described.environments, options.packing.chunk_steps)

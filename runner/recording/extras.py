@@ -31,12 +31,12 @@ from runner.recording.metadata import json_object
 from runner.recording.records import ReadChunk, check_constants
 from runner.recording.schema import MessageType
 from runner.recording.space_fields import has_one_size, space_field
-from runner.recording.spaces import Description, encode_bytes, encode_text, item_dtype, leaf_dtype, row_dtype
+from runner.recording.spaces import Description, encode_bytes, encode_text, leaf_dtype, leaves_of, row_dtype
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Array, MaskedArray, zeros
-from runner.util.values import is_text, is_whole
+from runner.util.values import is_whole
 
 MAX_NAMES: Final = 256
 """The most names of extras in a recording; those of each agent count."""
@@ -94,6 +94,13 @@ class ExtraLayout:
     def beginning(self) -> Beginning:
         """Its schema and channels."""
         return beginning_of_extras(self.number, self.message)
+
+    def is_declared_in(self, index: Index) -> bool:
+        """Return whether a file has its schema and channels."""
+        schemas, channels, *_ = self.beginning
+        return all(index.schemas.get(schema.id) == schema for schema in schemas) and all(
+            index.channels.get(channel.id) == channel for channel in channels
+        )
 
     @property
     def fields(self) -> Message:
@@ -165,22 +172,14 @@ def _columns_of(description: dict[str, object], what: str) -> dict[str, Descript
     parts = description.get("spaces")
     if description.get("type") != "Dict" or not isinstance(parts, dict) or not 0 < len(parts) <= MAX_NAMES:
         raise RecordingError(f"{what}: found no mapping of 1 to {MAX_NAMES} names.")
-    size = 0
+    leaves = leaves_of(description, what)
     for name, part in parts.items():
-        if not is_text(name) or not 0 < len(name) <= MAX_NAME_LENGTH:
-            raise RecordingError(
-                f"{what}: found the name {name[:40]!r}, expected at most {MAX_NAME_LENGTH} letters."
-            )
-        if not isinstance(part, dict) or part.get("type") not in ("Box", "Array", "Text"):
+        if part["type"] not in ("Box", "Array", "Text"):
             raise RecordingError(f"{what}: {name!r} is no array of numbers, and no text.")
-        try:
-            dtype, item = leaf_dtype(part), item_dtype(part)
-        except (KeyError, ValueError) as error:
-            raise RecordingError(f"{what}: {name!r} is no array of numbers ({error}).") from error
-        size += sum(kind.itemsize for kind in (dtype, item) if kind is not None)
-        if dtype is not None and not dtype.itemsize:
-            raise RecordingError(f"{what}: {name!r} has no numbers.")
-    if size > MAX_EXTRA_BYTES:
+    dtypes = [dtype for leaf in leaves for dtype in (leaf.dtype, leaf.item) if dtype is not None]
+    if any(leaf.dtype is not None and not leaf.dtype.itemsize for leaf in leaves):
+        raise RecordingError(f"{what}: found an array without numbers.")
+    if sum(dtype.itemsize for dtype in dtypes) > MAX_EXTRA_BYTES:
         raise RecordingError(f"{what}: found values of more than {MAX_EXTRA_BYTES:,} bytes.")
     return parts
 
@@ -215,12 +214,7 @@ class ExtraNames:
             RecordingError: they are others.
         """
         layout = self.of(chunk)
-        expected = layout.beginning if layout is not None else Beginning([], [], b"", b"")
-        schemas, channels = (
-            [known.get(record.id) for record in records]
-            for known, records in ((index.schemas, expected.schemas), (index.channels, expected.channels))
-        )
-        if layout is None or (schemas, channels) != (expected.schemas, expected.channels):
+        if layout is None or not layout.is_declared_in(index):
             raise RecordingError(f"chunk at {chunk.offset}: found extras with other names than were recorded")
         check_constants(chunk, layout.message)
 

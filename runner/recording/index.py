@@ -173,8 +173,8 @@ class Index:
     """Bytes of the file."""
     reason: str = ""
     """Why its records were not read to the end of the data section; empty if they were."""
-    _written: Beginning | None = None
-    """The schemas and channels of a recording that is written."""
+    schema_records: bytes = b""
+    channel_records: bytes = b""
 
     @property
     def topics(self) -> list[Topic]:
@@ -229,9 +229,11 @@ class Index:
             case Opcode.SCHEMA:
                 schema = _parse(Schema, raw)
                 _add_once(self.schemas, schema.id, schema, "schema")
+                self.schema_records += RECORD_HEAD.pack(*raw[:2]) + raw.body
             case Opcode.CHANNEL:
                 channel = _parse(Channel, raw)
                 _add_once(self.channels, channel.id, channel, "channel")
+                self.channel_records += RECORD_HEAD.pack(*raw[:2]) + raw.body
             case Opcode.STATISTICS:
                 self.message_counts = dict(_parse(Statistics, raw).channel_message_counts)
             case Opcode.HEADER if raw.offset != len(MCAP0_MAGIC):
@@ -280,31 +282,12 @@ class Index:
         if start != end:
             raise RecordingError(f"found {end - start} stray bytes at {start}, expected a record")
 
-    def begin(self, beginning: Beginning) -> None:
-        """Add the schemas and channels of a recording that is written."""
-        self.schemas = {schema.id: schema for schema in beginning.schemas}
-        self.channels = {channel.id: channel for channel in beginning.channels}
-        self._written = beginning
-
     def declare(self, beginning: Beginning) -> None:
-        """Add schemas and channels that are written after the beginning."""
-        before = self.beginning
+        """Add schemas and channels that are written."""
         self.schemas |= {schema.id: schema for schema in beginning.schemas}
         self.channels |= {channel.id: channel for channel in beginning.channels}
-        self._written = Beginning(
-            [*before.schemas, *beginning.schemas],
-            [*before.channels, *beginning.channels],
-            before.schema_records + beginning.schema_records,
-            before.channel_records + beginning.channel_records,
-        )
-
-    @property
-    def beginning(self) -> Beginning:
-        """Its schemas and channels."""
-        if self._written is not None:
-            return self._written
-        schemas, channels = [*self.schemas.values()], [*self.channels.values()]
-        return Beginning(schemas, channels, bytes_of(*schemas), bytes_of(*channels))
+        self.schema_records += beginning.schema_records
+        self.channel_records += beginning.channel_records
 
     def tail(self, crc: int) -> bytes:
         """Return the end of a finished recording, after its data: data end, summary, footer, magic.
@@ -314,15 +297,14 @@ class Index:
         """
         data_end = bytes_of(DataEnd(crc))
         start = self.end + len(data_end)
-        beginning = self.beginning
         metadata = (MetadataIndex(*place, name) for name, place in self.metadata.items())
         attachments = (
             _attachment_index(name, *place, self.media_types[name])
             for name, place in self.attachments.items()
         )
         groups = [
-            (Opcode.SCHEMA, beginning.schema_records),
-            (Opcode.CHANNEL, beginning.channel_records),
+            (Opcode.SCHEMA, self.schema_records),
+            (Opcode.CHANNEL, self.channel_records),
             (Opcode.STATISTICS, bytes_of(self._statistics())),
             (Opcode.CHUNK_INDEX, b"".join(map(_chunk_index, self.chunks))),
             (Opcode.ATTACHMENT_INDEX, bytes_of(*attachments)),

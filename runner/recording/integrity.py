@@ -138,10 +138,9 @@ def _check_beginning(raw: RawRecord, contents: Index, layout: Layout) -> None:
     Raises:
         RecordingError: they differ.
     """
-    expected = beginning_of(layout)
-    size = len(expected.schema_records) + len(expected.channel_records)
-    is_whole = contents.beginning[2:] == expected[2:] and raw.offset == contents.header_end + size
-    if not is_whole:
+    expected = beginning_of(layout)[2:]
+    is_whole = (contents.schema_records, contents.channel_records) == expected
+    if not is_whole or raw.offset != contents.header_end + sum(map(len, expected)):
         raise RecordingError("found other schemas or channels than a recording of its kind begins with")
 
 

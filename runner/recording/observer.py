@@ -29,31 +29,40 @@ _MAX_WAITING: Final = 1 << 18
 
 
 class Observer:
-    """What is seen while one run is recorded.
+    """What is seen while one run is recorded: the time that passes, the machine, the output.
 
     Args:
-        console: returns a line of the output as it is to be recorded; None for no output.
+        folder: the folder of the run.
+        host: whether to see what the process uses of its machine.
+        console: returns a line of the output as it is to be recorded, without secrets; None for no output.
     """
 
-    def __init__(
-        self, folder: Path, stopwatch: Stopwatch, host: bool, console: Callable[[str], str] | None
-    ) -> None:
+    def __init__(self, folder: Path, host: bool = False, console: Callable[[str], str] | None = None) -> None:
         self._folder = folder
-        self._stopwatch = stopwatch
+        self._stopwatch = Stopwatch()
         self.host = host
         self._next_host = 0.0
         self.console = None if console is None else ConsoleLog(console)
         self._seen: deque[tuple[Topic, bytes]] = deque()
-        _thread.add(self)
+        self._needs_thread = host or console is not None
+        if self._needs_thread:
+            _thread.add(self)
 
     def take(self, is_last: bool = False) -> list[tuple[Topic, bytes]]:
-        """Return the messages since the last call; after the last one nothing more is watched."""
-        if is_last:
+        """Return the messages since the last call, and the time if that is due.
+
+        The first call begins the session; after the last one nothing more is watched.
+        """
+        is_first = self._stopwatch.begin()
+        if self._needs_thread and is_last:
             _thread.remove(self)
             self.see_console(time.monotonic(), is_last=True)
-        else:
+        elif self._needs_thread and not is_first:  # a short run needs no thread
             _thread.ensure_running()
-        return [self._seen.popleft() for _ in range(len(self._seen))]
+        messages = [self._seen.popleft() for _ in range(len(self._seen))]
+        if is_first or is_last or self._stopwatch.is_due():
+            messages.append((schema.CLOCK_TOPIC, self._stopwatch.sample()))
+        return messages
 
     def wants_host(self) -> bool:
         """Return whether a sample of the machine is due."""

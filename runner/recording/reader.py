@@ -387,17 +387,17 @@ class Phase:
         """
         table, where = self._recording.table(self.topics.extras), str(self._recording.path)
         layouts = {layout.number: layout for layout in extra_layouts(self._recording)} if table else {}
-        schemas, parts = self._recording.file.index.schemas, []
+        index, parts = self._recording.file.index, []
         channels = self._recording.file.channels[table.places]
         for channel in np.unique(channels).tolist():
-            topic = schema.TOPIC_OF[channel]
             layout = layouts.get(channel // schema.LAYOUT_STRIDE)
-            if layout is None or schemas.get(schema.schema_id(topic)) != layout.beginning.schemas[0]:
+            if layout is None or not layout.is_declared_in(index):
                 raise RecordingError(
                     f"{where}: the names of extras do not give the schema of channel {channel}."
                 )
             places = table.places[channels == channel]
-            parts.append((layout, TopicChunks(table.file, topic, places, layout.message)))
+            chunks = TopicChunks(table.file, schema.TOPIC_OF[channel], places, layout.message)
+            parts.append((layout, chunks))
         return Extras(parts, lambda episode: self.episode(episode).numbers(), where)
 
     @property

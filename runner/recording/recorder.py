@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.blocks import blank_records, message_record, record_dtype, row_dtype, rows_of
-from runner.recording.clock import Stopwatch
 from runner.recording.digest import combined_digest
 from runner.recording.index import beginning_of_extras
 from runner.recording.layout import Layout
@@ -87,10 +86,7 @@ class Recorder:
         watch: called with the records of a block as they are committed; the block is used again.
         before: called once, before the first message is written. With it, threads are started and messages
             written only when some have gathered, or by `release`, so that a short recording costs little.
-        clock: whether to record the time that passes.
-        system: whether to record what the process uses of its machine; only with the clock.
-        console: returns a line of the process's output as it is to be recorded, without secrets; None records
-            no output. Only with the clock.
+        observer: what it sees of the time, the machine and the output is recorded.
         packed: the chunks of another recording, used again for the same messages.
         grouped: write the chunks of all topics together, at each flush: the file has no steps without their
             resets then, whatever ends the process. The caller calls `write_if_full`, and `flush`.
@@ -107,9 +103,7 @@ class Recorder:
         threads: bool = True,
         watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
-        clock: bool = True,
-        system: bool = False,
-        console: Callable[[str], str] | None = None,
+        observer: Observer | None = None,
         packed: PackedChunks | None = None,
         grouped: bool = False,
     ) -> None:
@@ -136,13 +130,8 @@ class Recorder:
         """Writes everything, also what the caller holds; called when a block of steps was full."""
         self._is_full = False
         """Whether a block of steps was full since the last flush."""
-        self._stopwatch: Stopwatch | None = None
-        self._observer: Observer | None = None
-        if clock and file is not None:
-            self._stopwatch = Stopwatch()
-            self._record_machine()
-            if system or console is not None:
-                self._observer = Observer(file.path.parent, self._stopwatch, system, console)
+        self._observer = observer
+        self._record_machine()
 
     def _lane(self, topic: Topic, message: MessageType, write: bool) -> _Lane:
         return _Lane(topic, message, capacity_of(topic, message, self._chunk_steps), write)
@@ -331,19 +320,14 @@ class Recorder:
         self._pipeline.close()
 
     def _record_machine(self, is_last: bool = False) -> None:
-        """Record the time, if that is due, and what was seen of the machine and the output.
+        """Record what was seen of the time, the machine and the output.
 
         A resumed run has none of it before it has new steps.
         """
-        watch = self._stopwatch
-        if watch is None or not self._reference.exhausted:
-            return
-        messages = [] if self._observer is None else self._observer.take(is_last)
-        if watch.begin() or is_last or watch.is_due():
-            messages.append((schema.CLOCK_TOPIC, watch.sample()))
-        position = self.position * STEP_NANOSECONDS
-        for topic, message in messages:
-            self._batches.extend(topic, [position], [message])
+        if self._observer is not None and self._reference.exhausted:
+            position = self.position * STEP_NANOSECONDS
+            for topic, message in self._observer.take(is_last):
+                self._batches.extend(topic, [position], [message])
 
     def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
         """Take the next filled records of the topic's block: set their times, compare or keep them.

@@ -76,9 +76,11 @@ class RecordingFile:
 
     def begin(self, layout: Layout) -> None:
         """Append the schemas and channels of a run."""
-        beginning = beginning_of(layout)
+        self._write_beginning(beginning_of(layout))
+
+    def _write_beginning(self, beginning: Beginning) -> None:
         self._append(beginning.schema_records + beginning.channel_records)
-        self._index.begin(beginning)
+        self._index.declare(beginning)
 
     def declare(self, beginning: Beginning) -> None:
         """State schemas and channels; they are written before the first chunk of one of the channels."""
@@ -128,8 +130,7 @@ class RecordingFile:
         for channel in {chunk.entry.channel for chunk in chunks} - self._index.channels.keys():
             beginning = self._later.get(channel)
             if beginning is not None and channel not in self._index.channels:
-                self._append(beginning.schema_records + beginning.channel_records)
-                self._index.declare(beginning)
+                self._write_beginning(beginning)
         start, _ = self._append(b"".join(part for chunk in chunks for part in (chunk.record, chunk.index)))
         for chunk in chunks:
             self._index.chunks.append(chunk.entry._replace(offset=start, index_length=len(chunk.index)))
