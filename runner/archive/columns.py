@@ -19,9 +19,9 @@ from runner.recording import schema
 from runner.recording.blocks import record_dtype
 from runner.recording.description import RunDescription
 from runner.recording.extras import ExtraLayout
+from runner.recording.fields import Field
 from runner.recording.layout import NUMBERS
-from runner.recording.schema import Field, MessageType, Topic
-from runner.recording.space_fields import row_dtype
+from runner.recording.schema import MessageType, Topic
 from runner.util.arrays import Array, Records
 
 _INT32, _FLOAT, _FLAG = pa.int32(), pa.float64(), pa.bool_()
@@ -110,7 +110,7 @@ class Shape:
             if (space := self.space(topic, field.name)) is not None:
                 return space.dtype
             if field.parts is not None:
-                return row_dtype(field)
+                return field.row_dtype
             if field.dtype is not None:
                 return field.dtype
             return object if field.repeated else NUMBERS.get(field.kind, object)

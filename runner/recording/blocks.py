@@ -17,9 +17,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording import space_fields
 from runner.recording.schema import MessageType, Topic
-from runner.recording.space_fields import are_exact, has_one_size, put_constants, stored_dtype, tag
 from runner.util.arrays import Records
 
 HEADER: Final = [
@@ -46,11 +44,11 @@ def record_dtype(message: MessageType) -> np.dtype[np.void] | None:
 
     Fields named `tag_…` hold Protobuf's constant bytes (see `blank_records`).
     """
-    if message.varies or not all(map(has_one_size, message.fields)):
+    if message.varies or not all(field.has_one_size for field in message.fields):
         return None
     layout: list[tuple[object, ...]] = list(HEADER)
     for field in message.fields:
-        layout += [(f"tag_{field.name}", "u1", (len(tag(field)),)), (field.name, stored_dtype(field))]
+        layout += [(f"tag_{field.name}", "u1", (len(field.tag),)), (field.name, field.stored_dtype)]
     return np.dtype(layout)
 
 
@@ -65,7 +63,7 @@ def row_dtype(message: MessageType) -> np.dtype[np.void]:
     fields: list[tuple[str, np.dtype[Any]]] = []
     for field in message.fields:
         is_object = record is None and field.is_value
-        fields.append((field.name, np.dtype(object) if is_object else space_fields.row_dtype(field)))
+        fields.append((field.name, np.dtype(object) if is_object else field.row_dtype))
     if record is not None and all(record[name] == dtype for name, dtype in fields):
         return record
     return np.dtype([*HEADER, *fields])
@@ -84,7 +82,7 @@ def rows_of(message: MessageType, records: Records) -> Records:
     for name in dtype.names or ():
         rows[name] = records[name]
     for field in message.fields:
-        if not are_exact(field, rows[field.name], records[field.name]):
+        if not field.are_exact(rows[field.name], records[field.name]):
             raise RecordingError(f"{message.full_name}: found a number in {field.name} out of its range")
     return rows
 
@@ -121,8 +119,8 @@ def _blank_record(topic: Topic, message: MessageType, fill: int = 0) -> bytes:
     one["record_length"] = dtype.itemsize - RECORD_HEAD.size
     one["channel_id"] = topic.channel
     for field in message.fields:
-        one[f"tag_{field.name}"] = list(tag(field))
-        put_constants(field, stored, dtype.fields[field.name][1])  # type: ignore[index]
+        one[f"tag_{field.name}"] = list(field.tag)
+        field.put_constants(stored, dtype.fields[field.name][1])  # type: ignore[index]
     return stored.tobytes()
 
 

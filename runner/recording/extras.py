@@ -25,12 +25,12 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
+from runner.recording.fields import space_field
 from runner.recording.index import Beginning, Index, beginning_of_extras
 from runner.recording.messages import Message, decode
 from runner.recording.metadata import json_object
 from runner.recording.records import ReadChunk, check_constants
 from runner.recording.schema import MessageType
-from runner.recording.space_fields import has_one_size, space_field
 from runner.recording.spaces import Description, encode_bytes, encode_text, leaf_dtype, leaves_of, row_dtype
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import FOREVER, TopicChunks
@@ -81,8 +81,8 @@ class ExtraLayout:
         """
         whole = space_field(1, "values", {"type": "Dict", "spaces": self.columns})
         flags = space_field(2, "given", {"type": "Dict", "spaces": dict.fromkeys(self.columns, _FLAG)})
-        fixed = tuple(part for part in whole.parts or () if has_one_size(part))
-        varying = tuple(part for part in whole.parts or () if not has_one_size(part))
+        fixed = tuple(part for part in whole.parts or () if part.has_one_size)
+        varying = tuple(part for part in whole.parts or () if not part.has_one_size)
         fields = [replace(whole, parts=fixed, is_value=False)] if fixed else []
         fields += [replace(flags, is_value=False), *schema.EXTRA.fields]
         if varying:

@@ -1,7 +1,7 @@
 """The messages of a run: their fields follow from its learners, its events and its environment's spaces.
 
 A step over states has `state`, `action` and `next_state`; in other spaces `action` and `next_observation`
-have the types of the spaces' values, with a field for each part of a `Dict` or `Tuple` (`space_fields`).
+have the types of the spaces' values, with a field for each part of a `Dict` or `Tuple` (`fields`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
 from runner.recording import schema
 from runner.recording.blocks import record_dtype, row_dtype
-from runner.recording.schema import Field, MessageType, Topic
-from runner.recording.space_fields import has_one_size, space_field
+from runner.recording.fields import Field, space_field
+from runner.recording.schema import MessageType, Topic
 from runner.util.values import Json, is_whole
 
 _MAX_STATES: Final = 2**32
@@ -98,7 +98,7 @@ class Layout:
         values = {
             name: [field for field in message.fields if field.is_value] for name, message in types.items()
         }
-        if not all(has_one_size(field) for fields in values.values() for field in fields):
+        if not all(field.has_one_size for fields in values.values() for field in fields):
             types |= {name: _values_last(types[name]) for name, fields in values.items() if fields}
         return {
             topic: types[topic.name.rpartition("/")[2]] for topic in self.topics if topic in schema.ROW_TOPICS

@@ -7,6 +7,7 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -18,22 +19,14 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, blank_records, constant_bytes, row_dtype
-from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, Field, MessageType
-from runner.recording.space_fields import (
-    Decoder,
-    Encoder,
-    are_exact,
-    decoder,
-    encoder,
-    is_text,
-    raw_field,
-    varint,
-)
+from runner.recording.fields import Field, varint
+from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
 from runner.util.arrays import Array, Records
 
 Message = dict[str, Any]
 """The fields of a decoded message by name."""
+_IS_VALUE: Final = attrgetter("is_value")
 
 
 @lru_cache(256)
@@ -88,8 +81,8 @@ def _add_field(
         type=field.kind,
         label=Pb.LABEL_REPEATED if field.repeated else Pb.LABEL_OPTIONAL,
     )
-    if is_text(field) and (is_value or field.is_value):
-        _add_field(file, described, raw_field(field), "")
+    if field.kind == Pb.TYPE_STRING and (is_value or field.is_value):
+        _add_field(file, described, field.raw, "")
     if field.parts is not None:
         nested = file.message_type.add(name=f"{described.name}_{nested_name}")
         added.type_name = f".{file.package}.{nested.name}"
@@ -124,16 +117,6 @@ def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
 
 
 @lru_cache(64)
-def _encoders(message: MessageType) -> dict[str, Encoder]:
-    return {field.name: encoder(field) for field in message.fields if field.is_value}
-
-
-@lru_cache(64)
-def _decoders(message: MessageType) -> dict[str, Decoder]:
-    return {field.name: decoder(field) for field in message.fields if field.is_value}
-
-
-@lru_cache(64)
 def _numbers_of(message: MessageType) -> MessageType:
     """Return a message with the fields alone that come before its values of varying size."""
     fields = tuple(field for field in message.fields if not field.is_value)
@@ -147,8 +130,8 @@ def encode_rows(message: MessageType, rows: Records) -> list[bytes]:
     for field in numbers.fields:
         records[field.name] = rows[field.name]
     payloads = [record[HEADER_BYTES:] for record in records.view(f"V{records.itemsize}").tolist()]
-    for name, encode_value in _encoders(message).items():
-        parts = (encode_value(value, 0)[0] for value in rows[name].tolist())
+    for field in filter(_IS_VALUE, message.fields):
+        parts = (field.encoded(value, 0)[0] for value in rows[field.name].tolist())
         payloads = [payload + part for payload, part in zip(payloads, parts, strict=True)]
     return payloads
 
@@ -159,7 +142,7 @@ def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> 
     Raises:
         RecordingError: one is not as `encode_rows` writes them.
     """
-    numbers, decoders = _numbers_of(message), _decoders(message)
+    numbers, values = _numbers_of(message), [*filter(_IS_VALUE, message.fields)]
     dtype = blank_records(schema.LOG_TOPIC, numbers, 0).dtype
     size = dtype.itemsize - HEADER_BYTES
     head = bytes(HEADER_BYTES)
@@ -172,13 +155,13 @@ def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> 
     is_message = bool((found[:, is_constant] == expected[is_constant]).all())
     for field in numbers.fields:
         rows[field.name] = records[field.name]
-        is_message &= are_exact(field, rows[field.name], records[field.name])
+        is_message &= field.are_exact(rows[field.name], records[field.name])
     if not is_message:
         raise RecordingError(f"found a payload that is no {message.full_name}")
     for k, (_, payload) in enumerate(messages):
         end = size
-        for name, decode_value in decoders.items():
-            rows[name][k], end = decode_value(payload, end)
+        for field in values:
+            rows[field.name][k], end = field.decoded(payload, end)
         if end != len(payload):
             raise RecordingError(f"found {len(payload)} bytes, expected {end} in a {message.full_name}")
     return rows

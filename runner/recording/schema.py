@@ -12,35 +12,13 @@ from typing import Final
 import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
+from runner.recording.fields import Field
 from runner.recording.metrics import METRICS
 
 FORMAT_VERSION: Final = 2
 PROFILE: Final = "dualtaxi"
 STEP_NANOSECONDS: Final = 100_000_000
 """Logical time of one environment step: 0.1 s, so that playback at 1x shows ten steps a second."""
-
-
-@dataclass(frozen=True)
-class Field:
-    """One field of a message; `repeated` means packed."""
-
-    number: int
-    name: str
-    kind: int
-    repeated: bool = False
-    stored_as: str = ""
-    """Its name in the file's schema, if that is another one."""
-    dtype: np.dtype[np.generic] | None = None
-    """The dtype of its value, with the shape; None if that varies, or is not known without a run."""
-    parts: tuple[Field, ...] | None = None
-    """The fields of a nested message: the values of a `Dict` or `Tuple`."""
-    is_value: bool = False
-    """Whether it has values of a space of the environment."""
-
-    @property
-    def stored_name(self) -> str:
-        """Its name in the file's schema."""
-        return self.stored_as or self.name
 
 
 @dataclass(frozen=True, eq=False)

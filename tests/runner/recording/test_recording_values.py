@@ -19,11 +19,11 @@ from mcap_protobuf.decoder import DecoderFactory
 import runner
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.fields import space_field
 from runner.recording.integrity import check_integrity
 from runner.recording.layout import layout_of
 from runner.recording.messages import decode_rows, encode_rows, file_descriptor_set
 from runner.recording.reader import open_recording
-from runner.recording.space_fields import space_field
 from runner.recording.spaces import leaves_of
 from tests.runner.altering import altered
 from tests.runner.loops.making import Leaving
