@@ -42,7 +42,7 @@ class ActionRecorder:
             for row, digest in self._digests[topic.phase].add(environment, *columns):
                 rows["digest"][places[row]] = np.void(digest)
         self._rows.append(rows)
-        is_large = sum(each.nbytes for each in self._rows) >= BLOCK_BYTES
+        is_large = sum(part.nbytes for part in self._rows) >= BLOCK_BYTES
         if is_large or sum(map(len, self._rows)) >= self._block_steps:
             self.commit()
 

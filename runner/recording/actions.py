@@ -87,11 +87,11 @@ class EpisodeDigests:
         """
         rows = len(t)
         dtype = [("o", observations.dtype, observations.shape[1:]), ("r", "<f8", rewards.shape[1:])]
-        whole = np.empty(rows, np.dtype([*dtype, ("e", "?", (2,))]))
-        whole["o"], whole["r"] = observations, rewards
-        whole["e"][:, 0], whole["e"][:, 1] = terminated, truncated
+        steps = np.empty(rows, np.dtype([*dtype, ("e", "?", (2,))]))
+        steps["o"], steps["r"] = observations, rewards
+        steps["e"][:, 0], steps["e"][:, 1] = terminated, truncated
         edges = sorted({0, *np.flatnonzero(t == 0).tolist(), *(row + 1 for row in at), rows})
-        data, size = whole.view(np.uint8).data, whole.itemsize
+        data, size = steps.view(np.uint8).data, steps.itemsize
         for first, stop in pairwise(edges):
             if t[first] == 0:
                 self._running[environment] = blake3()
@@ -115,12 +115,12 @@ def packed(rows: Rows, n: int) -> dict[str, object]:
     last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
     digests = rows["digest"].copy().view(np.uint8).reshape(len(rows), -1)
     marked = np.asarray(digests.any(axis=1))
-    for first in range(min(n, len(rows))):  # an environment
-        own = np.arange(first, len(rows), n)
-        own = own[marked[own]]
-        if len(own):
-            episode = rows["episode"][own]
-            last[own] = np.append(episode[1:] != episode[:-1], True)
+    for environment in range(min(n, len(rows))):
+        steps = np.arange(environment, len(rows), n)
+        steps = steps[marked[steps]]
+        if len(steps):
+            episode = rows["episode"][steps]
+            last[steps] = np.append(episode[1:] != episode[:-1], True)
     marks = np.zeros(int(last.sum()), MARK)
     marks["row"], marks["digest"] = np.flatnonzero(last), rows["digest"][last]
     return {

@@ -114,12 +114,12 @@ def _blank_record(topic: Topic, message: MessageType, fill: int = 0) -> bytes:
     assert dtype is not None
     stored = np.full(dtype.itemsize, fill, np.uint8)
     stored[:HEADER_BYTES] = 0
-    one: Records = stored.view(dtype)
-    one["opcode"] = MESSAGE
-    one["record_length"] = dtype.itemsize - RECORD_HEAD.size
-    one["channel_id"] = topic.channel
+    record: Records = stored.view(dtype)
+    record["opcode"] = MESSAGE
+    record["record_length"] = dtype.itemsize - RECORD_HEAD.size
+    record["channel_id"] = topic.channel
     for field in message.fields:
-        one[f"tag_{field.name}"] = list(field.tag)
+        record[f"tag_{field.name}"] = list(field.tag)
         field.put_constants(stored, dtype.fields[field.name][1])  # type: ignore[index]
     return stored.tobytes()
 
@@ -128,3 +128,11 @@ def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
     """Return the whole message record of one message, logged at a time in nanoseconds."""
     length = HEADER_BYTES - RECORD_HEAD.size + len(payload)
     return MESSAGE_HEAD.pack(MESSAGE, length, topic.channel, 0, log_time, log_time) + payload
+
+
+def lone_message(
+    topic: Topic, log_time: int, payload: bytes
+) -> tuple[memoryview, NDArray[np.uint64], NDArray[np.uint64]]:
+    """Return the record of a message that has a chunk of its own, its time, and where it begins."""
+    record = memoryview(message_record(topic, log_time, payload))
+    return record, np.array([log_time], np.uint64), np.zeros(1, np.uint64)

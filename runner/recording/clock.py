@@ -116,8 +116,8 @@ class Clock:
         return np.asarray(self.seconds[before] + np.clip(done, 0.0, 1.0) * passed)
 
     def run_seconds(self, started: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the seconds of the run for those of its sessions; both [n], as messages have them."""
-        return seconds + [self.earlier.get(each, 0.0) for each in started.tolist()]
+        """Return the seconds of the run for seconds of its sessions, [n]; `started` are their beginnings."""
+        return seconds + [self.earlier.get(start, 0.0) for start in started.tolist()]
 
 
 def read_clock(recording: Recording) -> Clock | None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import Rows, packed
-from runner.recording.blocks import message_record
+from runner.recording.blocks import lone_message
 from runner.recording.chunks import encode_chunk
 from runner.recording.messages import encode
 from runner.recording.pipeline import MessageBatches
@@ -96,11 +96,8 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
             messages[topic.name] = 0
             most = min(packing.chunk_steps, max(1, BLOCK_BYTES // phase.steps.row_dtype.itemsize))
             for rows in _in_blocks(phase.steps.rows() if phase.steps.are_actions else (), most):
-                log_time = rows["log_time"][-1:].astype(np.uint64)
                 payload = encode(schema.ACTIONS, packed(rows, recording.environments))
-                write(
-                    topic, message_record(topic, int(log_time[0]), payload), log_time, np.zeros(1, np.uint64)
-                )
+                write(topic, *lone_message(topic, int(rows["log_time"][-1]), payload))
                 messages[topic.name] += 1
                 steps += len(rows)
             _require_same(file.path, {topic.name: steps}, {topic.name: phase.steps.total()})

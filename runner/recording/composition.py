@@ -84,8 +84,8 @@ def composition_of(recording: Recording) -> Composition | None:
     }
     wrappers = [{"entry_point": name} for name in reversed(maker.wrappers)]
     if spec:
-        own = spec.get("additional_wrappers", spec.get("wrappers"))
-        wrappers = own if isinstance(own, list) else []
+        listed = spec.get("additional_wrappers", spec.get("wrappers"))
+        wrappers = listed if isinstance(listed, list) else []
     wrappers += json.loads(maker.vector.wrapper_specs or "[]") if maker.vector is not None else []
     named = (_wrapper(fields) for fields in wrappers if isinstance(fields, Mapping))
     return Composition(

@@ -63,17 +63,17 @@ def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
     Raises:
         Inconsistent: something does not follow from the rest.
     """
-    own = recording.phase(phase)
-    for table in (own.resets, own.episodes):
+    recorded = recording.phase(phase)
+    for table in (recorded.resets, recorded.episodes):
         for _ in _numbered(table):
             pass
-    if recording.leaves_out_steps and not own.steps.are_actions:
+    if recording.leaves_out_steps and not recorded.steps.are_actions:
         return Findings()
-    if own.steps.are_actions and not recording.leaves_out_steps:
+    if recorded.steps.are_actions and not recording.leaves_out_steps:
         raise Inconsistent(
-            f"{own.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
+            f"{recorded.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
         )
-    last = own.resets.last()
+    last = recorded.resets.last()
     stop = None if complete else 0 if last is None else int(last["step"])
     return _PhaseCheck(recording, phase, stop).check()
 
@@ -138,9 +138,9 @@ class _PhaseCheck:
     """
 
     def __init__(self, recording: Recording, phase: str, stop: int | None) -> None:
-        self._recording, self._own, self._stop = recording, recording.phase(phase), stop
+        self._recording, self._phase, self._stop = recording, recording.phase(phase), stop
         self._n, self._learners = recording.environments, len(recording.agents)
-        self._is_whole = not self._own.steps.are_actions
+        self._is_whole = not self._phase.steps.are_actions
         """Whether steps have observations and rewards, and not their actions alone."""
         self._mdp = recording.mdp if recording.tabular and self._is_whole else None
         self._episodes = EpisodeLog(self._n, self._learners, self._mdp, recording.layout.has_turns)
@@ -151,16 +151,16 @@ class _PhaseCheck:
         self._state = np.full(self._n, -1, np.int64)
         """The state after that step, -1 before any."""
         self._findings = Findings()
-        self._resets, self._numbered_resets = _Resets(self._own.resets), _Resets(self._own.resets)
+        self._resets, self._numbered_resets = _Resets(self._phase.resets), _Resets(self._phase.resets)
         """To find where environments were reset, and to compare with the episodes that follow from it."""
-        self._endings = self._own.episodes.blocks()
+        self._endings = self._phase.episodes.blocks()
         self._silent_ends, self._last_end = np.empty(0, np.int64), -1
         """Of the last block of `_endings`: the steps that ended an episode silently, and its last step."""
 
     def check(self) -> Findings:
         """Check all steps, and what comes after the last."""
         steps = left = 0
-        for rows, waiting in aligned(_numbered(self._own.steps), self._n, self._stop):
+        for rows, waiting in aligned(_numbered(self._phase.steps), self._n, self._stop):
             left = waiting
             if len(rows):
                 self._check_block(steps, rows.reshape(-1, self._n))
@@ -168,8 +168,8 @@ class _PhaseCheck:
         if self._stop is None:
             if left:
                 raise Inconsistent(
-                    f"{self._own.steps.topic.name}: found {steps + left} steps, expected as many of each of "
-                    f"the {self._n} environments"
+                    f"{self._phase.steps.topic.name}: found {steps + left} steps, expected as many of each "
+                    f"of the {self._n} environments"
                 )
             self._finish(steps)
         return self._findings
@@ -308,12 +308,12 @@ class _PhaseCheck:
         if not (count := len(expected["episode"])):
             return
         first = int(expected["episode"][0])
-        found = self._own.episodes.array(first, first + count)
+        found = self._phase.episodes.array(first, first + count)
         have = len(found)
         if have < count and self._stop is None:
             raise Inconsistent(
-                f"/{self._own.name}/episode: found {first + have} episodes, expected one that ended at step "
-                f"{expected['last_step'][have]}"
+                f"/{self._phase.name}/episode: found {first + have} episodes, expected one that ended at "
+                f"step {expected['last_step'][have]}"
             )
         known = expected.keys() if self._is_whole else expected.keys() - {"returns"}
         self._compare("episode", found, {name: expected[name][:have] for name in sorted(known)})
@@ -330,11 +330,13 @@ class _PhaseCheck:
             self._compare("reset", resets, {"episode": self._episodes.episode[environment]})
         has_more = {
             "reset": len(self._resets.left) > 0,
-            "episode": self._own.episodes.count() > self._episodes.ended,
+            "episode": self._phase.episodes.count() > self._episodes.ended,
         }
         for name, found in has_more.items():
             if found:
-                raise Inconsistent(f"/{self._own.name}/{name}: found more records than the steps account for")
+                raise Inconsistent(
+                    f"/{self._phase.name}/{name}: found more records than the steps account for"
+                )
 
     def _compare(self, what: str, found: NDArray[np.void], expected: Columns) -> None:
         """Compare fields of steps, resets or episodes; `what` is the field with their number, too."""
@@ -346,19 +348,16 @@ class _PhaseCheck:
                 raise self._wrong(what, found[what][row], name, was, should)
 
     def _out_of_order(self) -> Inconsistent:
-        return Inconsistent(f"/{self._own.name}/reset: found resets out of order, or of no environment")
+        return Inconsistent(f"/{self._phase.name}/reset: found resets out of order, or of no environment")
 
     def _wrong(self, what: str, number: int, name: str, found: object, expected: object) -> Inconsistent:
         return Inconsistent(
-            f"/{self._own.name}/{what}, {what} {number}: {name}: found {found}, expected {expected}"
+            f"/{self._phase.name}/{what}, {what} {number}: {name}: found {found}, expected {expected}"
         )
 
 
-def _numbered(table: TopicChunks, name: str = "") -> Iterator[NDArray[np.void]]:
+def _numbered(table: TopicChunks) -> Iterator[NDArray[np.void]]:
     """Yield the records of a topic in blocks, as `TopicChunks.rows` does.
-
-    Args:
-        name: of the topic in errors.
 
     Raises:
         Inconsistent: messages are not numbered consecutively.
@@ -367,6 +366,6 @@ def _numbered(table: TopicChunks, name: str = "") -> Iterator[NDArray[np.void]]:
     for block in table.rows():
         if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
             found, expected = block[number][wrong[0]], first + wrong[0]
-            raise Inconsistent(f"{name or table.topic.name}: found {number} {found}, expected {expected}")
+            raise Inconsistent(f"{table.topic.name}: found {number} {found}, expected {expected}")
         yield block
         first += len(block)

@@ -89,11 +89,11 @@ class Tee:
         """Replace the methods, also of streams whose methods somebody has replaced since."""
         for number, stream in self._streams if self._is_on else ():
             with contextlib.suppress(Exception):  # None, or a stream of somebody's own that forbids it
-                own = vars(stream).get("write")
-                if getattr(own, "tee", None) is not self:
+                before = vars(stream).get("write")
+                if getattr(before, "tee", None) is not self:
                     write = self._writer(number, stream.write)
                     stream.write = write
-                    self._patched.append((stream, own, write))
+                    self._patched.append((stream, before, write))
 
     def _writer(self, number: int, original: Write) -> Write:
         """Return a method `write` that calls the original one, and keeps the text."""
@@ -125,14 +125,14 @@ class Tee:
         if self._shell is not None:
             with contextlib.suppress(Exception):
                 self._shell.events.unregister("pre_execute", self.patch)
-        for stream, own, write in reversed(self._patched):
+        for stream, before, write in reversed(self._patched):
             with contextlib.suppress(Exception):
                 if vars(stream).get("write") is not write:
                     continue
-                if own is None:
+                if before is None:
                     del stream.write
                 else:
-                    stream.write = own
+                    stream.write = before
         self._patched.clear()
 
     def take(self) -> list[tuple[float, int, str]]:

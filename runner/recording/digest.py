@@ -29,10 +29,9 @@ class ContentHash:
     def update(self, topic: Topic, records: bytes | memoryview) -> None:
         """Take in whole message records of a topic, in canonical form."""
         if topic.digested and len(records):
-            if (own := self._topics.get(topic.name)) is None:
-                own = blake3()
-                self._topics[topic.name] = own
-            own.update(memoryview(records).cast("B"))
+            if (running := self._topics.get(topic.name)) is None:
+                running = self._topics[topic.name] = blake3()
+            running.update(memoryview(records).cast("B"))
 
     def topics(self) -> dict[str, str]:
         """Return the hash of each topic that has messages, in hexadecimal."""
@@ -49,15 +48,15 @@ def combined_digest(topics: Mapping[str, str]) -> str:
     Raises:
         RecordingError: one of them is no hash.
     """
-    whole = blake3(_PREFIX)
+    content = blake3(_PREFIX)
     for name in sorted(topics):
         encoded = name.encode()
         try:
-            own = bytes.fromhex(topics[name])
+            digest = bytes.fromhex(topics[name])
         except ValueError:
-            found = shortened(topics[name], _MAX_SHOWN)
+            text = shortened(topics[name], _MAX_SHOWN)
             raise RecordingError(
-                f"the hash of {name}: found {found!r}, expected hexadecimal digits."
+                f"the hash of {name}: found {text!r}, expected hexadecimal digits."
             ) from None
-        whole.update(struct.pack("<I", len(encoded)) + encoded + own)
-    return whole.hexdigest()
+        content.update(struct.pack("<I", len(encoded)) + encoded + digest)
+    return content.hexdigest()

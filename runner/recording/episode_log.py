@@ -91,49 +91,47 @@ class EpisodeLog:
         left = np.vstack([self.length, length[:-1]])
         cut = was_reset & (left > 0) & ~after_end  # the reset ends an episode in progress
         number = np.cumsum(cut | after_end, axis=0, dtype=np.int64)
-        sums, place = self._summed(steps, number, ends[-1])
+        sums, sum_of = self._summed(steps, number, ends[-1])
         episode, total = self.episode + number, number[-1] + ends[-1]
 
-        at, own = (np.concatenate(pair) for pair in zip(np.nonzero(ends), np.nonzero(cut), strict=True))
+        at, column = (np.concatenate(pair) for pair in zip(np.nonzero(ends), np.nonzero(cut), strict=True))
         by_reset = np.arange(len(at)) >= np.count_nonzero(ends)
-        order = np.lexsort([own, by_reset, at - by_reset])
-        at, own, by_reset = at[order], own[order], by_reset[order]
-        environment = own
+        order = np.lexsort([column, by_reset, at - by_reset])
+        at, column, by_reset = at[order], column[order], by_reset[order]
+        environment = column
         if steps.environment is not None:
             environments = np.vstack([self._environments, steps.environment])
-            environment, self._environments = environments[at - by_reset + 1, own], environments[-1]
+            environment, self._environments = environments[at - by_reset + 1, column], environments[-1]
         ended = self._end(
             environment,
-            steps.first + (at - by_reset) * n + own,
-            np.where(by_reset, left[at, own], length[at, own]),
-            sums[place[at, own] - by_reset],
-            steps.terminated[at, own] & ~by_reset,
-            steps.truncated[at, own] & ~by_reset,
+            steps.first + (at - by_reset) * n + column,
+            np.where(by_reset, left[at, column], length[at, column]),
+            sums[sum_of[at, column] - by_reset],
+            steps.terminated[at, column] & ~by_reset,
+            steps.truncated[at, column] & ~by_reset,
         )
         self.episode = self.episode + total
         self.length = np.where(ends[-1], 0, length[-1])
-        self._sums = sums[place[-1] + ends[-1]]
+        self._sums = sums[sum_of[-1] + ends[-1]]
         return Episodes(np.where(taken, before - began, 0), episode, ended)
 
-    def interrupt(self, steps: int, which: NDArray[np.integer]) -> Columns:
+    def interrupt(self, steps: int, environments: NDArray[np.integer]) -> Columns:
         """End the episodes in progress of some environments by a reset after `steps` of the phase.
 
         Returns the fields of their records.
         """
-        which = which[self.length[which] > 0]
-        never = np.zeros(len(which), np.bool_)
-        last = np.asarray(steps - self._n + which, np.int64)
-        ended = self._end(
-            self._environments[which], last, self.length[which], self._sums[which], never, never
-        )
-        self.episode[which] += 1
-        self.length[which], self._sums[which] = 0, self._zero
+        at = environments[self.length[environments] > 0]
+        never = np.zeros(len(at), np.bool_)
+        last = np.asarray(steps - self._n + at, np.int64)
+        ended = self._end(self._environments[at], last, self.length[at], self._sums[at], never, never)
+        self.episode[at] += 1
+        self.length[at], self._sums[at] = 0, self._zero
         return ended
 
     def _summed(self, steps: TurnBlock, number: Ints, ends: Flags) -> tuple[Floats, Ints]:
-        """Return the sums of each episode, and in which row of them that of each step is, [rows, N].
+        """Return the sums of each episode, and for each step, [rows, N], the row of its episode among them.
 
-        The episodes of an environment follow one another, and one is left to follow the last.
+        The episodes of an environment follow one another, with room for the episode after the last step.
         """
         values = steps.rewards
         if steps.counts is not None:
@@ -142,13 +140,13 @@ class EpisodeLog:
             values = np.where(np.asarray(steps.only_reset)[..., np.newaxis], -0.0, values)  # adds nothing
         sizes = number[-1] + ends + 1
         first = np.cumsum(sizes) - sizes
-        place = first + number
+        row = first + number
         sums = np.full((values.shape[-1], int(sizes.sum())), self._zero)
-        at = np.append(first, place)
+        at = np.append(first, row)
         with np.errstate(invalid="ignore", over="ignore"):
-            for k, own in enumerate(sums):  # added one after the other: other orders round otherwise
-                np.add.at(own, at, np.append(self._sums[:, k], values[..., k]))
-        return sums.T, place
+            for k, column in enumerate(sums):  # added one after the other: other orders round otherwise
+                np.add.at(column, at, np.append(self._sums[:, k], values[..., k]))
+        return sums.T, row
 
     def _end(
         self,

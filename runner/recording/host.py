@@ -31,9 +31,9 @@ _CHILDREN_SECONDS: Final = 10.0
 _BYTES: Final = 8192
 """The largest message that is read."""
 _STAMPS: Final = ("started", "seconds")
-GPU_FIELDS: Final = tuple(each.name for each in schema.HOST.fields if each.repeated)
+GPU_FIELDS: Final = tuple(field.name for field in schema.HOST.fields if field.repeated)
 FIELDS: Final = tuple(
-    each.name for each in schema.HOST.fields if not each.repeated and each.name not in _STAMPS
+    field.name for field in schema.HOST.fields if not field.repeated and field.name not in _STAMPS
 )
 
 
@@ -176,24 +176,25 @@ def read_host(recording: Recording, clock: Clock | None) -> HostMetrics | None:
     gpus: list[list[list[float]]] = []
     name = schema.HOST_TOPIC.name
     for fields in recording.table(schema.HOST_TOPIC).decoded(max_bytes=_BYTES):
-        own = [fields[name] for name in GPU_FIELDS]
-        if len(rows) == MAX_SAMPLES or len({len(each) for each in own}) > 1 or len(own[0]) > MAX_GPUS:
+        measures = [fields[name] for name in GPU_FIELDS]
+        counts = [*map(len, measures)]
+        if len(rows) == MAX_SAMPLES or len(set(counts)) > 1 or counts[0] > MAX_GPUS:
             raise RecordingError(
-                f"{recording.path}: {name}: found {[len(each) for each in own]} values of GPUs in sample "
+                f"{recording.path}: {name}: found {counts} values of GPUs in sample "
                 f"{len(rows)}, expected at most {MAX_SAMPLES:,} samples, with at most {MAX_GPUS} GPUs each."
             )
         rows.append((fields["log_time"] // STEP_NANOSECONDS, *(fields[name] for name in (*_STAMPS, *FIELDS))))
-        gpus.append(own)
+        gpus.append(measures)
     if not rows:
         return None
     positions = np.array([row[0] for row in rows], np.int64)
     started, seconds, *columns = np.array([row[1:] for row in rows]).T
     if not np.isfinite([started, seconds]).all():
         raise RecordingError(f"{recording.path}: {name}: found a time that is not finite.")
-    widest = max(len(own[0]) for own in gpus)
+    widest = max(len(measures[0]) for measures in gpus)
     per_gpu = np.full((len(GPU_FIELDS), len(rows), widest), np.nan)
-    for k, own in enumerate(gpus):
-        per_gpu[:, k, : len(own[0])] = own
+    for k, measures in enumerate(gpus):
+        per_gpu[:, k, : len(measures[0])] = measures
     values = dict(zip(FIELDS, columns, strict=True)) | dict(zip(GPU_FIELDS, per_gpu, strict=True))
     seconds = seconds if clock is None else clock.run_seconds(started, seconds)
     return HostMetrics(positions, seconds, values, started)

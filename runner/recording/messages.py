@@ -321,8 +321,8 @@ def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:
         files = descriptor_pb2.FileDescriptorSet.FromString(schema_data).file
     except DecodeError:
         return []
-    described = [each for file in files for each in file.message_type if each.name == message.name]
-    numbers = {field.number for each in described for field in each.field}
+    described = [kind for file in files for kind in file.message_type if kind.name == message.name]
+    numbers = {field.number for kind in described for field in kind.field}
     return [
         field.name
         for field in message.fields
@@ -425,12 +425,12 @@ def encode_image(data: bytes, kind: str, position: int, frame_id: str) -> bytes:
 
 def frame_id(phase: str, environment: int | None, is_reset: bool) -> str:
     """Return the place of a frame: `train`, `train/reset`, or of a vector environment `train/3/reset`."""
-    place = [phase, *([] if environment is None else [str(environment)]), *(["reset"] if is_reset else [])]
-    return "/".join(place)
+    parts = [phase, *([] if environment is None else [str(environment)]), *(["reset"] if is_reset else [])]
+    return "/".join(parts)
 
 
 def frame_place(frame: Message) -> tuple[int, bool]:
     """Return the environment of a decoded frame, and whether it shows the state after a reset."""
-    _, *place = frame["frame_id"].split("/", 2)
-    environment = int(place[0]) if place and place[0].isdecimal() and len(place[0]) < 10 else 0
-    return environment, place[-1:] == ["reset"]
+    _, *parts = frame["frame_id"].split("/", 2)
+    environment = int(parts[0]) if parts and parts[0].isdecimal() and len(parts[0]) < 10 else 0
+    return environment, parts[-1:] == ["reset"]

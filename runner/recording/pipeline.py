@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, message_record
+from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, lone_message
 from runner.recording.chunks import Chunk, Packed, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import ACTIONS, RESET, RESET_OPTIONS, RESET_STATE, STEP, TOPIC_OF, Topic
@@ -54,10 +54,10 @@ class _Work:
     Without a topic it is the end of a group of chunks.
     """
 
-    topic: Topic | None
-    records: memoryview
-    encode: Callable[[], Chunk] | None
-    done: Callable[[], None]
+    topic: Topic | None = None
+    records: bytes | memoryview = b""
+    encode: Callable[[], Chunk] | None = None
+    done: Callable[[], None] = lambda: None
     """Called when the records are not needed any more."""
 
 
@@ -143,15 +143,13 @@ class Pipeline:
         assert not topic.digested
 
         def encode() -> Chunk:
-            record = message_record(topic, log_time, make())
-            times = np.array([log_time], np.uint64)
-            return encode_chunk(topic, record, times, np.zeros(1, np.uint64), self._packing)
+            return encode_chunk(topic, *lone_message(topic, log_time, make()), self._packing)
 
-        self._enqueue(_Work(topic, memoryview(b""), encode if self._file is not None else None, lambda: None))
+        self._enqueue(_Work(topic, encode=encode if self._file is not None else None))
 
     def end_group(self) -> None:
         """Write what was sent since the last group: resets first, then steps, then all else."""
-        self._enqueue(_Work(None, memoryview(b""), None, lambda: None))
+        self._enqueue(_Work())
 
     def release(self, threads: bool = True) -> None:
         """Write what is held, and hold nothing from now on; `threads` False does so without threads.

@@ -103,12 +103,12 @@ class Recording(RunDescription):
             RecordingError: the recording has no topic of that name.
         """
         if isinstance(topic, str):
-            named = [own for own in self.topics if own.name == topic]
-            if not named:
+            known = {known.name: known for known in self.topics}
+            if topic not in known:
                 raise RecordingError(
                     f"{self.path}: has no topic {topic!r}: it is of the kind {self.layout.kind!r}."
                 )
-            topic = named[0]
+            topic = known[topic]
         if topic not in self._tables:
             message, lost = self.layout.message(topic), self.lost.get(topic.name, [])
             chunks = self.file, topic, self._places[topic], message, lost
@@ -441,8 +441,8 @@ class Phase:
         for shard in self._recording.shards:
             last += shard.environments
             if environment < last:
-                if (own := self._recording._maker(f"{SHARD_MAKER}/{shard.name}")) is not None:
-                    return own
+                if (maker := self._recording._maker(f"{SHARD_MAKER}/{shard.name}")) is not None:
+                    return maker
                 break
         return self.own_maker or self._recording.maker
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.recording import schema
-from runner.recording.blocks import blank_records, message_record, record_dtype, row_dtype, rows_of
+from runner.recording.blocks import blank_records, lone_message, record_dtype, row_dtype, rows_of
 from runner.recording.digest import combined_digest
 from runner.recording.index import beginning_of_extras
 from runner.recording.layout import Layout
@@ -247,9 +247,7 @@ class Recorder:
         log_time = self.position * STEP_NANOSECONDS
         self.counts[topic.name] += 1
         is_recorded = self._reference.compare_message(topic, log_time, payload)
-        records = memoryview(message_record(topic, log_time, payload))
-        times = np.array([log_time], dtype=np.uint64)
-        self._pipeline.send(topic, records, times, np.zeros(1, np.uint64), write=not is_recorded)
+        self._pipeline.send(topic, *lone_message(topic, log_time, payload), write=not is_recorded)
         return not is_recorded
 
     def append(self, topic: Topic, payload: bytes, position: int) -> None:

@@ -102,7 +102,7 @@ class Reference:
             Diverged: the recording should be complete.
         """
         if self.complete and topic not in self._unrecorded and len(records):
-            raise Diverged(topic.name, "message", "none", "one more", **_place(records[0]))
+            raise Diverged(topic.name, "message", "none", "one more", **_position(records[0]))
 
     def check_exhausted(self) -> None:
         """Check, after the run, that the recording holds no more than the run gave.
@@ -124,23 +124,21 @@ def _block_difference(topic: Topic, found: NDArray[np.void], expected: NDArray[n
     assert difference is not None  # their bytes differ
     first, name = difference
     was, should = (np.asarray(block[first][name]).tolist() for block in (found, expected))
-    return Diverged(topic.name, name, was, should, **_place(expected[first]))
+    return Diverged(topic.name, name, was, should, **_position(expected[first]))
 
 
 def _message_difference(topic: Topic, found: tuple[int, bytes], expected: tuple[int, bytes]) -> Diverged:
-    was, should = decode(topic.message, found[1]), decode(topic.message, expected[1])
-    place: dict[str, int] = {key: should[key] for key in ("step", "episode") if key in should}
-    if found[0] != expected[0]:
-        return Diverged(topic.name, "log_time", found[0], expected[0], **place)
+    was, should = ({"log_time": time} | decode(topic.message, payload) for time, payload in (found, expected))
+    position: dict[str, int] = {key: should[key] for key in ("step", "episode") if key in should}
     for name in should:
-        are_nan = was[name] != was[name] and should[name] != should[name]
-        if was[name] != should[name] and not are_nan:
+        if repr(was[name]) != repr(should[name]):  # NaN is like NaN
+            is_table = name == "data"
             field, left, right = (
-                _cell_difference(was, should) if name == "data" else (name, was[name], should[name])
+                _cell_difference(was, should) if is_table else (name, was[name], should[name])
             )
-            return Diverged(topic.name, field, left, right, **place)
+            return Diverged(topic.name, field, left, right, **position)
     other = "other bytes of the same meaning"
-    return Diverged(topic.name, "bytes", f"{len(found[1])} bytes", other, **place)
+    return Diverged(topic.name, "bytes", f"{len(found[1])} bytes", other, **position)
 
 
 def _cell_difference(found: Message, expected: Message) -> tuple[str, object, object]:
@@ -153,6 +151,6 @@ def _cell_difference(found: Message, expected: Message) -> tuple[str, object, ob
     return f"data[{state}, {action}]", float(left[cell]), float(right[cell])
 
 
-def _place(record: np.void) -> dict[str, int]:
+def _position(record: np.void) -> dict[str, int]:
     step = "step" if "step" in (record.dtype.names or ()) else "last_step"
     return {"episode": int(record["episode"]), "step": int(record[step])}

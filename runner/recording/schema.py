@@ -409,9 +409,9 @@ class PhaseTopics:
 @cache
 def topics_of(phase: str) -> PhaseTopics:
     """Return the topics of a phase."""
-    own = {topic.name.rpartition("/")[2]: topic for topic in ALL_TOPICS if topic.phase == phase}
+    topics = {topic.name.rpartition("/")[2]: topic for topic in ALL_TOPICS if topic.phase == phase}
     names = "step actions episode reset reset_options reset_state info frame extra metrics"
-    return PhaseTopics(*(own[name] for name in names.split()))
+    return PhaseTopics(*(topics[name] for name in names.split()))
 
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", RESET: "reset"}

@@ -72,13 +72,6 @@ def leaves_of(description: object, where: str) -> list[Leaf]:
     return leaves
 
 
-def dtype_of(description: Any, where: str) -> np.dtype[np.generic] | None:
-    """Return the dtype of a space's values, `Dict` and `Tuple` as fields; None if their size varies."""
-    if any(leaf.dtype is None for leaf in leaves_of(description, where)):
-        return None
-    return row_dtype(description)
-
-
 def row_dtype(description: Description) -> np.dtype[np.generic]:
     """Return the dtype of a space's values in records, `Dict` and `Tuple` as fields.
 

@@ -31,13 +31,13 @@ def is_of_environment(rows: NDArray[np.void], environment: int) -> NDArray[np.bo
     """Return which rows are steps that an environment took: all where only one was recorded."""
     if "environment" not in (rows.dtype.names or ()):
         return is_taken(rows)
-    is_own: NDArray[np.bool_] = rows["environment"] == environment
-    is_own &= is_taken(rows)
-    return is_own
+    is_step: NDArray[np.bool_] = rows["environment"] == environment
+    is_step &= is_taken(rows)
+    return is_step
 
 
 def turns_of(rows: NDArray[np.void]) -> Iterator[tuple[int, Ints]]:
-    """Yield each environment that took steps, and the places of these among the rows."""
+    """Yield each environment that took steps, and the places of its steps among the rows."""
     places = np.flatnonzero(is_taken(rows))
     if "environment" not in (rows.dtype.names or ()):
         yield 0, places
@@ -45,6 +45,6 @@ def turns_of(rows: NDArray[np.void]) -> Iterator[tuple[int, Ints]]:
     environment = rows["environment"][places]
     order = np.argsort(environment, kind="stable")
     edges = np.flatnonzero(np.diff(environment[order])) + 1
-    for own in np.split(places[order], edges):
-        if len(own):
-            yield int(rows["environment"][own[0]]), own
+    for steps in np.split(places[order], edges):
+        if len(steps):
+            yield int(rows["environment"][steps[0]]), steps
