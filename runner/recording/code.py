@@ -15,8 +15,7 @@ import zstandard
 from msgspec import Meta
 
 from runner.errors import RecordingError
-from runner.recording.metadata import json_object
-from runner.recording.records import MAX_METADATA_BYTES
+from runner.recording.metadata import unpacked_object
 from runner.util.stored import require_keys, stored_as
 from runner.util.values import is_utf8
 
@@ -25,9 +24,7 @@ CODE_RECORD: Final = "provenance/code"
 CODE_ATTACHMENT: Final = "code.json.zst"
 MAX_CODE_BYTES: Final = 1 << 20
 """The most bytes of sources and patch that are recorded, and the most that are read."""
-_MAX_UNPACKED: Final = MAX_METADATA_BYTES
 MAX_FILES: Final = 2_000
-_MAX_WINDOW: Final = 1 << 23
 
 
 @dataclass(frozen=True)
@@ -58,18 +55,14 @@ def parse_code(data: bytes, where: str) -> Code:
     Raises:
         RecordingError: it is damaged, or too large.
     """
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
-            text = stream.read(_MAX_UNPACKED + 1)
-    except zstandard.ZstdError as error:
-        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged ({error}).") from error
-    values = json_object(text, f"{where}: {CODE_ATTACHMENT}")
-    require_keys(values, ("files", "new", "patch"), f"{where}: {CODE_ATTACHMENT} is damaged")
-    code = stored_as(Code, values, f"{where}: {CODE_ATTACHMENT} is damaged")
+    values = unpacked_object(data, f"{where}: {CODE_ATTACHMENT}")
+    where = f"{where}: {CODE_ATTACHMENT} is damaged"
+    require_keys(values, ("files", "new", "patch"), where)
+    code = stored_as(Code, values, where)
     if not all(map(_is_path, code.files)):
-        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a path that is not relative.")
+        raise RecordingError(f"{where}: found a path that is not relative.")
     if not set(code.new) <= code.files.keys():
-        raise RecordingError(f"{where}: {CODE_ATTACHMENT} is damaged: found a new file without its text.")
+        raise RecordingError(f"{where}: found a new file without its text.")
     return code
 
 

@@ -225,7 +225,7 @@ class RunDescription:
     @cached_property
     def spaces(self) -> Json:
         """The descriptions of the `observation` and the `action` space; of a job those of its tables."""
-        if not self.can_train_again:
+        if self.layout.spaces:
             return spaces_of(self.run, str(self.path))
         number = {"type": "Discrete", "start": 0, "dtype": "<i8", "shape": []}
         sizes = {"observation": self.mdp.states, "action": self.mdp.joint_actions}

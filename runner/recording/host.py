@@ -49,9 +49,19 @@ class HostSampler:
         self._looked = -math.inf
         self._before: tuple[float, float] | None = None
         """When the last sample was taken, and the processor time until then."""
-        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+        self._hidden = psutil.Error, OSError, RuntimeError, NotImplementedError
+        """The errors for what a system does not tell."""
+        with contextlib.suppress(*self._hidden):
             psutil.cpu_percent()  # the next call measures from here
-        self._gpus = _Gpus()
+        self._gpus: list[object] = []
+        """Handles of the GPUs of NVIDIA; none without its driver or without the library (the extra `gpu`)."""
+        with contextlib.suppress(Exception):  # the library may be of another version, or of another package
+            import pynvml
+
+            self._nvml = pynvml
+            pynvml.nvmlInit()
+            count = min(pynvml.nvmlDeviceGetCount(), MAX_GPUS)
+            self._gpus = [pynvml.nvmlDeviceGetHandleByIndex(k) for k in range(count)]
         self.sample()
 
     def sample(self) -> dict[str, float | list[float]]:
@@ -72,26 +82,20 @@ class HostSampler:
         values: dict[str, float | list[float]] = dict.fromkeys(FIELDS, math.nan)
         values |= {"cpu_percent": cpu, "memory_bytes": memory}
         # The system may hide each of these, as in a container.
-        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+        with contextlib.suppress(*self._hidden):
             host = psutil.virtual_memory()
-            values |= {
-                "host_memory_bytes": float(host.total - host.available),
-                "host_memory_total": float(host.total),
-            }
+            values["host_memory_bytes"] = float(host.total - host.available)
+            values["host_memory_total"] = float(host.total)
             values["host_cpu_percent"] = float(psutil.cpu_percent())
-        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+        with contextlib.suppress(*self._hidden):
             if (disk := psutil.disk_io_counters()) is not None:
-                values |= {
-                    "disk_read_bytes": float(disk.read_bytes),
-                    "disk_written_bytes": float(disk.write_bytes),
-                }
-        with contextlib.suppress(psutil.Error, OSError, RuntimeError, NotImplementedError):
+                values["disk_read_bytes"] = float(disk.read_bytes)
+                values["disk_written_bytes"] = float(disk.write_bytes)
+        with contextlib.suppress(*self._hidden):
             if (network := psutil.net_io_counters()) is not None:
-                values |= {
-                    "network_received_bytes": float(network.bytes_recv),
-                    "network_sent_bytes": float(network.bytes_sent),
-                }
-        return values | self._gpus.sample()
+                values["network_received_bytes"] = float(network.bytes_recv)
+                values["network_sent_bytes"] = float(network.bytes_sent)
+        return values | self._sample_gpus()
 
     def _used(self) -> tuple[float, float]:
         """Return processor time in seconds and resident memory in bytes, of the process and its children."""
@@ -106,29 +110,11 @@ class HostSampler:
                 memory += process.memory_info().rss
         return processor, memory
 
-
-class _Gpus:
-    """The GPUs of NVIDIA; none without its driver or without the library (the extra `gpu`)."""
-
-    def __init__(self) -> None:
-        self._handles: list[object] = []
-        try:
-            import pynvml
-
-            self._nvml = pynvml
-            pynvml.nvmlInit()
-            count = min(pynvml.nvmlDeviceGetCount(), MAX_GPUS)
-            self._handles = [pynvml.nvmlDeviceGetHandleByIndex(k) for k in range(count)]
-        except Exception:  # the library may be of another version, or another package of its name
-            self._handles = []
-
-    def sample(self) -> dict[str, list[float]]:
+    def _sample_gpus(self) -> dict[str, list[float]]:
         """Return the values of `GPU_FIELDS`, one a GPU."""
         values: dict[str, list[float]] = {name: [] for name in GPU_FIELDS}
-        for handle in self._handles:
-            use = math.nan
-            used = math.nan
-            total = math.nan
+        for handle in self._gpus:
+            use = used = total = math.nan
             with contextlib.suppress(Exception):  # each of its errors is a class of its own
                 memory = self._nvml.nvmlDeviceGetMemoryInfo(handle)
                 used, total = float(memory.used), float(memory.total)

@@ -55,7 +55,7 @@ class Layout:
     @cached_property
     def has_states(self) -> bool:
         """Whether its steps are over states; else over values of its spaces."""
-        return self.kind == "job" or over_states(json.loads(self.spaces))
+        return not self.spaces or over_states(json.loads(self.spaces))
 
     @cached_property
     def varies(self) -> bool:
@@ -78,7 +78,7 @@ class Layout:
     def _messages(self) -> dict[Topic, MessageType]:
         """The messages of the topics that are put down as rows."""
         types = {"step": schema.STEP, "episode": schema.EPISODE, "reset": schema.RESET}
-        if self.kind != "job":
+        if self.spaces:
             spaces: Json = json.loads(self.spaces)
             observation = space_field(1, "observation", spaces["observation"])
             types["reset"] = _with_values(schema.RESET, observation)

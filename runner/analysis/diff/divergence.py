@@ -21,7 +21,6 @@ from runner.errors import shortened
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
 from runner.recording.differences import differing_rows
-from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.replay.recorded import ended_episode
@@ -236,8 +235,8 @@ def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
 
 def have_same_spaces(a: Recording, b: Recording) -> bool:
     """Return whether the steps of two recordings, of which one is of a loop, are in the same spaces."""
-    kinds = {kind_of(a.run), kind_of(b.run)}
-    return kinds <= {"job", "step"} or (len(kinds) == 1 and a.spaces == b.spaces and a.agents == b.agents)
+    left, right = ((recording.layout.kind, recording.spaces, recording.agents) for recording in (a, b))
+    return left == right
 
 
 def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
