@@ -20,9 +20,8 @@ from runner.loops.options import Options, RunOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
 from runner.loops.vector import autoreset_mode_of, described_vector, first_of
-from runner.recording.episode_log import Flags
 from runner.recording.gym_values import element_of
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Flags
 
 
 class NamedEnvironments(AnyVectorEnv):

@@ -17,8 +17,8 @@ from runner.loops.loop import Loop
 from runner.loops.messages import Messages
 from runner.loops.options import Arguments, Options
 from runner.loops.step_buffer import StepBuffer
-from runner.recording.episode_log import Flags
 from runner.runs.run import Run
+from runner.util.arrays import Flags
 
 
 class Recorded:

@@ -21,14 +21,14 @@ from runner.loops.description import Copied, Described
 from runner.loops.generators import States
 from runner.loops.values import as_given, require_reset, warn_user
 from runner.recording import schema
-from runner.recording.episode_log import Columns, EpisodeLog, Flags, TurnBlock
+from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
 from runner.recording.fillers import Change, Put, filler, step_filler
 from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, only_number
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.reset_options import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions
 from runner.recording.reset_states import ResetState
 from runner.recording.spaces import Value, least_number
-from runner.util.arrays import Array, Ints, Records, zeros
+from runner.util.arrays import Array, Flags, Ints, Records, zeros
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""

@@ -24,8 +24,8 @@ from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures, without_none
 from runner.loops.values import as_given, check_phase
 from runner.loops.wrappers import return_name
-from runner.recording.episode_log import Flags
 from runner.recording.spaces import Value
+from runner.util.arrays import Flags
 
 if TYPE_CHECKING:
     _Wrapper = VectorWrapper[object, object, object, object, object]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from runner.recording import schema
-from runner.recording.actions import EpisodeDigests, Rows, after_step, kept_dtype, packed
+from runner.recording.actions import EpisodeDigests, after_step, kept_dtype, packed
 from runner.recording.messages import encode
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.schema import Topic
 from runner.recording.turns import turns_of
+from runner.util.arrays import Records
 
 
 class ActionRecorder:
@@ -22,10 +23,10 @@ class ActionRecorder:
     def __init__(self, recorder: Recorder, environments: int, block_steps: int) -> None:
         self._recorder, self._n, self._block_steps = recorder, environments, block_steps
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
-        self._rows: list[Rows] = []
+        self._rows: list[Records] = []
         self._phase = ""
 
-    def take_records(self, topic: Topic, records: Rows) -> None:
+    def take_records(self, topic: Topic, records: Records) -> None:
         """Take the steps among the records that the recorder gets."""
         if topic.message is not schema.STEP:
             return

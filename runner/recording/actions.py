@@ -20,7 +20,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.turns import is_taken
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Flags, Floats, Records
 
 DIGEST_BYTES: Final = 16
 COLUMNS: Final = (
@@ -42,8 +42,6 @@ NUMBERS: Final = ("environment", "episode", "t", "log_time")
 MARK: Final = np.dtype([("row", "<u4"), ("digest", f"V{DIGEST_BYTES}")])
 _MAX_BLOCK_BYTES: Final = 64 << 20
 _MAX_STEP: Final = 1 << 62
-
-Rows = NDArray[np.void]
 
 
 def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
@@ -74,9 +72,9 @@ class EpisodeDigests:
         environment: int,
         t: NDArray[np.integer],
         observations: Array,
-        rewards: NDArray[np.float64],
-        terminated: NDArray[np.bool_],
-        truncated: NDArray[np.bool_],
+        rewards: Floats,
+        terminated: Flags,
+        truncated: Flags,
         at: Iterable[int] = (),
     ) -> Iterator[tuple[int, bytes]]:
         """Yield rows of consecutive steps of an environment, each with the digest of its episode so far.
@@ -100,7 +98,7 @@ class EpisodeDigests:
                 yield stop - 1, running.digest(DIGEST_BYTES)
 
 
-def packed(rows: Rows, n: int) -> dict[str, object]:
+def packed(rows: Records, n: int) -> dict[str, object]:
     """Return the fields of a message with a block of steps, as `unpacked` returns them.
 
     Of each episode only the last digest in the block is kept.
@@ -131,7 +129,7 @@ def packed(rows: Rows, n: int) -> dict[str, object]:
     }
 
 
-def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> Rows:
+def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> Records:
     """Return the steps in a message.
 
     Args:
@@ -166,7 +164,7 @@ def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> R
     return rows
 
 
-def _following(rows: Rows, name: str, n: int) -> Array:
+def _following(rows: Records, name: str, n: int) -> Array:
     """Return the numbers to expect of the rows from number n on, by what their environments did before."""
     now, later = rows[:-n], rows[n:]
     if name == "episode":
@@ -176,7 +174,7 @@ def _following(rows: Rows, name: str, n: int) -> Array:
     return np.array(now[name])
 
 
-def _summed(values: Array, rows: Rows, name: str, n: int) -> Array:
+def _summed(values: Array, rows: Records, name: str, n: int) -> Array:
     """Return the numbers whose differences from `_following` these are; rows have the columns before them."""
     n = min(n, len(rows))
     turns, sums = _rounds(rows, n), _rounds(values, n)
@@ -198,7 +196,7 @@ def _rounds(values: NDArray[Any], n: int) -> NDArray[Any]:
     return padded.reshape(-1, n)
 
 
-def _is_over(rows: Rows) -> NDArray[np.bool_]:
+def _is_over(rows: Records) -> Flags:
     return np.asarray(rows["terminated"] | rows["truncated"])
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.schema import MessageType, Topic
-from runner.util.arrays import Records
+from runner.util.arrays import Flags, Records, Unsigned
 
 HEADER: Final = [
     ("opcode", "u1"),
@@ -87,7 +87,7 @@ def rows_of(message: MessageType, records: Records) -> Records:
     return rows
 
 
-def blank_records(topic: Topic, message: MessageType, n: int) -> NDArray[np.void]:
+def blank_records(topic: Topic, message: MessageType, n: int) -> Records:
     """Return n message records of a topic with every constant byte set and every value 0.
 
     Rows of messages that vary in size are not those of a file, and have no constant bytes.
@@ -99,7 +99,7 @@ def blank_records(topic: Topic, message: MessageType, n: int) -> NDArray[np.void
 
 
 @lru_cache(64)
-def constant_bytes(topic: Topic, message: MessageType) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def constant_bytes(topic: Topic, message: MessageType) -> tuple[NDArray[np.uint8], Flags]:
     """Return a blank message record of one size, and which of its bytes after the header no value changes."""
     blank, full = (np.frombuffer(_blank_record(topic, message, fill), np.uint8) for fill in (0, 255))
     is_constant = blank == full
@@ -130,9 +130,7 @@ def message_record(topic: Topic, log_time: int, payload: bytes) -> bytes:
     return MESSAGE_HEAD.pack(MESSAGE, length, topic.channel, 0, log_time, log_time) + payload
 
 
-def lone_message(
-    topic: Topic, log_time: int, payload: bytes
-) -> tuple[memoryview, NDArray[np.uint64], NDArray[np.uint64]]:
+def lone_message(topic: Topic, log_time: int, payload: bytes) -> tuple[memoryview, Unsigned, Unsigned]:
     """Return the record of a message that has a chunk of its own, its time, and where it begins."""
     record = memoryview(message_record(topic, log_time, payload))
     return record, np.array([log_time], np.uint64), np.zeros(1, np.uint64)

@@ -18,11 +18,11 @@ import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.schema import ACTIONS, EXTRA, ROW_TOPICS, STEP, TOPIC_OF, Topic
+from runner.util.arrays import Unsigned
 from runner.util.packing import MAX_CHUNK_STEPS, MAX_LEVEL, Packing
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -75,8 +75,8 @@ class Chunk:
 def encode_chunk(
     topic: Topic,
     records: bytes | memoryview,
-    log_times: NDArray[np.uint64],
-    offsets: NDArray[np.uint64],
+    log_times: Unsigned,
+    offsets: Unsigned,
     packing: Packing,
     packed: Packed | None = None,
 ) -> Chunk:
@@ -102,9 +102,7 @@ def encode_chunk(
     return Chunk(record, index, entry)
 
 
-def message_index(
-    topic: Topic, log_times: NDArray[np.uint64], offsets: NDArray[np.uint64], indexed: bool
-) -> bytes:
+def message_index(topic: Topic, log_times: Unsigned, offsets: Unsigned, indexed: bool) -> bytes:
     """Return the MessageIndex record that follows a chunk, and names its channel.
 
     Args:

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import encode
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.util.arrays import Floats, Ints
 
 SAMPLE_SECONDS: Final = 1.0
 _SAMPLES_A_DURATION: Final = 3600
@@ -80,11 +80,11 @@ class Stopwatch:
 class Clock:
     """How much time had passed after how many steps, without pauses before a run was resumed."""
 
-    positions: NDArray[np.int64]
+    positions: Ints
     """[samples], never decreasing: steps executed so far, of training and evaluation together."""
-    seconds: NDArray[np.float64]
+    seconds: Floats
     """[samples], never decreasing."""
-    started: NDArray[np.float64]
+    started: Floats
     """[samples]: when the session of the sample began, in seconds since 1970, UTC."""
     earlier: Mapping[float, float] = field(default_factory=dict)
     """When each session began -> the seconds that had been recorded before."""
@@ -100,7 +100,7 @@ class Clock:
         steps = int(self.positions[-1] - self.positions[0])
         return steps / self.duration if self.duration > 0 else None
 
-    def seconds_at(self, positions: NDArray[np.int64]) -> NDArray[np.float64]:
+    def seconds_at(self, positions: Ints) -> Floats:
         """Return the seconds that had passed at each number of steps, interpolated between samples.
 
         Args:
@@ -115,7 +115,7 @@ class Clock:
         passed = self.seconds[i] - self.seconds[before]
         return np.asarray(self.seconds[before] + np.clip(done, 0.0, 1.0) * passed)
 
-    def run_seconds(self, started: NDArray[np.float64], seconds: NDArray[np.float64]) -> NDArray[np.float64]:
+    def run_seconds(self, started: Floats, seconds: Floats) -> Floats:
         """Return the seconds of the run for seconds of its sessions, [n]; `started` are their beginnings."""
         return seconds + [self.earlier.get(start, 0.0) for start in started.tolist()]
 

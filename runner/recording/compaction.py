@@ -13,11 +13,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.actions import Rows, packed
+from runner.recording.actions import packed
 from runner.recording.blocks import lone_message
 from runner.recording.chunks import encode_chunk
 from runner.recording.messages import encode
@@ -28,6 +27,7 @@ from runner.recording.records import ReadChunk, Record
 from runner.recording.rewriting import copy
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
+from runner.util.arrays import Records, Unsigned
 from runner.util.files import replacing
 from runner.util.packing import Packing
 
@@ -66,9 +66,7 @@ def compacted(file: RecordingFile, packing: Packing) -> tuple[RecordingFile, dic
 def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dict[str, int]:
     """Write a recording into a new file; return how many messages with actions it has, by topic."""
 
-    def write(
-        topic: Topic, records: bytes | memoryview, times: NDArray[np.uint64], offsets: NDArray[np.uint64]
-    ) -> None:
+    def write(topic: Topic, records: bytes | memoryview, times: Unsigned, offsets: Unsigned) -> None:
         fresh.add_chunk(encode_chunk(topic, records, times, offsets, packing))
 
     batches, messages, read = MessageBatches(write), {}, Counter[str]()
@@ -115,9 +113,9 @@ def _require_same(path: Path, found: Mapping[str, int], expected: Mapping[str, i
             )
 
 
-def _in_blocks(blocks: Iterable[Rows], size: int) -> Iterator[Rows]:
+def _in_blocks(blocks: Iterable[Records], size: int) -> Iterator[Records]:
     """Yield rows in blocks of a size; the last may be smaller."""
-    waiting: list[Rows] = []
+    waiting: list[Records] = []
     for block in blocks:
         waiting.append(block)
         if sum(map(len, waiting)) > size:

@@ -12,19 +12,18 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.description import environment_count
 from runner.recording.differences import first_differing_row
-from runner.recording.episode_log import Columns, EpisodeLog, Flags, TurnBlock
+from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import TopicChunks
 from runner.recording.turns import is_taken
-from runner.util.arrays import Array, Ints, zeros
+from runner.util.arrays import Array, Flags, Ints, Records, zeros
 
 _MAX_STEPS: Final = 2**62
 """More steps than a recording has."""
@@ -119,7 +118,7 @@ class _Resets:
         self.left = np.empty(0, table.row_dtype)
         """What was read and not yet taken."""
 
-    def before(self, step: int) -> Iterator[NDArray[np.void]]:
+    def before(self, step: int) -> Iterator[Records]:
         """Yield the next resets in blocks, up to the first at this step or a later one."""
         while len(self.left) or len(block := next(self._blocks, self.left)):
             resets = self.left if len(self.left) else block
@@ -174,7 +173,7 @@ class _PhaseCheck:
             self._finish(steps)
         return self._findings
 
-    def _check_block(self, first: int, rows: NDArray[np.void]) -> None:
+    def _check_block(self, first: int, rows: Records) -> None:
         """Check steps of all environments, [steps of each, environments], and the resets before them.
 
         Args:
@@ -236,11 +235,11 @@ class _PhaseCheck:
         self._environments = environment[-1]
         return given, was_reset, environment
 
-    def _places(self, first: int, resets: NDArray[np.void]) -> tuple[Ints, Ints]:
+    def _places(self, first: int, resets: Records) -> tuple[Ints, Ints]:
         """Return the places of resets among the rows of a block that begins with step `first`."""
         return (resets["step"] - first) // self._n, resets["environment"].astype(np.int64) % self._n
 
-    def _check_times(self, numbers: range, rows: NDArray[np.void]) -> None:
+    def _check_times(self, numbers: range, rows: Records) -> None:
         """Compare the times of steps: each step of either phase takes one tick, so they increase."""
         times = rows["log_time"].astype(np.int64).ravel()
         before = np.concatenate([[self._findings.last_time], times[:-1]])
@@ -250,7 +249,7 @@ class _PhaseCheck:
             raise self._wrong("step", numbers[k], "log_time", times[k], f"a later tick than {before[k]}")
         self._findings.last_time = int(times[-1])
 
-    def _states(self, rows: NDArray[np.void], given: Array, was_reset: Flags, only_reset: Flags) -> Columns:
+    def _states(self, rows: Records, given: Array, was_reset: Flags, only_reset: Flags) -> Columns:
         """Return the states before and after steps, by the steps, or resets, before them."""
         least = least_number(self._recording.spaces["observation"])
         after, begun = rows["next_state"].astype(np.int64), given.reshape(rows.shape).astype(np.int64) - least
@@ -260,7 +259,7 @@ class _PhaseCheck:
         self._state = after[-1]
         return {"state": state, "next_state": np.where(only_reset, begun, after)}
 
-    def _is_over(self, numbers: range, rows: NDArray[np.void]) -> Flags:
+    def _is_over(self, numbers: range, rows: Records) -> Flags:
         """Return where a game of several agents ended without the end of any: its episode record says so."""
         is_over = np.zeros(rows.shape, np.bool_)
         while self._learners > 1 and self._n == 1:
@@ -288,7 +287,7 @@ class _PhaseCheck:
         self._findings.begun_without += len(without)
         self._findings.begun_by_reset += int(np.count_nonzero(began & explained))
 
-    def _counts(self, first: int, steps: NDArray[np.void]) -> Ints | None:
+    def _counts(self, first: int, steps: Records) -> Ints | None:
         """Return events and penalties of each step, if the environment's table determines them."""
         if self._mdp is None:
             return None
@@ -338,7 +337,7 @@ class _PhaseCheck:
                     f"/{self._phase.name}/{name}: found more records than the steps account for"
                 )
 
-    def _compare(self, what: str, found: NDArray[np.void], expected: Columns) -> None:
+    def _compare(self, what: str, found: Records, expected: Columns) -> None:
         """Compare fields of steps, resets or episodes; `what` is the field with their number, too."""
         for name, values in expected.items():
             columns = found[name], values.reshape(found[name].shape)
@@ -356,7 +355,7 @@ class _PhaseCheck:
         )
 
 
-def _numbered(table: TopicChunks) -> Iterator[NDArray[np.void]]:
+def _numbered(table: TopicChunks) -> Iterator[Records]:
     """Yield the records of a topic in blocks, as `TopicChunks.rows` does.
 
     Raises:

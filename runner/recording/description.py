@@ -36,7 +36,7 @@ from runner.recording.schema import Q_TABLE_TOPIC, Topic
 from runner.util.values import Json
 
 
-class Records(Protocol):
+class NamedRecords(Protocol):
     """What describes a run in a file: metadata records and attachments, each by name."""
 
     @property
@@ -65,7 +65,7 @@ class Records(Protocol):
 class RunDescription:
     """What is recorded about a run besides its messages; raises a `RecordingError` where it is damaged."""
 
-    def __init__(self, path: Path, records: Records) -> None:
+    def __init__(self, path: Path, records: NamedRecords) -> None:
         self.path = path
         self._records = records
 

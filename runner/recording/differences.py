@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.util.arrays import Array, Records
+from runner.util.arrays import Array, Flags, Records
 
 _COMPARED_BYTES: Final = 1 << 16
 
@@ -44,7 +44,7 @@ def first_differing_row(recorded: Array, got: Array, tolerance: float | None = N
     return None
 
 
-def differing_rows(a: NDArray[Any], b: NDArray[Any], tolerance: float | None = None) -> NDArray[np.bool_]:
+def differing_rows(a: NDArray[Any], b: NDArray[Any], tolerance: float | None = None) -> Flags:
     """Return which rows of two columns, [rows, ...], differ; arguments as for `first_difference`."""
     if tolerance is None:
         differs = _bits(a) != _bits(b)
@@ -55,7 +55,7 @@ def differing_rows(a: NDArray[Any], b: NDArray[Any], tolerance: float | None = N
         differs = ~np.isclose(b, a, rtol=tolerance, atol=tolerance, equal_nan=True)
     else:
         differs = a != b
-    rows: NDArray[np.bool_] = np.asarray(differs).reshape(len(a), -1)
+    rows: Flags = np.asarray(differs).reshape(len(a), -1)
     return np.asarray(rows.any(axis=1))
 
 

@@ -13,10 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
-from runner.util.arrays import Array, Ints
+from runner.util.arrays import Array, Flags, Floats, Ints
 
-Flags = NDArray[np.bool_]
-Floats = NDArray[np.float64]
 Columns = dict[str, Array]
 """Fields of records, by name."""
 

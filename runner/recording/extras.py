@@ -35,7 +35,7 @@ from runner.recording.spaces import Description, encode_bytes, encode_text, leaf
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Array, MaskedArray, zeros
+from runner.util.arrays import Array, Flags, Ints, MaskedArray, Records, zeros
 from runner.util.values import is_whole
 
 MAX_NAMES: Final = 256
@@ -237,7 +237,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
     def __init__(
         self,
         parts: Sequence[tuple[ExtraLayout, TopicChunks]],
-        steps_of: Callable[[int], NDArray[np.int64]],
+        steps_of: Callable[[int], Ints],
         where: str,
     ) -> None:
         self.parts = parts
@@ -264,7 +264,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         """The number of steps with extras."""
         return sum(chunks.count() for _, chunks in self.parts)
 
-    def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
+    def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Records]:
         """Yield the extras of the steps number `start` up to `stop` in blocks of one layout each.
 
         Each block is a read-only structured array with `step`, `values` and `given` (whether the value was
@@ -280,7 +280,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
             for rows in chunks.rows() if is_all else chunks.rows_between("step", start, limit):
                 yield self._with_objects(layout, rows) if layout.varying["spaces"] else rows
 
-    def _with_objects(self, layout: ExtraLayout, rows: NDArray[np.void]) -> NDArray[np.void]:
+    def _with_objects(self, layout: ExtraLayout, rows: Records) -> Records:
         """Return rows of a layout with values of varying size, with these among the others."""
         copied = [(name, rows.dtype[name]) for name in ("log_time", "given", "step")]
         block = np.zeros(len(rows), [*copied, ("values", layout.values)])
@@ -305,7 +305,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         """
         return self.at(self._steps_of(episode))
 
-    def at(self, steps: NDArray[np.int64]) -> dict[str, MaskedArray]:
+    def at(self, steps: Ints) -> dict[str, MaskedArray]:
         """Return the extras of steps, given by their numbers, ascending; as `of_episode`.
 
         Raises:
@@ -342,7 +342,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
             )
 
 
-def _column(flags: NDArray[np.bool_], dimensions: int) -> NDArray[np.bool_]:
+def _column(flags: Flags, dimensions: int) -> Flags:
     """Return [n] flags as [n, 1, ...]."""
     return flags.reshape(-1, *[1] * (dimensions - 1))
 

@@ -14,13 +14,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import MAX_SAMPLES, Clock
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.util.arrays import Floats, Ints
 
 if TYPE_CHECKING:
     import psutil
@@ -128,13 +128,13 @@ class HostSampler:
 class HostMetrics:
     """What a run used of its machine; NaN where a value is unknown."""
 
-    positions: NDArray[np.int64]
+    positions: Ints
     """[samples]: steps executed so far, of training and evaluation together."""
-    seconds: NDArray[np.float64]
+    seconds: Floats
     """[samples]: as in the clock."""
-    values: Mapping[str, NDArray[np.float64]]
+    values: Mapping[str, Floats]
     """Each of `FIELDS`, [samples]; each of `GPU_FIELDS`, [samples, GPUs]."""
-    started: NDArray[np.float64] = field(repr=False)
+    started: Floats = field(repr=False)
     """[samples]: when the session of the sample began."""
 
     @cached_property
@@ -142,7 +142,7 @@ class HostMetrics:
         """The number of GPUs."""
         return int(self.values[GPU_FIELDS[0]].shape[1])
 
-    def rate(self, name: str) -> NDArray[np.float64]:
+    def rate(self, name: str) -> Floats:
         """Return the bytes a second of a counter, [samples]; NaN for the first sample of a session."""
         counts = self.values[name]
         rate = np.full(len(counts), np.nan)

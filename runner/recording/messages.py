@@ -14,7 +14,6 @@ import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -22,7 +21,7 @@ from runner.recording.blocks import HEADER_BYTES, blank_records, constant_bytes,
 from runner.recording.fields import Field, varint
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
-from runner.util.arrays import Array, Records
+from runner.util.arrays import Array, Floats, Records
 
 Message = dict[str, Any]
 """The fields of a decoded message by name."""
@@ -99,7 +98,7 @@ class QTable:
     episode: int
     agent: str
     table: int
-    values: NDArray[np.float64]
+    values: Floats
     """[states, actions]."""
 
 
@@ -212,7 +211,7 @@ class Scalars(NamedTuple):
 
     series: list[tuple[str, str]]
     """Name and phase of each series, in the order of their first values."""
-    rows: NDArray[np.void]
+    rows: Records
     """A `SCALAR_ROW` for each value."""
 
 

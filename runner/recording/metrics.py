@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
-    from runner.util.arrays import Records
+    from runner.util.arrays import Flags, Floats, Records
 
 Better = Literal["higher", "lower", "lower_to_goal", None]
 """Which values are better; `lower_to_goal` only where episodes have a goal, None where nobody can say."""
@@ -179,12 +178,12 @@ RECENT_EPISODES: Final = 100
 """Training episodes that the summary of a loop averages, the last ones."""
 
 
-def is_usable(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_usable(values: Floats) -> Flags:
     """Return which values are finite and small enough that sums of them stay finite."""
     return abs(values) <= LARGEST  # false for NaN
 
 
-def spread_of(values: NDArray[np.float64]) -> dict[str, float]:
+def spread_of(values: Floats) -> dict[str, float]:
     """Return the sample's standard deviation, lowest and highest value; nothing for fewer than two values."""
     usable = values[is_usable(values)]
     if len(usable) < 2:
@@ -193,7 +192,7 @@ def spread_of(values: NDArray[np.float64]) -> dict[str, float]:
     return {"standard_deviation": float(usable.std(ddof=1)), "lowest": lowest, "highest": highest}
 
 
-def finite_mean(values: NDArray[np.float64]) -> float | None:
+def finite_mean(values: Floats) -> float | None:
     """Return the mean of the values that are finite and no larger than `LARGEST`; None without any."""
     if not values.size:
         return None

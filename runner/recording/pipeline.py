@@ -21,13 +21,13 @@ from functools import partial
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, lone_message
 from runner.recording.chunks import Chunk, Packed, encode_chunk
 from runner.recording.digest import ContentHash
 from runner.recording.schema import ACTIONS, RESET, RESET_OPTIONS, RESET_STATE, STEP, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile, storage_error
+from runner.util.arrays import Unsigned
 from runner.util.packing import Packing
 
 ENCODERS: Final = 2
@@ -43,7 +43,7 @@ MAX_BATCH_MESSAGES: Final = 4096
 """A batch of messages is sent before it has more than either."""
 _BEAT_SECONDS: Final = 1.0
 
-Send = Callable[[Topic, memoryview, NDArray[np.uint64], NDArray[np.uint64]], None]
+Send = Callable[[Topic, memoryview, Unsigned, Unsigned], None]
 """Takes the records of a topic, their times in nanoseconds, and where each begins."""
 
 
@@ -114,8 +114,8 @@ class Pipeline:
         self,
         topic: Topic,
         records: memoryview,
-        log_times: NDArray[np.uint64],
-        offsets: NDArray[np.uint64],
+        log_times: Unsigned,
+        offsets: Unsigned,
         write: bool = True,
         done: Callable[[], None] = lambda: None,
         packed: Packed | None = None,

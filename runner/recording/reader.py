@@ -50,6 +50,7 @@ from runner.recording.spaces import decode as decode_value
 from runner.recording.steps import EpisodeSteps, Steps
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.turns import taken
+from runner.util.arrays import Records
 
 MAX_METRICS: Final = 1 << 17
 """The most that `Phase.all_metrics` returns as one list."""
@@ -253,7 +254,7 @@ class Phase:
         )
         self._recording, self.topics = recording, topics
 
-    def steps_of_episodes(self, start: int, stop: int | None) -> Iterator[NDArray[np.void]]:
+    def steps_of_episodes(self, start: int, stop: int | None) -> Iterator[Records]:
         """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
         end = None if stop is None else self.steps.first_from("episode", stop)
         return self.steps.blocks(self.steps.first_from("episode", start), end)
@@ -293,7 +294,7 @@ class Phase:
             )
         return EpisodeSteps(self.steps, first, last, length, environment)
 
-    def episode_steps(self, episode: int) -> NDArray[np.void]:
+    def episode_steps(self, episode: int) -> Records:
         """Return the steps of one episode as an array.
 
         Raises:
@@ -345,7 +346,7 @@ class Phase:
         states = self._recording.table(self.topics.reset_states)
         return (state for _, state in states.parsed(decode_reset_state, times=times))
 
-    def _values(self, table: TopicChunks, blocks: Iterator[NDArray[np.void]], **spaces: str) -> Iterator[Any]:
+    def _values(self, table: TopicChunks, blocks: Iterator[Records], **spaces: str) -> Iterator[Any]:
         """Yield messages in blocks one by one; `spaces` names the space of each field that is a value."""
         if table.dtype is not None:
             for block in blocks:
@@ -405,7 +406,7 @@ class Phase:
         """Whether metrics are recorded, as by training; else they follow from the episodes."""
         return self.topics.metrics in self._recording.topics
 
-    def recent_episodes(self) -> NDArray[np.void]:
+    def recent_episodes(self) -> Records:
         """Return the records of the last `RECENT_EPISODES` episodes."""
         return self.episodes.array(max(0, self.episodes.count() - RECENT_EPISODES))
 

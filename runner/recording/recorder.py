@@ -14,7 +14,6 @@ from functools import lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.recording import schema
 from runner.recording.blocks import blank_records, lone_message, record_dtype, row_dtype, rows_of
@@ -29,7 +28,7 @@ from runner.recording.reuse import PackedChunks
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Array, Records
+from runner.util.arrays import Array, Records, Unsigned
 from runner.util.packing import Packing
 
 FLUSH_SECONDS: Final = 0.5
@@ -44,16 +43,8 @@ BLOCK_BYTES: Final = 8 << 20
 
 
 @dataclass
-class _Block:
-    """A buffer of records of one topic, and how far it is filled."""
-
-    records: NDArray[np.void]
-    filled: int = 0
-
-
-@dataclass
 class _Lane:
-    """The buffers of one fixed-width topic."""
+    """The buffers of one fixed-width topic, its blocks."""
 
     topic: Topic
     message: MessageType
@@ -61,9 +52,11 @@ class _Lane:
     """Records of a whole block."""
     write: bool
     """Whether its records go into the file, or into the digest alone."""
-    open: _Block | None = None
+    open: Records | None = None
     """The block that is being filled."""
-    free: queue.SimpleQueue[_Block] = field(default_factory=queue.SimpleQueue)
+    filled: int = 0
+    """Its records that were taken."""
+    free: queue.SimpleQueue[Records] = field(default_factory=queue.SimpleQueue)
     """Blocks that were written and can be filled again."""
     made: int = 0
     """Number of whole blocks, at most `MAX_BLOCKS`."""
@@ -101,7 +94,7 @@ class Recorder:
         reference: Reference | None = None,
         beat: Callable[[], None] = lambda: None,
         threads: bool = True,
-        watch: Callable[[Topic, NDArray[np.void]], None] = lambda *_: None,
+        watch: Callable[[Topic, Records], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
         observer: Observer | None = None,
         packed: PackedChunks | None = None,
@@ -153,8 +146,7 @@ class Recorder:
         """Record extras in the channels of a layout from now on, as messages of its type."""
         self._batches.flush()
         for topic in [topic for topic in self._lanes if topic.message is schema.EXTRA]:
-            if (lane := self._lanes.pop(topic)).open is not None and lane.open.filled:
-                self._send_block(lane)
+            self._send_block(self._lanes.pop(topic))
         for phase in schema.PHASES:
             topic = schema.extra_topic(phase, number)
             self._lanes[topic] = self._lane(topic, message, write=True)
@@ -178,12 +170,12 @@ class Recorder:
         """Return the dtype of the rows of a topic."""
         return row_dtype(self._lanes[topic].message)
 
-    def block(self, topic: Topic) -> NDArray[np.void]:
+    def block(self, topic: Topic) -> Records:
         """Return the free records of the topic's open block, to be filled from the first on."""
         lane = self._lanes[topic]
         if lane.open is None:
             lane.open = self._take_block(lane)
-        free = lane.open.records[lane.open.filled :]
+        free = lane.open[lane.filled :]
         limit = self._reference.remaining(topic)
         if self._packed is not None:  # end where a packed chunk does
             count = self.counts[topic.name]
@@ -192,7 +184,7 @@ class Recorder:
             limit = lane.span.stop - count if lane.span else 0
         return free[:limit] if limit else free
 
-    def fill(self, topic: Topic, positions: NDArray[np.uint64]) -> Iterator[tuple[NDArray[np.void], slice]]:
+    def fill(self, topic: Topic, positions: Unsigned) -> Iterator[tuple[Records, slice]]:
         """Yield blocks to fill with the records of a slice; `take` follows with `positions`, one a record."""
         done, n = 0, len(positions)
         while done < n:
@@ -227,9 +219,8 @@ class Recorder:
             self.take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
             self.steps[phase] += steps
         if episodes:
-            block = self._open(episode_topic)
-            ended_by = block.records["last_step"][block.filled : block.filled + episodes]
-            self.take(episode_topic, ended_by.astype(np.uint64) + np.uint64(other + 1))
+            last_steps = self._filled(episode_topic, episodes)["last_step"]
+            self.take(episode_topic, last_steps.astype(np.uint64) + np.uint64(other + 1))
         if time.monotonic() - self._last_flush > FLUSH_SECONDS:
             self.flush()
 
@@ -284,8 +275,7 @@ class Recorder:
         """Send every open block and batch to the pipeline."""
         self._batches.flush()
         for lane in self._lanes.values():
-            if lane.open is not None and lane.open.filled:
-                self._send_block(lane)
+            self._send_block(lane)
         self._pipeline.end_group()
         self._is_full = False
         self._last_flush = time.monotonic()
@@ -327,7 +317,7 @@ class Recorder:
             for topic, message in self._observer.take(is_last):
                 self._batches.extend(topic, [position], [message])
 
-    def take(self, topic: Topic, positions: NDArray[np.uint64]) -> None:
+    def take(self, topic: Topic, positions: Unsigned) -> None:
         """Take the next filled records of the topic's block: set their times, compare or keep them.
 
         Args:
@@ -336,13 +326,11 @@ class Recorder:
         Raises:
             Diverged: a record differs from the one that the recording already holds.
         """
-        lane, block = self._lanes[topic], self._open(topic)
-        if block.records.dtype.hasobject:  # messages of varying size, and the block is filled again
-            payloads = encode_rows(lane.message, block.records[: len(positions)])
-            self.extend(topic, payloads, positions.tolist())
+        lane, fresh = self._lanes[topic], self._filled(topic, len(positions))
+        if fresh.dtype.hasobject:  # messages of varying size, and the block is filled again
+            self.extend(topic, encode_rows(lane.message, fresh), positions.tolist())
             return
         has_reference = self._reference.remaining(topic) > 0
-        fresh: Records = block.records[block.filled : block.filled + len(positions)]
         times = positions * np.uint64(STEP_NANOSECONDS)
         fresh["log_time"] = times
         fresh["publish_time"] = times
@@ -350,48 +338,50 @@ class Recorder:
             self._reference.compare_block(topic, fresh)
         else:
             self._reference.check_new(topic, fresh)
-        block.filled += len(positions)
+        lane.filled += len(positions)
         self.counts[topic.name] += len(positions)
         self._watch(topic, rows_of(lane.message, fresh))
         if has_reference:
             self._send_block(lane, write=False)
-        elif block.filled == len(block.records) or (lane.span and lane.span.stop == self.counts[topic.name]):
+        elif (lane.open is not None and lane.filled == len(lane.open)) or (
+            lane.span and lane.span.stop == self.counts[topic.name]
+        ):
             if self._grouped and topic.message is schema.STEP:
-                self._is_full |= len(block.records) == lane.capacity  # the first, smaller one can wait
+                self._is_full |= lane.filled == lane.capacity  # the first, smaller block can wait
             self._send_block(lane)
 
-    def _open(self, topic: Topic) -> _Block:
-        block = self._lanes[topic].open
-        assert block is not None, "records were committed before `block` was called"
-        return block
+    def _filled(self, topic: Topic, count: int) -> Records:
+        """Return the next records of the topic's open block."""
+        lane = self._lanes[topic]
+        assert lane.open is not None, "records were committed before `block` was called"
+        records: Records = lane.open[lane.filled : lane.filled + count]
+        return records
 
-    def _take_block(self, lane: _Lane) -> _Block:
+    def _take_block(self, lane: _Lane) -> Records:
         """Return a block to fill: one that was used before, or a new one while there may be more."""
         if self._first_records is not None and not lane.has_started and record_dtype(lane.message):
             lane.has_started = True
-            return _Block(blank_records(lane.topic, lane.message, min(self._first_records, lane.capacity)))
+            return blank_records(lane.topic, lane.message, min(self._first_records, lane.capacity))
         if lane.made < MAX_BLOCKS and lane.free.empty():
             lane.made += 1
-            return _Block(blank_records(lane.topic, lane.message, lane.capacity))
-        block = lane.free.get()
-        block.filled = 0
-        return block
+            return blank_records(lane.topic, lane.message, lane.capacity)
+        return lane.free.get()
 
     def _send_block(self, lane: _Lane, write: bool = True) -> None:
-        """Send the lane's open block to the pipeline; it comes back when it was written."""
-        block, lane.open = lane.open, None
-        if block is None:
+        """Send the records of the lane's open block to the pipeline; the block comes back when written."""
+        if lane.open is None or not lane.filled:
             return
-        filled = block.records[: block.filled]
+        block, filled = lane.open, lane.open[: lane.filled]
+        lane.open, lane.filled = None, 0
         packed, span, count = None, lane.span, self.counts[lane.topic.name]
-        if self._packed and span and span[:2] == (count - block.filled, count):
+        if self._packed and span and span[:2] == (count - len(filled), count):
             packed = partial(self._packed.data, span.entry)
-        is_whole = len(block.records) == lane.capacity  # the first, smaller one is not used again
+        is_whole = len(block) == lane.capacity  # the first, smaller one is not used again
         self._pipeline.send(
             lane.topic,
             filled.view(np.uint8).data.cast("B"),
             filled["log_time"],
-            _offsets(block.filled, filled.itemsize),
+            _offsets(len(filled), filled.itemsize),
             write=write and lane.write,
             done=partial(lane.free.put, block) if is_whole else lambda: None,
             packed=packed,
@@ -399,7 +389,7 @@ class Recorder:
 
 
 @lru_cache(8)
-def _offsets(count: int, size: int) -> NDArray[np.uint64]:
+def _offsets(count: int, size: int) -> Unsigned:
     """Return where each of the records of one size begins in a block; most blocks are whole."""
     offsets = np.arange(count, dtype=np.uint64) * np.uint64(size)
     offsets.flags.writeable = False

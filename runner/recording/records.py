@@ -18,7 +18,6 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, McapRecord, Metadata
 from mcap.writer import MCAP0_MAGIC
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -37,6 +36,7 @@ from runner.recording.chunks import (
     message_index,
     unpack_chunk,
 )
+from runner.util.arrays import Unsigned
 
 MAX_METADATA_BYTES: Final = 4 << 20
 """The largest metadata record that is read, config and provenance among them."""
@@ -96,9 +96,9 @@ class ReadChunk(NamedTuple):
     """Its place; without its message index."""
     records: bytes
     """The message records."""
-    times: NDArray[np.uint64]
+    times: Unsigned
     """Log times of the messages, in nanoseconds."""
-    offsets: NDArray[np.uint64]
+    offsets: Unsigned
     """Where each message begins in `records`."""
 
     @property
@@ -237,7 +237,7 @@ def _have_one_size(records: bytes, size: int) -> bool:
     return bool((heads == heads[0]).all())
 
 
-def checked_messages(records: bytes, where: str) -> tuple[int, NDArray[np.uint64], NDArray[np.uint64]]:
+def checked_messages(records: bytes, where: str) -> tuple[int, Unsigned, Unsigned]:
     """Return channel, times and offsets of a chunk's messages.
 
     Raises:

@@ -10,13 +10,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import Diverged
 from runner.recording import schema
 from runner.recording.differences import differing_rows, first_difference
 from runner.recording.messages import Message, decode
 from runner.recording.schema import BLOCK_TOPICS, Topic
+from runner.util.arrays import Records
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording
@@ -36,8 +36,8 @@ class Reference:
     ) -> None:
         self.complete = complete
         self._remaining: dict[Topic, int] = {}
-        self._blocks: dict[Topic, Iterator[NDArray[np.void]]] = {}
-        self._block: dict[Topic, NDArray[np.void]] = {}
+        self._blocks: dict[Topic, Iterator[Records]] = {}
+        self._block: dict[Topic, Records] = {}
         self._messages: dict[Topic, Iterator[tuple[int, bytes]]] = {}
         self._logged: set[tuple[int, bytes]] = set()
         self._unrecorded = {topic for topic in BLOCK_TOPICS if without_steps and topic.message is schema.STEP}
@@ -59,7 +59,7 @@ class Reference:
         """Whether every step and episode was compared."""
         return not any(self._remaining.values())
 
-    def compare_block(self, topic: Topic, records: NDArray[np.void]) -> None:
+    def compare_block(self, topic: Topic, records: Records) -> None:
         """Compare records with the next recorded ones, as many as there are.
 
         Raises:
@@ -95,7 +95,7 @@ class Reference:
             raise _message_difference(topic, recorded, (log_time, payload))
         return True
 
-    def check_new(self, topic: Topic, records: NDArray[np.void]) -> None:
+    def check_new(self, topic: Topic, records: Records) -> None:
         """Check that records which the recording does not hold may be new.
 
         Raises:
@@ -118,7 +118,7 @@ class Reference:
                 raise Diverged(topic.name, "messages", "more", "none")
 
 
-def _block_difference(topic: Topic, found: NDArray[np.void], expected: NDArray[np.void]) -> Diverged:
+def _block_difference(topic: Topic, found: Records, expected: Records) -> Diverged:
     names = sorted(found.dtype.names or (), key=lambda name: name.startswith("tag_"))
     difference = first_difference(found, expected, names)
     assert difference is not None  # their bytes differ

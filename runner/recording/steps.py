@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.topic_chunks import FOREVER, TopicChunks, within
 from runner.recording.turns import is_of_environment, taken
+from runner.util.arrays import Ints, Records
 
 
 @dataclass(eq=False, kw_only=True)
@@ -44,7 +44,7 @@ class Steps(TopicChunks):
         start = number - number % self.environments
         return range(start, start + self.environments)
 
-    def taken(self) -> Iterator[NDArray[np.void]]:
+    def taken(self) -> Iterator[Records]:
         """Yield the steps in blocks, as `rows`, without turns at which an environment was only reset."""
         return map(taken, self.rows())
 
@@ -60,7 +60,7 @@ class Steps(TopicChunks):
         """The dtype of `rows`; of actions alone, `kept_dtype`."""
         return kept_dtype(super().row_dtype) if self.are_actions else super().row_dtype
 
-    def rows(self, times: range | None = None) -> Iterator[NDArray[np.void]]:
+    def rows(self, times: range | None = None) -> Iterator[Records]:
         """Yield the steps in blocks, in any layout; those of actions alone have the fields of `kept_dtype`.
 
         Args:
@@ -77,23 +77,21 @@ class Steps(TopicChunks):
         blocks = self._unpacked(times=range(times.start, FOREVER))
         return within(blocks, "log_time", max(times.start, 0), max(times.stop, 0))
 
-    def numbered(self, numbers: range) -> Iterator[NDArray[np.void]]:
+    def numbered(self, numbers: range) -> Iterator[Records]:
         """Yield the steps of these numbers in blocks, as `rows` does."""
         if not (self.are_actions and numbers):
             return super().numbered(numbers)
         blocks = self._unpacked(chunks=self.actions.chunks_from("step", numbers.start))
         return within(blocks, "step", numbers.start, numbers.stop)
 
-    def _unpacked(
-        self, times: range | None = None, chunks: Sequence[int] | None = None
-    ) -> Iterator[NDArray[np.void]]:
+    def _unpacked(self, times: range | None = None, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the steps of each message with actions, as `TopicChunks.messages` selects them."""
         where = f"{self.file.path}: {self.actions.topic.name}"
         for fields in self.actions.decoded(times=times, chunks=chunks):
             yield unpacked(fields, self.row_dtype, self.environments, where)
 
     @cached_property
-    def _numbers(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _numbers(self) -> tuple[Ints, Ints]:
         """The number of each chunk's first step, and the number after its last."""
         if self.are_actions:
             raise RecordingError(
@@ -123,7 +121,7 @@ class EpisodeSteps:
         """The place of its environment in a round: 0 where environments follow one another."""
         return self.first - self.table.round_of(self.first).start
 
-    def rows(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[np.void]]:
+    def rows(self, start: int = 0, stop: int | None = None) -> Iterator[Records]:
         """Yield the steps from t = `start` to before `stop` in blocks, as `Steps.rows` does.
 
         Lost steps are left out.
@@ -154,18 +152,16 @@ class EpisodeSteps:
         table = self.table
         raise RecordingError(f"{table.file.path}: {table.topic.name}: t {t:,} of an episode was lost.")
 
-    def numbers(self) -> NDArray[np.int64]:
+    def numbers(self) -> Ints:
         """Return the numbers of the steps in the phase."""
         if not self.table.have_turns:
             return np.arange(self.first, self.last + 1)
         return np.concatenate([np.empty(0, np.int64), *(rows["step"] for rows in self.rows())])
 
 
-def aligned(
-    blocks: Iterable[NDArray[np.void]], n: int, stop: int | None = None
-) -> Iterator[tuple[NDArray[np.void], int]]:
+def aligned(blocks: Iterable[Records], n: int, stop: int | None = None) -> Iterator[tuple[Records, int]]:
     """Yield steps, up to number `stop`, in blocks of as many of each of n environments, and how many wait."""
-    left: NDArray[np.void] | None = None
+    left: Records | None = None
     done = 0
     for block in blocks:
         rows = block if left is None or not len(left) else np.concatenate([left, block])

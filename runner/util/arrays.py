@@ -15,6 +15,10 @@ Records = NDArray[np.void]
 MaskedArray: TypeAlias = "np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]"
 """An `Array` with missing values; a string, as loading `numpy.ma` takes 20 ms."""
 Ints = NDArray[np.int64]
+Unsigned = NDArray[np.uint64]
+"""Log times in nanoseconds, or offsets in a file."""
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 def leaves(name: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
