@@ -20,7 +20,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.turns import is_taken
-from runner.util.arrays import Array, Flags, Floats, Records
+from runner.util.arrays import Array, Flags, Floats, RecordDType, Records
 
 DIGEST_BYTES: Final = 16
 COLUMNS: Final = (
@@ -44,7 +44,7 @@ _MAX_BLOCK_BYTES: Final = 64 << 20
 _MAX_STEP: Final = 1 << 62
 
 
-def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
+def kept_dtype(step: RecordDType) -> RecordDType:
     """Return the dtype of steps of which the actions were recorded.
 
     `digest` is that of the episode up to this step, or all zeros where none was recorded.
@@ -56,7 +56,7 @@ def kept_dtype(step: np.dtype[np.void]) -> np.dtype[np.void]:
     return np.dtype([("step", "<i8"), *columns, ("digest", f"V{DIGEST_BYTES}")])
 
 
-def after_step(step: np.dtype[np.void]) -> str:
+def after_step(step: RecordDType) -> str:
     """Return the name of the field of whole records with the observation after the step."""
     return "next_state" if "next_state" in (step.names or ()) else "next_observation"
 
@@ -129,7 +129,7 @@ def packed(rows: Records, n: int) -> dict[str, object]:
     }
 
 
-def unpacked(fields: Message, dtype: np.dtype[np.void], n: int, where: str) -> Records:
+def unpacked(fields: Message, dtype: RecordDType, n: int, where: str) -> Records:
     """Return the steps in a message.
 
     Args:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import struct
 from functools import lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.schema import MessageType, Topic
-from runner.util.arrays import Flags, Records, Unsigned
+from runner.util.arrays import DType, Flags, RecordDType, Records, Unsigned
 
 HEADER: Final = [
     ("opcode", "u1"),
@@ -39,7 +39,7 @@ MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
 
 
 @lru_cache(256)
-def record_dtype(message: MessageType) -> np.dtype[np.void] | None:
+def record_dtype(message: MessageType) -> RecordDType | None:
     """Return the dtype of a whole MCAP message record of a message; None if its messages vary in size.
 
     Fields named `tag_…` hold Protobuf's constant bytes (see `blank_records`).
@@ -53,14 +53,14 @@ def record_dtype(message: MessageType) -> np.dtype[np.void] | None:
 
 
 @lru_cache(256)
-def row_dtype(message: MessageType) -> np.dtype[np.void]:
+def row_dtype(message: MessageType) -> RecordDType:
     """Return the dtype in which a message is put down and read.
 
     That of its records, unless these store a value in another way: then it has no constant bytes. If
     messages vary in size, the values of spaces are objects, which hold bytes as `spaces` describes them.
     """
     record = record_dtype(message)
-    fields: list[tuple[str, np.dtype[Any]]] = []
+    fields: list[tuple[str, DType]] = []
     for field in message.fields:
         is_object = record is None and field.is_value
         fields.append((field.name, np.dtype(object) if is_object else field.row_dtype))

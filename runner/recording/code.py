@@ -15,7 +15,8 @@ import zstandard
 from msgspec import Meta
 
 from runner.errors import RecordingError
-from runner.recording.metadata import unpacked_object
+from runner.recording.metadata import json_object, unpacked
+from runner.recording.records import MAX_METADATA_BYTES
 from runner.util.stored import require_keys, stored_as
 from runner.util.values import is_utf8
 
@@ -55,8 +56,13 @@ def parse_code(data: bytes, where: str) -> Code:
     Raises:
         RecordingError: it is damaged, or too large.
     """
-    values = unpacked_object(data, f"{where}: {CODE_ATTACHMENT}")
-    where = f"{where}: {CODE_ATTACHMENT} is damaged"
+    what = f"{where}: {CODE_ATTACHMENT}"
+    where = f"{what} is damaged"
+    try:
+        text = unpacked(data, MAX_METADATA_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise RecordingError(f"{where} ({error}).") from error
+    values = json_object(text, what)
     require_keys(values, ("files", "new", "patch"), where)
     code = stored_as(Code, values, where)
     if not all(map(_is_path, code.files)):

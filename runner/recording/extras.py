@@ -35,7 +35,7 @@ from runner.recording.spaces import Description, encode_bytes, encode_text, leaf
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Array, Flags, Ints, MaskedArray, Records, zeros
+from runner.util.arrays import Array, DType, Flags, Ints, MaskedArray, Records, zeros
 from runner.util.values import is_whole
 
 MAX_NAMES: Final = 256
@@ -62,7 +62,7 @@ class ExtraLayout:
     """The description of each name's values, as `spaces` has them: a `Box`, an `Array`, or a `Text`."""
 
     @cached_property
-    def values(self) -> np.dtype[Any]:
+    def values(self) -> DType:
         """A field for each name; values of varying size are objects."""
         return row_dtype({"type": "Dict", "spaces": self.columns})
 
@@ -115,7 +115,7 @@ def encoded(description: Description, value: Any) -> bytes:
     return encode_bytes(np.ascontiguousarray(value, description["dtype"]).tobytes())
 
 
-def box_of(dtype: np.dtype[Any], shape: tuple[int, ...]) -> Description:
+def box_of(dtype: DType, shape: tuple[int, ...]) -> Description:
     """Return the description of arrays of one shape."""
     return {"type": "Box", "dtype": dtype.str, "shape": list(shape), "low": None, "high": None}
 
@@ -224,7 +224,7 @@ class ExtraNames:
             file.declare(layout.beginning)
 
 
-class Extras(Mapping[str, np.dtype[np.generic]]):
+class Extras(Mapping[str, DType]):
     """The extras of a phase: a mapping of the names to their dtypes, which include the shapes.
 
     Names with values of varying size have the dtype `object`; `columns` describes them.
@@ -248,7 +248,7 @@ class Extras(Mapping[str, np.dtype[np.generic]]):
         """The description of each name's values: a `Box` of one shape, an `Array` whose `shape` begins with
         null where its first axis varies in length, or a `Text`."""
 
-    def __getitem__(self, name: str) -> np.dtype[np.generic]:
+    def __getitem__(self, name: str) -> DType:
         if name not in self.columns:
             raise KeyError(name)
         return self._values[name]

@@ -36,7 +36,7 @@ from runner.recording.spaces import (
     parts_of,
     varying_length,
 )
-from runner.util.arrays import Array
+from runner.util.arrays import Array, DType
 
 _KINDS: Final[Mapping[str, int]] = {
     "|b1": Pb.TYPE_BOOL,
@@ -67,7 +67,7 @@ class Field:
     repeated: bool = False
     stored_as: str = ""
     """Its name in the file's schema, if that is another one."""
-    dtype: np.dtype[np.generic] | None = None
+    dtype: DType | None = None
     """The dtype of its value, with the shape; None if that varies, or is not known without a run."""
     parts: tuple[Field, ...] | None = None
     """The fields of a nested message: the values of a `Dict` or `Tuple`."""
@@ -90,7 +90,7 @@ class Field:
         return self.dtype is not None if self.parts is None else all(part.has_one_size for part in self.parts)
 
     @cached_property
-    def row_dtype(self) -> np.dtype[Any]:
+    def row_dtype(self) -> DType:
         """The dtype of a value in rows: without gaps, and of varying size an object, which holds bytes."""
         if not self.has_one_size:
             return np.dtype(object)
@@ -99,7 +99,7 @@ class Field:
         return np.dtype([(part.name, part.row_dtype) for part in self.parts or ()])
 
     @cached_property
-    def stored_dtype(self) -> np.dtype[Any]:
+    def stored_dtype(self) -> DType:
         """The dtype of a value of one size as it is stored, after its tag, without the tags between parts."""
         if self.dtype is not None:
             wider = None if self.dtype.shape else _WIDER.get(self.dtype.str)

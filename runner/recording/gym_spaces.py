@@ -23,6 +23,7 @@ from gymnasium.vector.utils import iterate
 from runner.environments.gym_types import Space
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.recording.spaces import MAX_VALUE_BYTES, Description, Value
+from runner.util.arrays import DType
 from runner.util.jsonable import as_json
 from runner.util.values import is_text
 
@@ -115,7 +116,7 @@ class RecordedSpace(Generic[SpaceT]):
 
     comes_from_text = False
     """Whether values are recorded as JSON that gives them back."""
-    dtype: np.dtype[np.generic] | None = None
+    dtype: DType | None = None
     """The dtype of a leaf's values with their shape; None for values that are recorded as text."""
 
     def __init__(self, space: SpaceT) -> None:
@@ -368,7 +369,7 @@ class _Box(RecordedSpace[SpaceT]):
     """A box, and any space of another library whose values are arrays of one shape and dtype."""
 
     name = "Box"
-    dtype: np.dtype[np.generic]
+    dtype: DType
 
     def __init__(self, space: SpaceT) -> None:
         super().__init__(space)
@@ -476,7 +477,7 @@ _KINDS: Final[dict[type[Space], Callable[[Any], RecordedSpace[Any]]]] = {
 }
 
 
-def _dtype(description: Description) -> np.dtype[Any]:
+def _dtype(description: Description) -> DType:
     return np.dtype(description["dtype"]).newbyteorder("=")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from runner.errors import RecordingError
 from runner.recording.gym_spaces import Keys, RecordedSpace, checked_leaves
 from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
-from runner.util.arrays import Array, zeros
+from runner.util.arrays import Array, DType, zeros
 
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 NO_VALUE: Final = (struct.error, TypeError, ValueError, LookupError, OverflowError)
@@ -165,7 +165,7 @@ class SpaceValues:
                 names = ", ".join(map(str, self.agents))
                 raise RecordingError(f"found the agent {agent!r}, expected one of possible_agents: {names}")
 
-    def fitted(self, value: Value, batch: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+    def fitted(self, value: Value, batch: tuple[int, ...], dtype: DType) -> Array:
         """Return a batch of values as they stand in a column of this dtype, [*batch, ...].
 
         Raises:
@@ -181,7 +181,7 @@ class SpaceValues:
                 raise leaf.refused(error) from error
         return column
 
-    def unknown(self, dtype: np.dtype[Any]) -> Array:
+    def unknown(self, dtype: DType) -> Array:
         """Return an unknown value as it stands in a column of this dtype: NaN, and 0 for whole numbers."""
         value = zeros((), dtype)
         for leaf in self.leaves:
@@ -210,7 +210,7 @@ class SpaceValues:
 
 
 @cache
-def _exact_scalars(base: np.dtype[np.generic]) -> frozenset[type]:
+def _exact_scalars(base: DType) -> frozenset[type]:
     scalars = {kind for kind in SCALARS if np.can_cast(kind, base)}
     return frozenset(
         scalars | {bool} | ({int} if base.kind in "iu" else {float} if base.char == "d" else set())

@@ -19,6 +19,7 @@ from runner.recording import schema
 from runner.recording.blocks import record_dtype, row_dtype
 from runner.recording.fields import Field, space_field
 from runner.recording.schema import MessageType, Topic
+from runner.util.arrays import DType, RecordDType
 from runner.util.values import Json, is_whole
 
 _MAX_STATES: Final = 2**32
@@ -66,11 +67,11 @@ class Layout:
         """Return the type of a topic's messages."""
         return self._messages.get(topic, topic.message)
 
-    def dtype(self, topic: Topic) -> np.dtype[np.void] | None:
+    def dtype(self, topic: Topic) -> RecordDType | None:
         """Return the dtype of a topic's message records in the file; None if they vary in size."""
         return record_dtype(self.message(topic))
 
-    def rows(self, topic: Topic) -> np.dtype[np.void]:
+    def rows(self, topic: Topic) -> RecordDType:
         """Return the dtype in which the messages of one of `schema.ROW_TOPICS` are put down and read."""
         return row_dtype(self.message(topic))
 
@@ -132,7 +133,7 @@ def _values_last(message: MessageType) -> MessageType:
     return replace(message, fields=fields, varies=True)
 
 
-def sized(message: MessageType, sizes: Mapping[str, int | np.dtype[Any]]) -> MessageType:
+def sized(message: MessageType, sizes: Mapping[str, int | DType]) -> MessageType:
     """Return a message with the dtypes of its numbers.
 
     Args:

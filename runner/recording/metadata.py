@@ -44,6 +44,7 @@ RECORDING_STOPPED: Final = "recording stopped at step "
 _PACKAGE: Final = "package."
 _PACKAGES: Final = "packages"
 """The entry of the provenance with the versions of all packages: JSON, in zstd, in Base64."""
+_MAX_PACKAGES_BYTES: Final = 1 << 20
 _MAX_WINDOW: Final = 1 << 23
 """The most memory that zstd may take to unpack a text."""
 _OF_SPACES: Final = ("dualtaxi.Step", "dualtaxi.Reset")
@@ -206,17 +207,14 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
         raise RecordingError(f"{what} holds no JSON object ({error}).") from error
 
 
-def unpacked_object(data: bytes, what: str) -> dict[str, object]:
-    """Return the JSON object in a text that zstd packed.
+def unpacked(data: bytes, max_bytes: int) -> bytes:
+    """Return at most so many bytes of a text that zstd packed.
 
     Raises:
-        RecordingError: it is damaged, or as for `json_object`; the message names `what`.
+        zstandard.ZstdError: it is damaged.
     """
-    try:
-        with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
-            return json_object(stream.read(MAX_METADATA_BYTES + 1), what)
-    except zstandard.ZstdError as error:
-        raise RecordingError(f"{what}: found damage ({error}).") from error
+    with zstandard.ZstdDecompressor(max_window_size=_MAX_WINDOW).stream_reader(data) as stream:
+        return stream.read(max_bytes)
 
 
 class _Repair(TypedDict):
@@ -318,9 +316,10 @@ def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]
     what = f"{path}: the packages of its provenance"
     try:
         data = base64.b64decode(others.pop(_PACKAGES, ""), validate=True)
-    except ValueError as error:
+        text = unpacked(data, _MAX_PACKAGES_BYTES)
+    except (ValueError, zstandard.ZstdError) as error:
         raise RecordingError(f"{what} are damaged ({error}).") from error
-    for name, version in (unpacked_object(data, what) if data else {}).items():
+    for name, version in (json_object(text, what) if data else {}).items():
         if not isinstance(version, str):
             raise RecordingError(f"{what} are damaged: found {version!r}, expected the version of {name}.")
         others[f"{_PACKAGE}{name}"] = version

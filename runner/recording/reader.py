@@ -80,10 +80,8 @@ class Recording(RunDescription):
         super().__init__(path, self.file)
         try:
             check_file(self.run, self.file.index, str(path))
-        except BaseException as error:
+        except BaseException:
             self.close()
-            if isinstance(error, OSError):
-                raise RecordingError(f"{path}: cannot be read ({error.strerror}).") from error
             raise
         self._tables: dict[Topic, TopicChunks] = {}
 

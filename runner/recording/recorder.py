@@ -28,7 +28,7 @@ from runner.recording.reuse import PackedChunks
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Array, Records, Unsigned
+from runner.util.arrays import Array, RecordDType, Records, Unsigned
 from runner.util.packing import Packing
 
 FLUSH_SECONDS: Final = 0.5
@@ -166,7 +166,7 @@ class Recorder:
         """Raise the error that stopped the writing, if there was one."""
         self._pipeline.raise_failure()
 
-    def dtype(self, topic: Topic) -> np.dtype[np.void]:
+    def dtype(self, topic: Topic) -> RecordDType:
         """Return the dtype of the rows of a topic."""
         return row_dtype(self._lanes[topic].message)
 

@@ -26,6 +26,7 @@ from typing import Any, Final
 import numpy as np
 
 from runner.errors import RecordingError
+from runner.util.arrays import DType
 from runner.util.values import is_text, is_whole
 
 MAX_VALUE_BYTES: Final = 16 << 20
@@ -48,9 +49,9 @@ class Leaf:
 
     path: tuple[str, ...]
     """Keys of `Dict`s and numbers of `Tuple`s, from the outermost in."""
-    dtype: np.dtype[np.generic] | None
+    dtype: DType | None
     """The dtype of its value, including the shape; None where values vary in size."""
-    item: np.dtype[np.generic] | None = None
+    item: DType | None = None
     """The dtype of an element along the first axis, of arrays of varying length; else None."""
 
 
@@ -72,7 +73,7 @@ def leaves_of(description: object, where: str) -> list[Leaf]:
     return leaves
 
 
-def row_dtype(description: Description) -> np.dtype[np.generic]:
+def row_dtype(description: Description) -> DType:
     """Return the dtype of a space's values in records, `Dict` and `Tuple` as fields.
 
     Values of varying size are objects.
@@ -150,13 +151,13 @@ def _count(description: Any) -> int:
     return 1 if parts is None else len(parts) + sum(_count(part) for _, part in parts if parts_of(part))
 
 
-def leaf_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
+def leaf_dtype(description: Mapping[str, object]) -> DType | None:
     """Return the dtype of a leaf; None where values vary in size: texts, and arrays of varying length."""
     is_one_size = description["type"] not in ("Text", "Array")
     return _array_dtype(description, description["shape"]) if is_one_size else None
 
 
-def item_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None:
+def item_dtype(description: Mapping[str, object]) -> DType | None:
     """Return the dtype of an element of arrays of varying length; None for other leaves."""
     if description["type"] != "Array":
         return None
@@ -166,7 +167,7 @@ def item_dtype(description: Mapping[str, object]) -> np.dtype[np.generic] | None
     return _array_dtype(description, shape[1:])
 
 
-def _array_dtype(description: Mapping[str, object], shape: object) -> np.dtype[np.generic]:
+def _array_dtype(description: Mapping[str, object], shape: object) -> DType:
     kind, dtype = description["type"], description["dtype"]
     if not isinstance(kind, str) or not isinstance(dtype, str) or not NUMBERS.fullmatch(dtype):
         raise ValueError(f"{kind} of {dtype}")

@@ -12,7 +12,7 @@ from runner.errors import RecordingError
 from runner.recording.actions import kept_dtype, unpacked
 from runner.recording.topic_chunks import FOREVER, TopicChunks, within
 from runner.recording.turns import is_of_environment, taken
-from runner.util.arrays import Ints, Records
+from runner.util.arrays import Ints, RecordDType, Records
 
 
 @dataclass(eq=False, kw_only=True)
@@ -56,7 +56,7 @@ class Steps(TopicChunks):
         return max(int(fields["step"] + fields["count"]) for fields in last)
 
     @property
-    def row_dtype(self) -> np.dtype[np.void]:
+    def row_dtype(self) -> RecordDType:
         """The dtype of `rows`; of actions alone, `kept_dtype`."""
         return kept_dtype(super().row_dtype) if self.are_actions else super().row_dtype
 

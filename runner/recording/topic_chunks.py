@@ -20,7 +20,7 @@ from runner.recording.messages import Message, decode, decode_rows
 from runner.recording.record_store import RecordStore
 from runner.recording.records import checked_messages
 from runner.recording.schema import TOPIC_OF, MessageType, Topic
-from runner.util.arrays import Ints, Records
+from runner.util.arrays import Ints, RecordDType, Records
 
 M = TypeVar("M")
 FOREVER: Final = 2**63 - 1
@@ -62,12 +62,12 @@ class TopicChunks:
         return len(self.places)
 
     @cached_property
-    def dtype(self) -> np.dtype[np.void] | None:
+    def dtype(self) -> RecordDType | None:
         """The dtype of a message record in the file; None if messages vary in size."""
         return record_dtype(self.message)
 
     @cached_property
-    def row_dtype(self) -> np.dtype[np.void]:
+    def row_dtype(self) -> RecordDType:
         """The dtype of `rows`."""
         return row_dtype(self.message)
 

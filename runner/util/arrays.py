@@ -14,6 +14,9 @@ Records = NDArray[np.void]
 """Structured records, such as messages of one topic."""
 MaskedArray: TypeAlias = "np.ma.MaskedArray[tuple[int, ...], np.dtype[np.generic]]"
 """An `Array` with missing values; a string, as loading `numpy.ma` takes 20 ms."""
+DType = np.dtype[Any]
+"""A dtype that is known only at run time."""
+RecordDType = np.dtype[np.void]
 Ints = NDArray[np.int64]
 Unsigned = NDArray[np.uint64]
 """Log times in nanoseconds, or offsets in a file."""
@@ -29,6 +32,6 @@ def leaves(name: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]
         yield from leaves(f"{name}.{part}" if name else part, values[part])
 
 
-def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+def zeros(shape: tuple[int, ...], dtype: DType) -> Array:
     """Return zeros of a dtype that may have a shape of its own, also one without elements."""
     return np.zeros((*shape, *dtype.shape), dtype.base)
