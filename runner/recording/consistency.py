@@ -86,11 +86,11 @@ def check_extras(recording: Recording, phase: str, complete: bool) -> None:
     Raises:
         Inconsistent: one does not.
     """
-    extras, last = recording.phase(phase).extras, -1
-    steps, topic = recording.phase(phase).steps, recording.phase(phase).topics.extras
+    recorded = recording.phase(phase)
+    steps, extras, topic, last = recorded.steps, recorded.extras, recorded.topics.extras, -1
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
-    total = recording.phase(phase).steps.total() if extras else 0
-    if recording.leaves_out_steps and not recording.phase(phase).steps.are_known:
+    total = steps.total() if extras else 0
+    if recording.leaves_out_steps and not steps.are_known:
         total = recording.result.get(f"{phase}_steps", _MAX_STEPS)
     for block in extras.blocks(stop=None if complete else total):
         numbers, where = block["step"], f"{topic.name}, step {block['step'][0]} and later"

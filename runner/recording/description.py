@@ -21,6 +21,7 @@ from runner.recording.maker import (
     parse_shards,
 )
 from runner.recording.metadata import (
+    LostRanges,
     RecordedEnvironment,
     environment_description,
     environment_of,
@@ -146,7 +147,7 @@ class RunDescription:
         return result
 
     @cached_property
-    def lost(self) -> dict[str, list[list[int]]]:
+    def lost(self) -> LostRanges:
         """Messages that a repair could not save, by topic: ranges (first, stop) of their numbers."""
         if "repair" not in self._records.metadata_names:
             return {}

@@ -40,6 +40,7 @@ from runner.recording.records import (
     LARGE,
     MAX_NAME_BYTES,
     MAX_NAMED,
+    Place,
     RawRecord,
     bytes_of,
     check_unpacked_size,
@@ -157,11 +158,11 @@ class Index:
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, Schema] = field(default_factory=dict)
     chunks: ChunkTable = field(default_factory=ChunkTable)
-    attachments: dict[str, tuple[int, int]] = field(default_factory=dict)
-    """Name to (offset, length) of the record."""
+    attachments: dict[str, Place] = field(default_factory=dict)
+    """By name."""
     media_types: dict[str, str] = field(default_factory=dict)
     """Media type of each attachment, by name."""
-    metadata: dict[str, tuple[int, int]] = field(default_factory=dict)
+    metadata: dict[str, Place] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
     """Messages by channel, as the summary counts them; empty without one."""
     finished: bool = False
@@ -239,12 +240,12 @@ class Index:
             case Opcode.HEADER if raw.offset != len(MCAP0_MAGIC):
                 raise RecordingError(f"found a second header at {raw.offset}")
 
-    def add_metadata(self, name: str, place: tuple[int, int]) -> None:
-        """Add the (offset, length) of a metadata record."""
+    def add_metadata(self, name: str, place: Place) -> None:
+        """Add a metadata record."""
         _add_once(self.metadata, name, place, "metadata")
 
-    def add_attachment(self, name: str, place: tuple[int, int], media_type: str) -> None:
-        """Add the (offset, length) of an attachment."""
+    def add_attachment(self, name: str, place: Place, media_type: str) -> None:
+        """Add an attachment."""
         _add_once(self.attachments, name, place, "attachment")
         self.media_types[name] = media_type
 

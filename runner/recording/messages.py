@@ -25,6 +25,8 @@ from runner.util.arrays import Array, Floats, Records
 
 Message = dict[str, Any]
 """The fields of a decoded message by name."""
+Logged = tuple[int, bytes]
+"""The log time of a message, in nanoseconds, and its payload."""
 _IS_VALUE: Final = attrgetter("is_value")
 
 
@@ -135,7 +137,7 @@ def encode_rows(message: MessageType, rows: Records) -> list[bytes]:
     return payloads
 
 
-def decode_rows(message: MessageType, messages: Sequence[tuple[int, bytes]]) -> Records:
+def decode_rows(message: MessageType, messages: Sequence[Logged]) -> Records:
     """Return messages of varying size, given as log times and payloads, as rows.
 
     Raises:
@@ -223,7 +225,7 @@ _MAX_LAYOUTS: Final = 64
 """The most layouts among payloads of one size; beyond these it is quicker to decode them one by one."""
 
 
-def decode_scalars(messages: Sequence[tuple[int, bytes]]) -> Scalars:
+def decode_scalars(messages: Sequence[Logged]) -> Scalars:
     """Return `dualtaxi.Scalar` messages, given as log times and payloads.
 
     Payloads that differ in nothing but the bytes of their numbers are decoded together.

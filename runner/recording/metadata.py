@@ -53,6 +53,8 @@ _RUN_TEXTS: Final = ("run_id", "name", "job", "created", "agents")
 _RUN_COUNTS: Final = {"seed": 2**64 - 1, "learners": MAX_AGENTS, "events": MAX_EVENTS}
 """The numbers that every metadata record `run` has, and the largest possible value of each."""
 
+LostRanges = dict[str, list[list[int]]]
+"""Topic -> ranges (first, stop) of the numbers of messages."""
 Attachments = Mapping[str, tuple[str, bytes]]
 """Name -> media type and content."""
 
@@ -223,7 +225,7 @@ class _Repair(TypedDict):
     lost: dict[str, list[Annotated[list[Count], Meta(min_length=2, max_length=2)]]]
 
 
-def lost_ranges(repair: Mapping[str, object], path: str) -> dict[str, list[list[int]]]:
+def lost_ranges(repair: Mapping[str, object], path: str) -> LostRanges:
     """Return the messages that a repair could not save: by topic, ranges (first, stop) of their numbers.
 
     Raises:

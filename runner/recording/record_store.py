@@ -25,6 +25,7 @@ from runner.recording.records import (
     MAX_METADATA_BYTES,
     AttachmentRecord,
     MetadataRecord,
+    Place,
     RawRecord,
     read_record,
 )
@@ -111,7 +112,7 @@ class RecordStore:
         for name in self.attachment_names:
             yield self._named(AttachmentRecord, "attachment", self.index.attachments, name)
 
-    def _named(self, kind: type[N], what: str, places: Mapping[str, tuple[int, int]], name: str) -> N:
+    def _named(self, kind: type[N], what: str, places: Mapping[str, Place], name: str) -> N:
         """Return a metadata record or an attachment, whose checksum is compared."""
         if name not in places:
             raise RecordingError(
@@ -169,10 +170,10 @@ class RecordStore:
         chunks = self.index.chunks
         channels: NDArray[np.uint16] = chunks.columns["channel"].copy()
         for k in np.flatnonzero(channels == 0).tolist():  # the file was cut off before the chunk's index
-            channels[k] = first_channel(self.chunk_body(chunks[k]), self._where(chunks[k]))
+            channels[k] = first_channel(self.chunk_body(chunks[k]), self.where(chunks[k]))
         for k in np.flatnonzero(~np.isin(channels, list(self.index.channels))).tolist():
             raise RecordingError(
-                f"{self._where(chunks[k])}: found messages of channel {channels[k]}, which the recording "
+                f"{self.where(chunks[k])}: found messages of channel {channels[k]}, which the recording "
                 "does not have."
             )
         return channels
@@ -193,7 +194,7 @@ class RecordStore:
         return records
 
     def _unpacked(self, entry: ChunkEntry) -> bytes:
-        where = self._where(entry)
+        where = self.where(entry)
         body = self.chunk_body(entry)
         try:
             head, records = unpack_chunk(body, where)
@@ -205,7 +206,8 @@ class RecordStore:
             )
         return records
 
-    def _where(self, entry: ChunkEntry) -> str:
+    def where(self, entry: ChunkEntry) -> str:
+        """Return how errors name a chunk."""
         return f"{self.path}: chunk at {entry.offset}"
 
     def _raw(self, offset: int, length: int, max_bytes: int = MAX_CHUNK_BYTES) -> RawRecord:

@@ -68,6 +68,8 @@ _BEGINNING_BYTES: Final = 1 << 10
 """Bytes of a body in which a chunk's head is, or a name of `MAX_NAME_BYTES`."""
 _CHUNK_TIMES: Final = struct.Struct("<QQ")
 
+Place = tuple[int, int]
+"""Where a record begins in the file, and how many bytes it has, its head included."""
 Report = Callable[[int, int], None]
 """Called with the bytes that were read, and the size of the file."""
 
@@ -140,8 +142,8 @@ class RawRecord(NamedTuple):
         return self.offset + RECORD_HEAD.size + self.length
 
     @property
-    def place(self) -> tuple[int, int]:
-        """Where it is, and how many bytes it has, its head included."""
+    def place(self) -> Place:
+        """Its place."""
         return self.offset, RECORD_HEAD.size + self.length
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from runner.errors import Diverged
 from runner.recording import schema
 from runner.recording.differences import differing_rows, first_difference
-from runner.recording.messages import Message, decode
+from runner.recording.messages import Logged, Message, decode
 from runner.recording.schema import BLOCK_TOPICS, Topic
 from runner.util.arrays import Records
 
@@ -38,8 +38,8 @@ class Reference:
         self._remaining: dict[Topic, int] = {}
         self._blocks: dict[Topic, Iterator[Records]] = {}
         self._block: dict[Topic, Records] = {}
-        self._messages: dict[Topic, Iterator[tuple[int, bytes]]] = {}
-        self._logged: set[tuple[int, bytes]] = set()
+        self._messages: dict[Topic, Iterator[Logged]] = {}
+        self._logged: set[Logged] = set()
         self._unrecorded = {topic for topic in BLOCK_TOPICS if without_steps and topic.message is schema.STEP}
         if recording is None:
             return
@@ -127,7 +127,7 @@ def _block_difference(topic: Topic, found: Records, expected: Records) -> Diverg
     return Diverged(topic.name, name, was, should, **_position(expected[first]))
 
 
-def _message_difference(topic: Topic, found: tuple[int, bytes], expected: tuple[int, bytes]) -> Diverged:
+def _message_difference(topic: Topic, found: Logged, expected: Logged) -> Diverged:
     was, should = ({"log_time": time} | decode(topic.message, payload) for time, payload in (found, expected))
     position: dict[str, int] = {key: should[key] for key in ("step", "episode") if key in should}
     for name in should:

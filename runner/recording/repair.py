@@ -26,7 +26,7 @@ from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
 from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
-from runner.recording.metadata import REQUIRED_RECORDS, check_run, json_object, layout_of_run
+from runner.recording.metadata import REQUIRED_RECORDS, LostRanges, check_run, json_object, layout_of_run
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import (
     MetadataRecord,
@@ -53,7 +53,7 @@ class Repair:
     """Whether there was nothing to do."""
     kept: dict[str, int] = field(default_factory=dict)
     """Messages kept, by topic."""
-    lost: dict[str, list[list[int]]] = field(default_factory=dict)
+    lost: LostRanges = field(default_factory=dict)
     """Messages lost, now or in an earlier repair, by topic: ranges of numbers, the second not included."""
     torn_steps: int = 0
     """Steps in a chunk that was cut off at the end."""
@@ -268,7 +268,7 @@ class _Salvage:
         return ticks if size == ticks * dtype.itemsize else 0
 
 
-def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> dict[str, list[list[int]]]:
+def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> LostRanges:
     """Return the messages missing after those found of each topic, as `Repair.lost`."""
     return {name: [[found[name], n]] for name, n in stated.items() if name in found and found[name] < n}
 

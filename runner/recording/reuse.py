@@ -51,7 +51,7 @@ class PackedChunks:
 
         They are unpacked, whatever checksums the file has: its maker may have written any.
         """
-        where = f"{self.recording.path}: chunk at {entry.offset}"
+        where = self.recording.file.where(entry)
         try:
             body = self.recording.file.chunk_body(entry)
             head = chunk_head(body, len(body), where)

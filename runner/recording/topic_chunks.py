@@ -16,7 +16,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype, row_dtype, rows_of
 from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry
-from runner.recording.messages import Message, decode, decode_rows
+from runner.recording.messages import Logged, Message, decode, decode_rows
 from runner.recording.record_store import RecordStore
 from runner.recording.records import checked_messages
 from runner.recording.schema import TOPIC_OF, MessageType, Topic
@@ -234,7 +234,7 @@ class TopicChunks:
             self._last = k, rows
         return self._last[1]
 
-    def _decoded(self, messages: Sequence[tuple[int, bytes]]) -> Records:
+    def _decoded(self, messages: Sequence[Logged]) -> Records:
         """Return messages of varying size as rows.
 
         Raises:
@@ -267,9 +267,7 @@ class TopicChunks:
             raise self._damaged(k, f"other messages than of {self.topic.name}")
         return block
 
-    def messages(
-        self, times: range | None = None, chunks: Sequence[int] | None = None
-    ) -> Iterator[tuple[int, bytes]]:
+    def messages(self, times: range | None = None, chunks: Sequence[int] | None = None) -> Iterator[Logged]:
         """Yield (log time in nanoseconds, payload) of the messages.
 
         Args:
@@ -281,8 +279,7 @@ class TopicChunks:
         for k in range(len(self)) if chunks is None else chunks:
             entry = self.entry(k)
             data = self.file.chunk(entry)
-            where = f"{self.file.path}: chunk at {entry.offset}"
-            channel, log_times, offsets = checked_messages(data, where)
+            channel, log_times, offsets = checked_messages(data, self.file.where(entry))
             if channel != (entry.channel or channel) or TOPIC_OF[channel].name != self.topic.name:
                 raise self._damaged(k, f"other messages than of {self.topic.name}")
             edges = pairwise([*offsets.tolist(), len(data)])
@@ -336,7 +333,7 @@ class TopicChunks:
         return RecordingError(f"{self.file.path}: {self.topic.name} at {time} ns: {error}")
 
     def _damaged(self, k: int, found: str) -> RecordingError:
-        return RecordingError(f"{self.file.path}: chunk at {self.entry(k).offset}: found {found}.")
+        return RecordingError(f"{self.file.where(self.entry(k))}: found {found}.")
 
 
 def within(blocks: Iterable[Records], field: str, start: int, stop: int) -> Iterator[Records]:

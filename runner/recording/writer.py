@@ -23,6 +23,7 @@ from runner.recording.layout import Layout
 from runner.recording.records import (
     AttachmentRecord,
     MetadataRecord,
+    Place,
     Record,
     asks_for_indexes,
     attachment_record,
@@ -183,7 +184,7 @@ class RecordingFile:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _append(self, data: bytes) -> tuple[int, int]:
+    def _append(self, data: bytes) -> Place:
         """Append records; return their place."""
         view = memoryview(data)
         while view:
