@@ -48,7 +48,6 @@ from runner.recording.records import (
     raw_records,
 )
 from runner.recording.schema import (
-    ALL_TOPICS,
     EXTRA,
     MAX_LAYOUTS,
     MESSAGES,
@@ -176,11 +175,6 @@ class Index:
     """Why its records were not read to the end of the data section; empty if they were."""
     schema_records: bytes = b""
     channel_records: bytes = b""
-
-    @property
-    def topics(self) -> list[Topic]:
-        """The topics of its channels."""
-        return [topic for topic in ALL_TOPICS if topic.channel in self.channels]
 
     def check_unpacked_size(self, path: str) -> None:
         """Refuse a file whose chunks declare far more bytes than those of any recording of its size.

@@ -303,13 +303,13 @@ def test_each_message_is_compared_in_a_time_that_does_not_grow(tmp_path, monkeyp
     read = []
 
     def counted(original):
-        def blocks(self, *arguments):
-            for block in original(self, *arguments):
+        def chunks(self, *arguments):
+            for k, rows in original(self, *arguments):
                 if self.topic.name == topic:
-                    read.append(len(block))
-                yield block
+                    read.append(len(rows))
+                yield k, rows
 
-        return blocks
+        return chunks
 
     with runner.record_parallel(Leaving(), tmp_path, chunk_steps=256) as rec:
         parallel(rec, 700)
@@ -317,7 +317,7 @@ def test_each_message_is_compared_in_a_time_that_does_not_grow(tmp_path, monkeyp
             rec.reset()
     with open_recording(rec.run.recording) as recording:
         total = recording.table(topic).count()
-        monkeypatch.setattr(TopicChunks, "blocks", counted(TopicChunks.blocks))
+        monkeypatch.setattr(TopicChunks, "_read", counted(TopicChunks._read))
         check_phase(recording, "train", complete=True)
         assert total <= sum(read) <= 4 * total
 
