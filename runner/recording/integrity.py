@@ -65,7 +65,10 @@ def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
         advice = "; `dualtaxi repair` mends it" if contents.end else ""
         error = CutOff if may_be_cut(path, contents) else RecordingError
         raise error(f"{path}: {contents.reason}{advice}.")
-    found, expected = _tails(path, contents)
+    with _reading(path) as stream:
+        expected = contents.tail(checksum(stream, 0, contents.end))
+        stream.seek(contents.end)
+        found = stream.read(len(expected) + 1)
     if len(found) < len(expected) and expected.startswith(found):
         raise CutOff(f"{path}: the file ends at {contents.size}, in its summary; `dualtaxi repair` mends it.")
     if found != expected:
@@ -212,14 +215,6 @@ def _with_index(chunk: ReadChunk, raw: RawRecord, indexed: bool) -> ChunkEntry:
     if expected[RECORD_HEAD.size :] != raw.body:
         raise RecordingError(f"the message index at {raw.offset} does not lead to the chunk's messages")
     return chunk.entry._replace(index_length=len(expected))
-
-
-def _tails(path: Path, contents: Index) -> tuple[bytes, bytes]:
-    """Return what follows the data of a recording, and what should follow it."""
-    with _reading(path) as stream:
-        expected = contents.tail(checksum(stream, 0, contents.end))
-        stream.seek(contents.end)
-        return stream.read(len(expected) + 1), expected
 
 
 def _ends_torn(stream: BinaryIO, contents: Index) -> bool:

@@ -96,11 +96,8 @@ class Layout:
             types["episode"] = replace(types["episode"], fields=episodes)
         sizes = {"rewards": self.learners, "returns": self.learners, "events": self.events}
         types = {name: sized(message, sizes) for name, message in types.items()}
-        values = {
-            name: [field for field in message.fields if field.is_value] for name, message in types.items()
-        }
-        if not all(field.has_one_size for fields in values.values() for field in fields):
-            types |= {name: _values_last(types[name]) for name, fields in values.items() if fields}
+        if not all(field.has_one_size for message in types.values() for field in message.values):
+            types |= {name: _values_last(message) for name, message in types.items() if message.values}
         return {
             topic: types[topic.name.rpartition("/")[2]] for topic in self.topics if topic in schema.ROW_TOPICS
         }

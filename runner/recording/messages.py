@@ -7,7 +7,6 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -27,7 +26,6 @@ Message = dict[str, Any]
 """The fields of a decoded message by name."""
 Logged = tuple[int, bytes]
 """The log time of a message, in nanoseconds, and its payload."""
-_IS_VALUE: Final = attrgetter("is_value")
 
 
 @lru_cache(256)
@@ -109,7 +107,7 @@ def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
 
     Values of spaces are bytes as `spaces` describes them; of such a message no field may be missing.
     """
-    if any(field.is_value for field in message.fields):
+    if message.values:
         row = np.zeros(1, row_dtype(message))
         for field in message.fields:
             row[field.name][0] = values[field.name]
@@ -131,7 +129,7 @@ def encode_rows(message: MessageType, rows: Records) -> list[bytes]:
     for field in numbers.fields:
         records[field.name] = rows[field.name]
     payloads = [record[HEADER_BYTES:] for record in records.view(f"V{records.itemsize}").tolist()]
-    for field in filter(_IS_VALUE, message.fields):
+    for field in message.values:
         parts = (field.encoded(value, 0)[0] for value in rows[field.name].tolist())
         payloads = [payload + part for payload, part in zip(payloads, parts, strict=True)]
     return payloads
@@ -143,7 +141,7 @@ def decode_rows(message: MessageType, messages: Sequence[Logged]) -> Records:
     Raises:
         RecordingError: one is not as `encode_rows` writes them.
     """
-    numbers, values = _numbers_of(message), [*filter(_IS_VALUE, message.fields)]
+    numbers = _numbers_of(message)
     dtype = blank_records(schema.LOG_TOPIC, numbers, 0).dtype
     size = dtype.itemsize - HEADER_BYTES
     head = bytes(HEADER_BYTES)
@@ -161,7 +159,7 @@ def decode_rows(message: MessageType, messages: Sequence[Logged]) -> Records:
         raise RecordingError(f"found a payload that is no {message.full_name}")
     for k, (_, payload) in enumerate(messages):
         end = size
-        for field in values:
+        for field in message.values:
             rows[field.name][k], end = field.decoded(payload, end)
         if end != len(payload):
             raise RecordingError(f"found {len(payload)} bytes, expected {end} in a {message.full_name}")
@@ -292,7 +290,7 @@ def decode(message: MessageType, payload: bytes) -> Message:
     Raises:
         RecordingError: the payload is not such a message.
     """
-    if any(field.is_value for field in message.fields):
+    if message.values:
         row = decode_rows(message, [(0, payload)])[0]
         return {field.name: _plain(row[field.name]) for field in message.fields}
     try:

@@ -240,8 +240,7 @@ class Pipeline:
         if self._file is None:
             return
         if work.encode is not None:
-            chunk = work.encode() if encoded is None else encoded.result()
-            self._group.append(chunk)
+            self._group.append(work.encode() if encoded is None else encoded.result())
         if self._group and (work.topic is None or not self._grouped):
             self._write_group(self._file)
 

@@ -6,7 +6,7 @@ Every message is protobuf; `blocks` defines how the most frequent ones are laid 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Final
 
 import numpy as np
@@ -35,6 +35,11 @@ class MessageType:
     def full_name(self) -> str:
         """The fully qualified protobuf name."""
         return f"{self.package}.{self.name}"
+
+    @cached_property
+    def values(self) -> tuple[Field, ...]:
+        """The fields with values of the spaces of an environment."""
+        return tuple(field for field in self.fields if field.is_value)
 
 
 @dataclass(frozen=True, eq=False)
