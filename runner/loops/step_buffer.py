@@ -22,7 +22,7 @@ from runner.loops.generators import States
 from runner.loops.values import as_given, require_reset, warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
-from runner.recording.fillers import Change, Put, filler, step_filler
+from runner.recording.fillers import Change, Put, PutStep, filler, step_filler
 from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, only_number
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.reset_options import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions
@@ -72,8 +72,9 @@ class StepBuffer:
         """Whether values vary in size."""
         self.off_table = 0
         """Committed steps whose reward the environment's table excludes; 0 without a table."""
-        self._filled, self._room, self._held = 0, 0, 0
-        """Rows of the block that are in use, with how many it is full, and bytes of varying size in them."""
+        self._filled, self._room, self._full_at, self._held = 0, 0, 0, 0
+        """Rows of the block that are in use, how many it has, with how many it is full now, and bytes of
+        varying size in them."""
         self.resets = 0
         """The number of resets so far."""
         resets = max(recorder.capacity(self._topics.resets), self._n)
@@ -102,7 +103,7 @@ class StepBuffer:
         """Rows with resets in place of steps, and what those depended on."""
         self._bytes: memoryview | None = None
         """The block, where it has the bytes of an action as `keep` returns them."""
-        self._put: Put = self._put_parts
+        self._put: PutStep = self._put_parts
         self.keep: Change = self._copied
         """Returns an action, of one environment alone, in a form that the step cannot change."""
         self._is_copied = isinstance(described, Copied)
@@ -186,7 +187,7 @@ class StepBuffer:
             self._ended += 1
             self._idle_at = row
         if row >= self._full_at:
-            self._advance(slice(row - 1, row))
+            self._commit_full()
 
     def take_game(
         self,
@@ -208,10 +209,12 @@ class StepBuffer:
         flags = dict.fromkeys(actions, True), terminated, truncated
         masks = [sum(bool(ends.get(agent)) << i for i, agent in enumerate(agents)) for ends in flags]
         self._marks[row] = (*masks, 0, over, False)
+        self._filled = row = row + 1
         if over:
             self._ended += 1
-            self._idle_at = row + 1
-        self._advance(slice(row, row + 1))
+            self._idle_at = row
+        if row >= self._full_at:
+            self._commit_full()
 
     def take_vector(
         self,
@@ -237,8 +240,7 @@ class StepBuffer:
         row = self._filled
         if rewards.__class__ is not np.ndarray or rewards.shape != self._batch:
             rewards = np.asarray(rewards, np.float64).reshape(self._batch)
-        self._put_action(row, actions)
-        self._put_observation(row, observations)
+        self._hold(self._put_action(row, actions) + self._put_observation(row, observations))
         self._rewards[row] = rewards
         ends = self._ends[row]
         ends[0], ends[1] = terminated, truncated
@@ -246,13 +248,13 @@ class StepBuffer:
             which = ends.any(axis=0).nonzero()[0]
             firsts = self._observations[row, which]
             for i in which.tolist():
-                self._put_last(row * self._n + i, element_of(final, i))
+                self._hold(self._put_last(row * self._n + i, element_of(final, i)))
             self._add_resets(row + 1, which, firsts)
         if states:
             self._autoreset_states[row] = states
         self._filled = row = row + 1
         if row >= self._full_at:
-            self._advance(slice(row - 1, row))
+            self._commit_full()
 
     def take_batch(
         self,
@@ -327,8 +329,12 @@ class StepBuffer:
             if firsts is not None:
                 at, which = np.nonzero(self._ends[rows].any(axis=1))
                 self._add_resets(row + at + 1, which, firsts[done + at, which])
+            if self._are_bytes:
+                self._hold(sum(map(len, (*self._actions[rows].flat, *self._observations[rows].flat))))
             done += count
-            self._advance(rows)
+            self._filled = rows.stop
+            if self._filled >= self._full_at:
+                self._commit_full()
 
     def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last batch or reset of the phase."""
@@ -401,7 +407,7 @@ class StepBuffer:
             states: what they depended on, by environment.
         """
         if self._are_bytes:
-            self._hold(*observations)
+            self._hold(sum(map(len, observations)))
         start, self._waiting = self._waiting, self._waiting + len(which)
         while self._waiting > len(self._resets):
             self._resets = np.concatenate([self._resets, np.zeros_like(self._resets)])
@@ -436,8 +442,7 @@ class StepBuffer:
         require_reset(self.resets, self._phase)
         self._first_action(action)
         room, n = max(1, self._recorder.capacity(self._topics.steps) // self._n), self._n
-        self._room = room
-        self._full_at = 0 if self._are_bytes else room  # the bytes of each step are counted
+        self._room = self._full_at = room
         masks = [(name, "<u4") for name in (*_OF_GAMES, "environment")]
         self._marks = np.zeros(room, [*masks, ("over", "?"), ("begins", "?")])
         action = self._recorder.dtype(self._topics.steps)["action"]
@@ -483,26 +488,23 @@ class StepBuffer:
             start = row * (len(self._bytes) // len(self._ends))
             self._bytes[start : start + len(action)] = action
         else:
-            self._put_action(row, action)
-        self._put_observation(row, observation)
+            self._hold(self._put_action(row, action))
+        self._hold(self._put_observation(row, observation))
         try:
             self._rewards[row] = rewards if self._is_game else float(rewards)
         except (TypeError, ValueError):
             self._rewards[row] = only_number(rewards, "reward")
         self._ends[row] = [[bool(terminated)], [bool(truncated)]]
 
-    def _advance(self, rows: slice) -> None:
-        """Take rows that were put down into the block, and hand it to the recorder if it is full."""
-        if self._are_bytes:
-            self._hold(*self._actions[rows].ravel(), *self._observations[rows].ravel())
-        self._filled = rows.stop
-        if self._filled == self._room or self._held > BLOCK_BYTES:
-            self.commit()
-            self._recorder.write_if_full()
+    def _hold(self, size: int) -> None:
+        """Count bytes of values of varying size; with many of them, the block is full."""
+        self._held += size
+        if self._held > BLOCK_BYTES:
+            self._full_at = 0
 
-    def _hold(self, *values: bytes) -> None:
-        """Count the bytes of values of varying size; with many of them, the block is full."""
-        self._held += sum(map(len, values))
+    def _commit_full(self) -> None:
+        self.commit()
+        self._recorder.write_if_full()
 
     # --- records --------------------------------------------------------------------------------------
 
@@ -554,6 +556,7 @@ class StepBuffer:
             self._last_position = before + rows * n
         self._over, self._idle_at, self._autoreset_states = over, 0 if is_idle else -1, {}
         self._filled = self._waiting = self._held = self._ended = self._counted = 0
+        self._full_at = self._room
 
     def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
         """Return `was_reset`, `only_reset` and `is_over` of the `TurnBlock`; put down the resets among these.

@@ -17,12 +17,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.recording.gym_values import NO_VALUE, Leaf, SpaceValues
-from runner.recording.spaces import Value
+from runner.recording.gym_values import NO_VALUE, REFUSED, Leaf, SpaceValues
+from runner.recording.spaces import MAX_VALUE_BYTES, Value, encode_text
 from runner.util.arrays import Array, Records
 
-Put = Callable[..., None]
-"""Puts values into a row, whose number comes first."""
+Put = Callable[..., int]
+"""Puts values into a row, whose number comes first; returns the bytes of those that vary in size."""
+PutStep = Callable[..., None]
+"""Puts a whole step into a row, whose number comes first."""
 Change = Callable[[Value], Value]
 """Returns a value in another form."""
 _MAX_PACKED: Final = 4096
@@ -43,6 +45,9 @@ class _Source:
         self._scope[name] = value
         return name
 
+    def _inside(self, whole: str, leaf: Leaf) -> str:
+        return whole + "".join(f"[{self.name(key)}]" for key in leaf.keys)
+
     def value(
         self,
         whole: str,
@@ -59,8 +64,7 @@ class _Source:
                 None for all values.
             fit: called with other values; by default they are fitted.
         """
-        value, shape = f"v{len(self._scope)}", batch + leaf.shape
-        inside = whole + "".join(f"[{self.name(key)}]" for key in leaf.keys)
+        value, shape, inside = f"v{len(self._scope)}", batch + leaf.shape, self._inside(whole, leaf)
         if values.agents:
             zeros = self.name(np.zeros(shape, leaf.base)[()])
             inside = f"{inside} if {self.name(leaf.keys[0])} in {whole} else {zeros}"
@@ -72,20 +76,28 @@ class _Source:
 
     def packed(
         self, whole: str, values: SpaceValues, column: Array, fit: Change | None = None
-    ) -> tuple[str, str]:
-        """Return how the leaves of a value of one environment are packed, and expressions for them."""
-        codes, expressions = "", []
+    ) -> list[tuple[str, str]]:
+        """Return how each leaf of a value of one environment is packed, and an expression for it.
+
+        Leaves of varying size have no code, and an expression for their bytes.
+        """
+        packed = []
         for leaf in values.leaves:
-            code = "" if leaf.shape else _CODES.get(leaf.column_in(column).dtype.str, "")
+            if leaf.space.dtype is None:
+                text = f"{self.name(leaf.space.text)}({self._inside(whole, leaf)})"
+                packed.append(("", f"{self.name(encode_text)}({text})"))
+                continue
+            dtype = leaf.base if column.dtype.hasobject else leaf.column_in(column).dtype
+            code = "" if leaf.shape else _CODES.get(dtype.str, "")
             scalars: frozenset[type] | None = leaf.exact_scalars
             if not code and not leaf.shape:
                 scalars = frozenset([leaf.base.type])
             elif code and code not in "?d":  # `struct` takes whole numbers that fit, and nothing else
                 scalars = None
-            codes += code or f"{leaf.base.itemsize * math.prod(leaf.shape)}s"
             expression = self.value(whole, values, leaf, scalars, fit=fit)
-            expressions.append(expression if code else f"{expression}.tobytes()")
-        return codes, ", ".join(expressions)
+            size = leaf.base.itemsize * math.prod(leaf.shape)
+            packed.append((code, expression) if code else (f"{size}s", f"{expression}.tobytes()"))
+        return packed
 
     def function(self, parameters: str, *lines: str) -> Any:
         """Return the function with these lines."""
@@ -106,23 +118,33 @@ def filler(values: SpaceValues, column: Array, batch: tuple[int, ...] = ()) -> P
     Args:
         column: [rows, *batch] values; objects where they vary in size, which hold their bytes.
     """
-    source = _Source(check_agents=values.check_agents, to_bytes=values.to_bytes)
-    lines = ["check_agents(value)" if values.agents else "pass"]
+    source = _Source(check_agents=values.check_agents, to_bytes=values.to_bytes, REFUSED=REFUSED)
+    lines = ["check_agents(value)"] if values.agents else []
     if column.dtype.hasobject:
-        places = source.name(column.reshape(len(column), math.prod(batch)))
-        lines.append(f"{places}[row] = to_bytes(value, {source.name(batch)})")
+        rows, size = source.name(column.reshape(len(column), math.prod(batch))), "sum(map(len, data))"
+        lines.append(f"{rows}[row] = data = to_bytes(value, {source.name(batch)})")
+        if not (batch or values.agents):
+            packed = [
+                f"{source.name(struct.Struct(f'<{code}').pack)}({piece})" if len(code) == 1 else piece
+                for code, piece in source.packed("value", values, column)
+            ]
+            size, lines = "len(data)", [f"try: data = b''.join(({', '.join(packed)},))"]
+            lines.append("except REFUSED: data, = to_bytes(value)  # which says why")
+            lines.append(f"if len(data) > {MAX_VALUE_BYTES}: to_bytes(value)  # which refuses it")
+            lines.append(f"{rows}[row] = data")
+        lines.append(f"return {size}")
     for leaf in () if column.dtype.hasobject else values.leaves:
         scalars = frozenset() if batch else leaf.exact_scalars
         expression = source.value("value", values, leaf, scalars, batch)
         lines.append(f"try: {source.name(leaf.column_in(column))}[row] = {expression}")
         lines.append(f"except NO_VALUE as error: raise {source.name(leaf.refused)}(error) from error")
-    function: Put = source.function("row, value", *lines)
+    function: Put = source.function("row, value", *lines, "return 0")
     return function
 
 
 def step_filler(
-    action: SpaceValues, observation: SpaceValues, rows: Records, put: Put, copied: Change
-) -> tuple[Put, Change]:
+    action: SpaceValues, observation: SpaceValues, rows: Records, put: PutStep, copied: Change
+) -> tuple[PutStep, Change]:
     """Return a function that puts down a step of one environment, and one that keeps its action before.
 
     The first takes a row, action, observation, reward, terminated and truncated. The second returns an action
@@ -136,20 +158,25 @@ def step_filler(
     if rows.itemsize > _MAX_PACKED:
         return put, copied
     source, keep = _Source(put=put, memory=rows.view(np.uint8).data), copied
-    code, given = source.packed("action", action, rows["action"])
+    code, given = _joined(source.packed("action", action, rows["action"]))
     if code not in _CODES.values():  # else it is a number, which nobody can change
         kept = _Source(copied=copied)
-        code, values = kept.packed("action", action, rows["action"], _not_expected)
+        code, values = _joined(kept.packed("action", action, rows["action"], _not_expected))
         pack = struct.Struct(f"<{code}")
         returned = f"try: return {kept.name(pack.pack)}({values})"
         keep = kept.function("action", returned, "except NO_VALUE: return copied(action)")
         code, given = f"{pack.size}s", "action"
-    codes, seen = source.packed("observation", observation, rows["observation"])
+    codes, seen = _joined(source.packed("observation", observation, rows["observation"]))
     pack_into = source.name(struct.Struct(f"<{code}{codes}d??").pack_into)
     parameters = "row, action, observation, reward, terminated, truncated"
     values = ", ".join(filter(None, [given, seen, "reward, terminated, truncated"]))
     packed = f"try: {pack_into}(memory, row * {rows.itemsize}, {values})"
     return source.function(parameters, packed, f"except NO_VALUE: put({parameters})"), keep
+
+
+def _joined(packed: list[tuple[str, str]]) -> tuple[str, str]:
+    """Return how all leaves are packed at once, and the expressions for them."""
+    return "".join(code for code, _ in packed), ", ".join(expression for _, expression in packed)
 
 
 def _not_expected(value: Value) -> Value:

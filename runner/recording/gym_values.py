@@ -18,6 +18,8 @@ from runner.util.arrays import Array, DType, zeros
 SCALARS: Final = (np.bool_, *(np.dtype(code).type for code in "bBhHiIlLqQefd"))
 NO_VALUE: Final = (struct.error, TypeError, ValueError, LookupError, OverflowError)
 """The errors of Python and NumPy for something that is no value of its space."""
+REFUSED: Final = (*NO_VALUE, AttributeError, RecursionError)
+"""The same for a value that may be text, of spaces that are not Gymnasium's too."""
 
 OnRounded = Callable[[str], None]
 """Called with a warning: values are recorded rounded."""
@@ -35,7 +37,7 @@ class Leaf:
     """
 
     def __init__(self, keys: Keys, space: RecordedSpace[Any], what: str, on_rounded: OnRounded) -> None:
-        self.keys, self._space, self._what, self._on_rounded = keys, space, what, on_rounded
+        self.keys, self.space, self._what, self._on_rounded = keys, space, what, on_rounded
         self.name = what + "".join(f"[{key!r}]" for key in keys)
         self.blank = encode_text("") if space.dtype is None else bytes(space.dtype.itemsize)
         """The bytes of the value of an agent that has none."""
@@ -108,8 +110,8 @@ class Leaf:
             if isinstance(values, str | bytes | Mapping) or len(values) != batch[0]:
                 raise ValueError(f"found {type(values).__name__}, expected a batch of {batch[0]}")
             return [piece for value in values for piece in self.pieces(value, batch[1:])]
-        is_text = self._space.dtype is None
-        return [encode_text(self._space.text(values)) if is_text else self.fit(values).tobytes()]
+        is_text = self.space.dtype is None
+        return [encode_text(self.space.text(values)) if is_text else self.fit(values).tobytes()]
 
     def refused(self, reason: object) -> RecordingError:
         """Return the error for a value that is not of the space."""
@@ -201,7 +203,7 @@ class SpaceValues:
                     columns.append([leaf.blank])
                 else:
                     columns.append(leaf.pieces(leaf.value_in(value), batch))
-            except (*NO_VALUE, AttributeError, RecursionError) as error:
+            except REFUSED as error:
                 raise leaf.refused(error) from error
         whole = [b"".join(pieces[k] for pieces in columns) for k in range(math.prod(batch))]
         if (size := max(map(len, whole), default=0)) > MAX_VALUE_BYTES:
