@@ -22,8 +22,7 @@ from runner.execution.verification import Verification
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
-from runner.replay.comparison import Difference
-from runner.replay.engine import Replay
+from runner.replay.engine import Difference, Replay
 from runner.replay.environment import rerun, stream_from_child
 from runner.replay.makers import why_not_rerun, why_uncertain
 from runner.runs.provenance import Differences

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from runner.errors import Diverged
 from runner.recording.composition import Composition
 from runner.recording.reader import Recording
-from runner.replay.comparison import Difference
 from runner.runs.provenance import Differences
 from runner.util.values import Json
+
+if TYPE_CHECKING:
+    from runner.replay.engine import Difference  # loads Gymnasium
 
 LOOP_NOT_COMPARED: Final = (
     "how its environment is described: scene, names of actions, agents, events and landmarks, step limit"

@@ -24,7 +24,7 @@ from runner.loops.env import record
 from runner.loops.makers import maker_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
-from runner.replay.comparison import Difference
+from runner.replay.engine import Difference
 from runner.replay.environment import rerun
 from runner.runs.run import Run
 from runner.util.arrays import Array

@@ -69,7 +69,7 @@ def _watch_of(replay: TableReplay, state: int) -> Watch:
     )
 
 
-def _count(visits: NDArray[np.int64], own: NDArray[np.int32]) -> None:
-    """Count each learner's own actions, [visits, learners]."""
+def _count(visits: NDArray[np.int64], actions: NDArray[np.int32]) -> None:
+    """Count each learner's own `actions`, [visits, learners]."""
     for i in range(len(visits)):
-        visits[i] += np.bincount(own[:, i], minlength=visits.shape[1])
+        visits[i] += np.bincount(actions[:, i], minlength=visits.shape[1])

@@ -232,8 +232,8 @@ def _registered(maker: EnvironmentMaker, trust: bool) -> tuple[EnvironmentSpec, 
         registered = dataclasses.replace(registered, entry_point=_creator(entry_point))
     if not trust:
         is_whole = maker.vector is not None and maker.vector.mode == "custom"
-        own = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
-        require_registered_arguments(spec.id, registered, own, is_whole)
+        kwargs = {key: value for key, value in spec.kwargs.items() if key not in _OF_VECTORS}
+        require_registered_arguments(spec.id, registered, kwargs, is_whole)
     return spec, registered
 
 
@@ -260,7 +260,7 @@ def _made_by_function(name: str, render: bool) -> Any:
     if not render:
         return make()
     parameters = inspect.signature(make).parameters.values()
-    if any(each.name == "render_mode" or each.kind is each.VAR_KEYWORD for each in parameters):
+    if any(part.name == "render_mode" or part.kind is part.VAR_KEYWORD for part in parameters):
         return make(render_mode="rgb_array")
     env = make()
     if getattr(env, "render_mode", None) != "rgb_array":
@@ -355,7 +355,7 @@ def why_uncertain(recording: Recording, trust: bool = False) -> str:
     firsts = itertools.accumulate((shard.environments for shard in recording.shards), initial=0)
     makers = [recording.phase(phase).maker_of(first) for first in firsts for phase in schema.PHASES]
     known = [maker for maker in makers if maker is not None and maker.assumed]
-    made = [one for one in known if not (one.make and (trust or own_mark(recording.path, one)))]
+    made = [maker for maker in known if not (maker.make and (trust or own_mark(recording.path, maker)))]
     names = ", ".join(dict.fromkeys(name for maker in made for name in maker.assumed))
     return names and (
         f"The arguments of {names} could not be recorded, and with those that were assumed it is another "

@@ -130,9 +130,19 @@ def resets_of(
             *(block[name].tolist() for name in names), block["observation"], strict=True
         ):
             given = options_of(number) or ResetOptions()
-            place = phase, number, environment, episode, step, time
             known_seed = seed if seeded else given.large_seed
-            yield RecordedReset(*place, observation, known_seed, given.options, state_of(number))
+            yield RecordedReset(
+                phase,
+                number,
+                environment,
+                episode,
+                step,
+                time,
+                observation,
+                known_seed,
+                given.options,
+                state_of(number),
+            )
 
 
 def _by_reset(messages: Iterator[M]) -> Callable[[int], M | None]:
@@ -243,7 +253,7 @@ def _blocks(
 def ended_episode(recording: Recording, phase: str, environment: int, step: int) -> int | None:
     """Return the number of the episode of a step in one of several environments; None if it never ended."""
     for block in recording.phase(phase).episodes.blocks():
-        own = (block["last_step"] >= step) & (block["environment"] == environment)
-        if own.any():
-            return int(block["episode"][np.argmax(own)])
+        is_later = (block["last_step"] >= step) & (block["environment"] == environment)
+        if is_later.any():
+            return int(block["episode"][np.argmax(is_later)])
     return None

@@ -111,31 +111,38 @@ def _needed(statements: list[ast.stmt], name: str) -> list[ast.stmt]:
     Raises:
         CannotRedo: what they need cannot be had without the rest of the script.
     """
-    candidates = [each for each in statements if _only_defines(each)]
-    kept = {id(each) for each in candidates if any(isinstance(node, _IMPORTS) for node in ast.walk(each))}
+    candidates = [statement for statement in statements if _only_defines(statement)]
+    kept = {
+        id(statement)
+        for statement in candidates
+        if any(isinstance(node, _IMPORTS) for node in ast.walk(statement))
+    }
     needed: set[str] = set()
     todo = {name}
     while todo:
         needed |= todo
-        kept |= {id(each) for each in candidates if not todo.isdisjoint(_bound(each))}
-        todo = {used for each in candidates if id(each) in kept for used in _loaded(each)} - needed
-    body = [each for each in statements if id(each) in kept]
-    rest = [each for each in statements if id(each) not in kept]
+        kept |= {id(statement) for statement in candidates if not todo.isdisjoint(_bound(statement))}
+        used = (_loaded(statement) for statement in candidates if id(statement) in kept)
+        todo = set[str]().union(*used) - needed
+    body = [statement for statement in statements if id(statement) in kept]
+    rest = [statement for statement in statements if id(statement) not in kept]
     _require_constant(body, rest, needed, name)
     return body
 
 
 def _require_constant(body: list[ast.stmt], rest: list[ast.stmt], needed: set[str], name: str) -> None:
     """Refuse definitions that use what is unknown before the script runs, or what its rest may change."""
-    imported = {bound: top for each in body for bound, top in _imported(each).items()}
+    imported = {bound: top for statement in body for bound, top in _imported(statement).items()}
     assigned: set[str] = set()
-    for assignment in (each for each in body if not isinstance(each, (*_DEFINITIONS, *_IMPORTS))):
+    for assignment in body:
+        if isinstance(assignment, (*_DEFINITIONS, *_IMPORTS)):
+            continue
         for used in _loaded(assignment):
             if imported.get(used, "math") not in _PURE or used in _OUTSIDE:
                 raise _refusal(name, f"{', '.join(sorted(_bound(assignment)))}, which it gets from {used}")
         assigned |= set() if _is_constant(assignment) else _bound(assignment)
-    changed = {used for each in rest for used in (_bound(each) | _loaded(each, "STORE_GLOBAL"))}
-    for node in (node for each in rest for node in ast.walk(each)):
+    changed = set[str]().union(*map(_bound, rest), *(_loaded(part, "STORE_GLOBAL") for part in rest))
+    for node in (node for statement in rest for node in ast.walk(statement)):
         if isinstance(node, ast.Attribute) and not isinstance(node.ctx, ast.Load):
             changed.add(ast.unparse(node.value))
         changed |= _handed_on(node) & assigned
@@ -176,8 +183,8 @@ def _bound(node: ast.AST) -> set[str]:
         return {node.name}
     if isinstance(node, ast.alias):
         return {node.asname or node.name.partition(".")[0]}
-    own = {node.id} if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load) else set()
-    return own.union(*map(_bound, ast.iter_child_nodes(node)))
+    bound = {node.id} if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load) else set()
+    return bound.union(*map(_bound, ast.iter_child_nodes(node)))
 
 
 def _imported(statement: ast.stmt) -> dict[str, str]:
@@ -204,8 +211,9 @@ def _loaded(statement: ast.stmt, operation: str = "LOAD_") -> set[str]:
     for code in todo:
         todo += [constant for constant in code.co_consts if isinstance(constant, CodeType)]
         names |= {
-            each.argval
-            for each in dis.get_instructions(code)
-            if each.opname.startswith(operation) and each.opname.endswith(("NAME", "GLOBAL", "GLOBALS"))
+            instruction.argval
+            for instruction in dis.get_instructions(code)
+            if instruction.opname.startswith(operation)
+            and instruction.opname.endswith(("NAME", "GLOBAL", "GLOBALS"))
         }
     return names

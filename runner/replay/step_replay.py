@@ -224,10 +224,10 @@ class StepReplay:
         for k in range(len(probe.states)):
             kernel.read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
 
-    def _lost(self, found: int) -> RecordingError:
+    def _lost(self, next_step: int) -> RecordingError:
         return RecordingError(
-            f"{self._where}: training steps {self.step} to {found - 1} were lost, so the Q-tables after them "
-            "are unknown until the next snapshot; `dualtaxi resume` retrains the run."
+            f"{self._where}: training steps {self.step} to {next_step - 1} were lost, so the Q-tables after "
+            "them are unknown until the next snapshot; `dualtaxi resume` retrains the run."
         )
 
 

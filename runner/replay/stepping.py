@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -24,7 +25,6 @@ from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.recording.turns import is_taken
-from runner.replay.comparison import Frame, PlacedReset, Returned, Start
 from runner.replay.recorded import RecordedReset, calls
 from runner.util.arrays import Array
 from runner.util.extras import missing
@@ -35,6 +35,40 @@ _ENDING: Final = struct.Struct("<d??")
 _ENDS: Final = ("rewards", "terminated", "truncated")
 Fill = Callable[[int, Any], None]
 """Puts down what the environment returned for a step."""
+Frame = NDArray[np.uint8]
+"""A picture, [height, width, 3]."""
+PlacedReset = tuple[int, RecordedReset]
+"""A reset, and the row that comes after it."""
+
+
+class Start(NamedTuple):
+    """A rerun reset."""
+
+    row: int
+    """The row that comes after it."""
+    reset: RecordedReset
+    got: Value
+    """The first observation, as `RecordedReset.observation`."""
+    frame: Frame | None = None
+    """The picture after the reset, if pictures are drawn."""
+
+
+@dataclass(eq=False)
+class Returned:
+    """What an environment returned for recorded actions and resets, until it raised an error."""
+
+    rows: NDArray[np.void]
+    """The recorded steps."""
+    resets: Sequence[PlacedReset]
+    """In order; each comes before its row."""
+    got: NDArray[np.void]
+    """Records with the fields of steps that come from the environment."""
+    starts: list[Start] = field(default_factory=list)
+    frames: list[Frame] = field(default_factory=list)
+    """A picture for each step; of a vector, of the environment that is drawn."""
+    done: int = 0
+    """The rows that are filled in."""
+    error: Exception | None = None
 
 
 class Stepper:
@@ -191,14 +225,14 @@ class Stepper:
             CannotRedo: one has other parts, shapes or numbers of values.
         """
         for name, space in (("observation", self.observation_space), ("action", self.action_space)):
-            recorded, found = self._recording.spaces[name], recorded_space(space).describe()
+            described = self._recording.spaces[name], recorded_space(space).describe()
             shapes = [
-                [(leaf.path, leaf.dtype and leaf.dtype.shape) for leaf in recorded_leaves(each, name)]
-                for each in (recorded, found)
+                [(leaf.path, leaf.dtype and leaf.dtype.shape) for leaf in recorded_leaves(description, name)]
+                + [description.get("n"), description.get("space")]
+                for description in described
             ]
-            is_alike = all(recorded.get(key) == found.get(key) for key in ("n", "space"))
-            if shapes[0] != shapes[1] or not is_alike:
-                texts = [shortened(json.dumps(each), _MAX_TEXT) for each in (recorded, found)]
+            if shapes[0] != shapes[1]:
+                texts = [shortened(json.dumps(description), _MAX_TEXT) for description in described]
                 raise CannotRedo(
                     f"The environment has another {name} space than recorded: found {texts[1]}, expected "
                     f"{texts[0]}. It is another environment, or another version."
@@ -370,7 +404,8 @@ class VectorStepper(Stepper):
         space, n, column = self.action_space, self.n, np.array(rows["action"])
         if column.dtype.hasobject:
             values = super().actions(rows)
-            return [batched(space, values[k : k + n]) for k in range(0, len(values), n)]
+            rooms: Any = (create_empty_array(space, n) for _ in range(0, len(values), n))
+            return [concatenate(space, values[k * n : k * n + n], room) for k, room in enumerate(rooms)]
         if self._has_states:
             column = column.astype(np.int64) + int(space.start)  # type: ignore[attr-defined]
         return values_in(space, column.reshape(-1, n, *column.shape[1:]))
@@ -393,12 +428,6 @@ def values_in(space: Space, column: NDArray[Any]) -> Sequence[Value]:
     return list(column)  # whole numbers as NumPy's, for which `Discrete.contains` takes a third of the time
 
 
-def batched(space: Space, values: Sequence[Value]) -> Value:
-    """Return the values of many environments as a vector with this single action space takes them."""
-    room: Any = create_empty_array(space, len(values))
-    return concatenate(space, values, room)
-
-
 def keyed(space: Space, value: Value) -> Value:
     """Return a decoded value with the keys and types that its space has.
 
@@ -408,7 +437,7 @@ def keyed(space: Space, value: Value) -> Value:
     if isinstance(space, spaces.Dict):
         return {key: keyed(part, value[str(key)]) for key, part in space.spaces.items()}
     if isinstance(space, spaces.Tuple):
-        return tuple(keyed(part, own) for part, own in zip(space.spaces, value, strict=True))
+        return tuple(keyed(*pair) for pair in zip(space.spaces, value, strict=True))
     if isinstance(value, str) and not isinstance(space, spaces.Text):
         try:
             return value_of(space, value)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,10 @@ from runner.recording import schema
 from runner.recording.messages import Message, frame_place
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.spaces import Value, least_number
-from runner.replay.comparison import RerunSteps
 from runner.replay.recorded import RecordedReset, reset_of
+
+if TYPE_CHECKING:
+    from runner.replay.engine import RerunSteps  # loads Gymnasium
 
 _END_OF_TIME: Final = 2**62
 """Later than any message, in nanoseconds."""
@@ -45,12 +47,12 @@ def step_of_episode(recording: Recording, episode: int) -> int:
 
 def transitions_of(recording: Recording, phase: str, episode: int, first: int = 0) -> Iterator[Any]:
     """Yield an episode's steps from number `first` on, as `Phase.transitions` does; memory is bounded."""
-    own = recording.phase(phase)
-    if own.steps.dtype is not None:
+    tables = recording.phase(phase)
+    if tables.steps.dtype is not None:
         for block in episode_blocks(recording, phase, episode, first):
             yield from block
         return
-    yield from islice(own.transitions(episode), first, None)
+    yield from islice(tables.transitions(episode), first, None)
 
 
 def episode_blocks(
@@ -61,11 +63,11 @@ def episode_blocks(
     Raises:
         RecordingError: the recording has no such episode, or steps of it were lost.
     """
-    own = recording.phase(phase)
-    if own.steps.are_actions:
+    tables = recording.phase(phase)
+    if tables.steps.are_actions:
         yield whole_steps(recording, phase, episode)[first:]
         return
-    steps = own.episode(episode)
+    steps = tables.episode(episode)
     count = min(first, len(steps))
     for rows in steps.rows(first):
         count += len(rows)
@@ -73,7 +75,7 @@ def episode_blocks(
     if count != len(steps):
         raise RecordingError(
             f"{recording.path}: {len(steps) - count:,} of the {len(steps):,} steps of "
-            f"{own.title} episode {episode} were lost."
+            f"{tables.title} episode {episode} were lost."
         )
 
 
@@ -83,8 +85,10 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
     Raises:
         CannotRedo: only its actions were recorded, and its environment cannot be had.
     """
-    own = recording.phase(phase)
-    return whole_steps(recording, phase, episode) if own.steps.are_actions else own.episode_steps(episode)
+    tables = recording.phase(phase)
+    if tables.steps.are_actions:
+        return whole_steps(recording, phase, episode)
+    return tables.episode_steps(episode)
 
 
 # --- of actions alone ---------------------------------------------------------------------------------
@@ -194,13 +198,13 @@ def recorded_frames(
     Raises:
         RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
     """
-    own = recording.phase(phase).episode(episode)
+    recorded = recording.phase(phase).episode(episode)
     first = max(0, start - frames_every(recording))
     steps = transitions_of(recording, phase, episode, max(0, first - 1)) if steps is None else steps
     times = (int(step["log_time"]) for step in steps)
     # The frames of a vector come at the end of a round.
-    turns = own.table.round_of(own.first)
-    later = (turns[-1] - own.first) * schema.STEP_NANOSECONDS
+    turns = recorded.table.round_of(recorded.first)
+    later = (turns[-1] - recorded.first) * schema.STEP_NANOSECONDS
     reset = reset_of(recording, phase, episode) if first == 0 else None
     if (earliest := next(times, None)) is None:
         return
@@ -208,20 +212,20 @@ def recorded_frames(
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
         for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))
-        if frame_place(frame)[0] == own.place
+        if frame_place(frame)[0] == recorded.place
     )
-    shown, following = None, next(frames, None)
+    frame, following = None, next(frames, None)
     after_steps = (time + later for time in chain([earliest], times))
     for t, time in enumerate(after_steps if first else chain([earliest], after_steps), first):
         # After the reset there may be several, of which the last one shows the state; after a step one.
         while following is not None and following[0] < time:
-            shown, following = following[2], next(frames, None)
+            frame, following = following[2], next(frames, None)
         if t and following is not None and following[0] == time and not following[1]:
-            shown, following = following[2], next(frames, None)
-        if shown is None:
+            frame, following = following[2], next(frames, None)
+        if frame is None:
             raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} is lost.")
         if t >= start:
-            yield shown
+            yield frame
 
 
 def log_times_of(recording: Recording, phase: str, episode: int) -> list[int]:
@@ -241,8 +245,8 @@ def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
     if not recording.phase(phase).frames:
         return ()
     frames = recording.config.get("frames")
-    chosen = frames.get("environments") if isinstance(frames, Mapping) else None
-    return chosen if isinstance(chosen, list) else range(recording.environments)
+    environments = frames.get("environments") if isinstance(frames, Mapping) else None
+    return environments if isinstance(environments, list) else range(recording.environments)
 
 
 def last_step(recording: Recording) -> int:
@@ -259,9 +263,9 @@ def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "tra
     """
     bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
     for name, bound in bounds.items():
-        if (found := int(block[name].max())) >= bound:
+        if (largest := int(block[name].max())) >= bound:
             step = int(block["step"][int(block[name].argmax())])
             raise RecordingError(
-                f"{where}: found {name} {found} in {phase} step {step}, expected less than {bound}; "
+                f"{where}: found {name} {largest} in {phase} step {step}, expected less than {bound}; "
                 "`dualtaxi verify` checks the whole recording."
             )

@@ -95,12 +95,12 @@ class TableReplay(StepReplay):
         nearest = _snapshot_before(self._recording, step, self.kinds)
         if nearest is None:
             raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
-        found, own = (
-            [table.shape for one in tables for table in one.values()]
+        shapes, expected = (
+            [table.shape for named in tables for table in named.values()]
             for tables in (nearest[1], self.named_tables)
         )
-        if found != own:
-            raise RecordingError(f"{self._where}: found Q-tables of shape {found}, expected {own}.")
+        if shapes != expected:
+            raise RecordingError(f"{self._where}: found Q-tables of shape {shapes}, expected {expected}.")
         if step - nearest[0] <= CHECKPOINT_STEPS:
             return nearest
         at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
@@ -114,9 +114,9 @@ class TableReplay(StepReplay):
         """
         first = self.step
         for part in self.blocks(stop):
-            at = slice(self.step - first, self.step - first + len(part))
-            own = None if trace is None else Trace(trace.updates[at], trace.learner)
-            self.apply(part, rows[at], trace=own)
+            filled = slice(self.step - first, self.step - first + len(part))
+            traced = None if trace is None else Trace(trace.updates[filled], trace.learner)
+            self.apply(part, rows[filled], trace=traced)
 
     def blocks(self, stop: int) -> Iterator[NDArray[np.void]]:
         """Yield the recorded steps from here to a later one; each block must be applied before the next.

@@ -296,7 +296,7 @@ def require_listed_wrapper(entry_point: str, kwargs: Mapping[str, object]) -> No
         CannotRedo: it is another one, or its arguments are not plain.
     """
     module, _, name = entry_point.partition(":")
-    home = next((one for one in WRAPPERS if f"{module}.".startswith(f"{one}.")), "")
+    home = next((listed for listed in WRAPPERS if f"{module}.".startswith(f"{listed}.")), "")
     if name in WRAPPERS.get(home, ()):
         listed = getattr(importlib.import_module(home), name)
         if getattr(importlib.import_module(module), name, None) is listed:

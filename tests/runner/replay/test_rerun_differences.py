@@ -70,7 +70,7 @@ def test_another_limit_is_found_in_the_first_episode_that_reaches_it(tmp_path):
 
 
 def test_steps_are_yielded_once_where_nothing_can_be_compared_in_advance(pole, monkeypatch):
-    monkeypatch.setattr("runner.replay.episodes._HELD_SECONDS", 0.0)  # as on a slow machine
+    monkeypatch.setattr("runner.replay.environment._HELD_SECONDS", 0.0)  # as on a slow machine
     limited = {"render_mode": "rgb_array", "max_episode_steps": 4}
     steps, difference = rerun_steps(
         pole, "train", [0], render=True, make=lambda: gymnasium.make("CartPole-v1", **limited)
