@@ -204,7 +204,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
         except (ConfigError, EnvironmentNotUsable) as error:
             warn_user(f"The evaluations of EvalCallback are not recorded: {error}")
             return
-        own.training_steps = lambda: self.recorded._rows.place[0]
+        own.training_steps = lambda: self.recorded._rows.progress[0]
         own.replace_methods()
         self._evaluations.append(own)
 

@@ -28,8 +28,8 @@ from runner.integrations.values import ValueRows, begin_values
 from runner.loops.env import record
 from runner.loops.flushing import open_loops
 from runner.loops.loop import Loop
+from runner.loops.media import Picture
 from runner.loops.options import CallbackOptions
-from runner.loops.pictures import Picture
 from runner.loops.recorded import ending_of
 from runner.loops.values import arrays_of, warn_user
 from runner.loops.vector import record_vector

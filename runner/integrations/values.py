@@ -22,19 +22,19 @@ _MAX_POSITION: Final = 2**37
 
 
 class ValueRows:
-    """The place of values in a run without an environment: the script's own step."""
+    """Where values stand in a run without an environment: the script's own step."""
 
     off_table = 0
     is_any_over = False
 
     def __init__(self) -> None:
-        self.place = (0, 0)
+        self.progress = (0, 0)
         self.filled = 0
         """The largest step so far, which orders the messages in time."""
 
     def move(self, step: int) -> None:
         """Let the next values have this step."""
-        self.place = (step, 0)
+        self.progress = (step, 0)
         self.filled = max(self.filled, min(step, _MAX_POSITION))
 
     def open(self) -> None:

@@ -56,7 +56,7 @@ def action_names(env: object, space: Space) -> tuple[str, ...]:
         except Exception:  # the user's own function, by the same name, may be another thing
             names = ()
     elif isinstance(named, type) and issubclass(named, enum.IntEnum):  # as MiniGrid has
-        names = tuple(each.name for each in named)
+        names = tuple(action.name for action in named)
     is_complete = isinstance(space, spaces.Discrete) and int(space.n) == len(names) <= MAX_NAMES
     return names if is_complete and all(map(is_text, names)) else ()
 
@@ -65,10 +65,11 @@ def action_in_words(space: Space, action: Value, names: Names) -> str:
     """Return the name of an action, or the names of those of several agents; empty if there is none."""
     if isinstance(names, Mapping):
         assert isinstance(space, spaces.Dict)
-        own = {
-            agent: action_in_words(space[agent], value, names[str(agent)]) for agent, value in action.items()
-        }
-        return ", ".join(f"{agent} {name}" for agent, name in own.items() if name)
+        words = (
+            (agent, action_in_words(space[agent], value, names[str(agent)]))
+            for agent, value in action.items()
+        )
+        return ", ".join(f"{agent} {name}" for agent, name in words if name)
     return (
         spoken(names[int(action) - int(space.start)]) if isinstance(space, spaces.Discrete) and names else ""
     )
@@ -101,10 +102,11 @@ def parsed_action(space: Space, given: object, recorded: Value, names: Names) ->
             f"action: found {_short(wrong)}, expected AGENT=VALUE of an agent that acts at this step: "
             f"{', '.join(acting)}.{nearest(str(wrong), acting)}"
         )
-    own = {acting[str(agent)]: value for agent, value in given.items()}
     return recorded | {
-        agent: _parsed(space[agent], value, recorded[agent], names[str(agent)], f"action of {agent}")
-        for agent, value in own.items()
+        (agent := acting[str(name)]): _parsed(
+            space[agent], value, recorded[agent], names[str(agent)], f"action of {agent}"
+        )
+        for name, value in given.items()
     }
 
 
@@ -129,9 +131,9 @@ def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], 
         outside = ~((array >= space.low) & (array <= space.high))
         if outside.any():
             at = np.unravel_index(int(np.argmax(outside)), array.shape)
-            place = f"[{', '.join(map(str, at))}]" if at else ""
+            index = f"[{', '.join(map(str, at))}]" if at else ""
             raise ConfigError(
-                f"{where}{place}: found {array[at]:g}, expected {space.low[at]:g} to {space.high[at]:g}"
+                f"{where}{index}: found {array[at]:g}, expected {space.low[at]:g} to {space.high[at]:g}"
             )
     elif array not in space:
         raise ConfigError(f"{where}: found {_short(given)}, expected an element of {space}")

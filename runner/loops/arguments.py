@@ -90,7 +90,7 @@ def _kept(kind: type[Any]) -> dict[str, str]:
         return {}
     if not isinstance(function, ast.FunctionDef) or function.decorator_list or not function.args.args:
         return {}
-    own = function.args.args[0].arg
+    itself = function.args.args[0].arg
     stored = Counter(
         node.id if isinstance(node, ast.Name) else f".{node.attr}"
         for node in ast.walk(function)
@@ -101,14 +101,13 @@ def _kept(kind: type[Any]) -> dict[str, str]:
         if isinstance(value, ast.Call) and ast.unparse(value.func) in _COPIES and len(value.args) == 1:
             value = value.args[0]  # noqa: PLW2901 - what is copied
         if isinstance(value, ast.Name) and isinstance(target, ast.Attribute):
-            is_own = ast.unparse(target.value) == own and stored[f".{target.attr}"] == 1
+            is_own = ast.unparse(target.value) == itself and stored[f".{target.attr}"] == 1
             kept |= {value.id: target.attr} if is_own and not stored[value.id] else {}
-    methods = (each for base in kind.__mro__ for each in vars(base).values() if inspect.isfunction(each))
-    unwrapped = (inspect.unwrap(each) for each in methods if each is not constructor)
-    others = (each for each in unwrapped if inspect.isfunction(each))
+    members = (member for base in kind.__mro__ for member in vars(base).values() if member is not constructor)
+    methods = (inspect.unwrap(member) for member in members if inspect.isfunction(member))
     changed = {
         instruction.argval
-        for method in others
+        for method in filter(inspect.isfunction, methods)
         if not set(kept.values()).isdisjoint(method.__code__.co_names)
         for instruction in dis.get_instructions(method)
         if instruction.opname == "STORE_ATTR"
@@ -189,9 +188,17 @@ def factory_of(made: Any) -> tuple[str, dict[str, object], bool]:
         for method in filter(inspect.isfunction, methods)
         for variable, cell in zip(method.__code__.co_freevars, method.__closure__ or (), strict=True)
     }
-    kwargs = {each.name: cells[each.name].cell_contents for each in parameters if each.name in cells}
-    if any(each.default is each.empty for each in parameters if each.name not in cells):
+    kwargs = {
+        parameter.name: cells[parameter.name].cell_contents
+        for parameter in parameters
+        if parameter.name in cells
+    }
+    if any(parameter.default is parameter.empty for parameter in parameters if parameter.name not in cells):
         raise CannotBeMade(f"{path} does not record its arguments")
-    changed = {each.argval for each in dis.get_instructions(function) if each.opname == "STORE_DEREF"}
+    changed = {
+        instruction.argval
+        for instruction in dis.get_instructions(function)
+        if instruction.opname == "STORE_DEREF"
+    }
     is_certain = len(kwargs) == len(parameters) and changed.isdisjoint(kwargs)
     return path, plain_kwargs(kwargs, path), is_certain

@@ -49,11 +49,11 @@ class RecordedBatches(Recorded):
         self,
         envs: AnyVectorEnv | str,
         mode: AutoresetMode,
-        own_spaces: tuple[Space | None, Space | None],
+        given_spaces: tuple[Space | None, Space | None],
         options: Options,
         make: str,
     ) -> None:
-        self._envs, self._mode, self._spaces, self._make = envs, mode, own_spaces, make
+        self._envs, self._mode, self._spaces, self._make = envs, mode, given_spaces, make
         self._options, self._phase = options, "train"
         self._first: object = None
         """The observations of a reset before the first batch."""
@@ -100,11 +100,11 @@ class RecordedBatches(Recorded):
         try:
             with self._loop.lock:
                 if self._loop.activate(self._rows):
-                    self._reset(observations)
+                    self._put_reset(observations)
         except Exception as error:
             self._loop.fail(error)
 
-    def _reset(self, observations: object) -> None:
+    def _put_reset(self, observations: object) -> None:
         self._rows.reset(observations, (), range(self.env.num_envs))
 
     def batch(
@@ -167,8 +167,13 @@ class RecordedBatches(Recorded):
         with self._loop.lock:
             if not self._loop.activate(self._rows):
                 return
-            if before is not None:
-                self._begin_with(before)
+            if before is not None and not self._rows.resets:
+                self._put_reset(before)
+            elif before is not None and not self._rows.continues_with(before):
+                raise ConfigError(
+                    "observations: found T + 1, whose first are not the last observations that were "
+                    "recorded; call reset(first) if the environments were reset in between"
+                )
             final = None if finals is None else _numpy(finals)
             values = {}
             try:
@@ -192,16 +197,6 @@ class RecordedBatches(Recorded):
         if self._first is not None and before is None:
             self.reset(self._first)
         self._first = None
-
-    def _begin_with(self, observations: object) -> None:
-        """Take the observations before a batch: its reset, or those that the last batch ended with."""
-        if not self._rows.resets:
-            self._reset(observations)
-        elif not self._rows.continues_with(observations):
-            raise ConfigError(
-                "observations: found T + 1, whose first are not the last observations that were recorded; "
-                "call reset(first) if the environments were reset in between"
-            )
 
     def _check_finals(self, finals: object, ends: Flags, observations: object) -> None:
         if finals is not None and self._mode != AutoresetMode.SAME_STEP:
@@ -272,9 +267,9 @@ def record_batches(
     if isinstance(envs, VectorEnv) and not observation_space is action_space is None:
         raise ConfigError("found spaces next to a vector environment, which has its own")
     mode = autoreset_mode_of(None if isinstance(envs, str) else envs, autoreset_mode)
-    own_spaces = _as_space(observation_space), _as_space(action_space)
+    given_spaces = _as_space(observation_space), _as_space(action_space)
     valid = options_of(recordings, options, valid=RunOptions.__annotations__)
-    return RecordedBatches(envs, mode, own_spaces, valid, checked_make(make))
+    return RecordedBatches(envs, mode, given_spaces, valid, checked_make(make))
 
 
 def _numpy(values: object) -> object:

@@ -27,16 +27,16 @@ class CopiedExtras:
 
     def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
         self._recorder = recorder
-        self._own = {
+        self._extras = {
             (source.number, phase): source.recording.phase(phase).extras
             for source in sources
             for phase in PHASES
         }
         columns: dict[str, Description] = {}
         self._names: dict[tuple[int, str], str] = {}
-        """The names in the run, by number of the process and its own name."""
-        for (number, _), own in self._own.items():
-            for name, column in own.columns.items():
+        """The names in the run, by number of the process and the name there."""
+        for (number, _), extras in self._extras.items():
+            for name, column in extras.columns.items():
                 new, before = name, columns.get(name, column)
                 both = united(before, column)
                 if both is None or before["type"] == column["type"] != both["type"]:
@@ -61,11 +61,11 @@ class CopiedExtras:
             new_step: the number of the first step in the run.
             new_position: the steps of the run before it.
         """
-        own = self._own[source.number, phase]
-        if not own:
+        extras = self._extras[source.number, phase]
+        if not extras:
             return 0
         n = len(numbers)
-        named = {self._names[source.number, name]: values for name, values in own.at(numbers).items()}
+        named = {self._names[source.number, name]: values for name, values in extras.at(numbers).items()}
         flags = {name: ~np.ma.getmaskarray(values).reshape(n, -1)[:, 0] for name, values in named.items()}
         rows = np.flatnonzero(np.logical_or.reduce(list(flags.values())))
         if not len(rows):

@@ -35,7 +35,7 @@ class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, objec
         self._env_step = env.step
         self._return_name = return_name([class_name(layer) for layer in layers_of(env)])
         self._has_messages = bool(loop.options.info or loop.options.frames_every or self._return_name)
-        self._watch = GeneratorWatch(env, sparse=loop.options.steps == "actions")
+        self._watch = GeneratorWatch([env], sparse=loop.options.steps == "actions")
         self._record_into(loop, is_owner=owner is None)
         self._enter(phase)
 
@@ -58,10 +58,7 @@ class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, objec
                     return result
                 rows.take(given, observation, reward, terminated, truncated)
                 if extras is not None:
-                    try:
-                        self._take_extras(extras)
-                    except ConfigError as error:
-                        loop.leave_out(error)
+                    self._put_extras(extras)
             finally:
                 loop.lock.release()
             if self._has_messages:
@@ -69,7 +66,8 @@ class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, objec
                     self._messages.info(self._phase, info)
                 if self._return_name and (terminated or truncated):
                     self._log_return(info)
-                self._record_frame(is_over=terminated or truncated)
+                if self._options.frames_every:
+                    self._record_frame(is_over=terminated or truncated)
         except Exception as error:
             self._loop.fail(error)
         return result

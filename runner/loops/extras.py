@@ -498,11 +498,11 @@ def _named(description: Description) -> str:
     return f"{np.dtype(description['dtype'])} of shape {shape}"
 
 
-def _wrong_shape(name: str, found: str, lead: tuple[int, ...]) -> ConfigError:
+def _wrong_shape(name: str, given: str, lead: tuple[int, ...]) -> ConfigError:
     if len(lead) > 1:
-        return ConfigError(f"extras: found {found} for {name!r}, expected {(*lead, '...')}")
+        return ConfigError(f"extras: found {given} for {name!r}, expected {(*lead, '...')}")
     return ConfigError(
-        f"extras: found {found} for {name!r}, expected an array [{lead[0]}, ...] or a list with a value for "
+        f"extras: found {given} for {name!r}, expected an array [{lead[0]}, ...] or a list with a value for "
         "each environment"
     )
 

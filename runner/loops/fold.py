@@ -12,13 +12,14 @@ import json
 import shutil
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 import numpy as np
+from blake3 import blake3
 from numpy.typing import NDArray
 
 from runner.client.outbox import forget_upload
@@ -26,11 +27,11 @@ from runner.config.loading import recorded_packing
 from runner.errors import RecordingError, RunnerError, StorageError, truncated_message
 from runner.loops.copied_extras import CopiedExtras
 from runner.loops.description import Copied
-from runner.loops.fold_check import Content, left_out
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, Source, open_sources
 from runner.loops.step_buffer import StepBuffer
 from runner.recording import schema
+from runner.recording.layout import Layout
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
     Message,
@@ -44,9 +45,11 @@ from runner.recording.messages import (
 )
 from runner.recording.metadata import json_object, layout_of_run, write_result
 from runner.recording.observer import Observer
+from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.reset_options import ResetOptions
 from runner.recording.reset_states import ResetState
+from runner.recording.rewriting import content_of
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.spaces import Description, parts_of
@@ -58,8 +61,14 @@ from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, sh
 from runner.util.arrays import Array
 from runner.util.files import storage_errors
 
-_NOT_COPIED: Final = frozenset({"run", "result", "repair"})
+_OWN_METADATA: Final = frozenset({"run", "result", "repair"})
 """The metadata that is not copied from the process that began the run."""
+_OWN_TOPICS: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
+"""What belongs to one process, or is written anew; so are episodes, which follow from the steps."""
+_NEW_FIELDS: Final = frozenset(
+    {"step", "episode", "t", "environment", "taken", "reset", "log_time", "publish_time"}
+)
+"""The fields with new numbers in the run, and those that only the steps of a vector have."""
 
 OWNER_WAITS: Final = 5.0
 """Seconds for which the process that began a run waits, at its end, for the others to end."""
@@ -143,8 +152,7 @@ def _remove_folded(run: Run, unfolded: Mapping[str, str]) -> None:
 def _widest(a: Description, b: Description) -> Description:
     """Return the description of a space, with the wider numbers of each part of two."""
     if (parts := parts_of(a)) is None:
-        widths = [np.dtype(one.get("dtype", "V0")).itemsize for one in (a, b)]
-        return a if widths[0] >= widths[1] else b
+        return max(a, b, key=lambda leaf: np.dtype(leaf.get("dtype", "V0")).itemsize)
     pairs = zip(parts, parts_of(b) or (), strict=True)
     wider = {key: _widest(part, other) for (key, part), (_, other) in pairs}
     return {**a, "spaces": wider if a["type"] == "Dict" else [*wider.values()]}
@@ -184,7 +192,7 @@ class _Fold:
         with create_recording(fresh, layout) as file:
             file.add_metadata("run", facts)
             for name in first.file.metadata_names:
-                if name not in _NOT_COPIED:
+                if name not in _OWN_METADATA:
                     file.add_metadata(name, first.file.metadata(name))
             for name, maker in self._own_makers().items():
                 file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
@@ -223,10 +231,10 @@ class _Fold:
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
 
     def _errors(self) -> list[str]:
-        own = self._run.file.summary.error
+        first = self._run.file.summary.error
         failed = [shard for shard in shards_of(self._run) if shard.status == "failed"]
         others = [f"{shard.run_id} failed: {shard.summary.error or 'of unknown cause'}" for shard in failed]
-        return ([own] if own else []) + others
+        return ([first] if first else []) + others
 
     def _facts(self) -> dict[str, str]:
         shards = [
@@ -274,12 +282,12 @@ class _Fold:
                     units["key"] = self._alongside((before if phase == "train" else others) / source.n)
                 else:
                     units["key"] = others if source.is_placed else self._alongside(before / source.n)
-        every = np.concatenate([units for source in self._sources for units in source.units.values()])
+        units = np.concatenate([units for source in self._sources for units in source.units.values()])
         names = ("reset", "phase", "steps", "position", "source", "key")
-        columns = [every[name] if name != "steps" else every["steps"] > 0 for name in names]
-        every = every[np.lexsort(columns)]
-        own = every[every["phase"] == PHASES.index("eval")]
-        return every, (own["key"].copy(), np.concatenate([[0], np.cumsum(own["steps"])]))
+        columns = [units[name] if name != "steps" else units["steps"] > 0 for name in names]
+        units = units[np.lexsort(columns)]
+        evaluated = units[units["phase"] == PHASES.index("eval")]
+        return units, (evaluated["key"].copy(), np.concatenate([[0], np.cumsum(evaluated["steps"])]))
 
     def _alongside(self, times: Array) -> NDArray[np.float64]:
         """Return the training steps of the run when every process had stepped its environments so often."""
@@ -289,7 +297,7 @@ class _Fold:
                 total += np.minimum(times * source.n, stop) * (source.taken["train"] / stop)
         return total
 
-    def _place(self, source: Source, position: int) -> tuple[float, int]:
+    def _key_and_position(self, source: Source, position: int) -> tuple[float, int]:
         """Return the key and the position in the run of a position that a process counted."""
         trained, evaluated = (source.phase_steps(phase, position) for phase in PHASES)
         if source.stops["train"]:
@@ -311,36 +319,35 @@ class _Fold:
         """Copy all resets, steps and extras; return how many rewards the environment's table excludes."""
         recorder = self._recorder
         copied = Copied(self._layout, self._first.spaces, self._mdp)
-        rows = {phase: StepBuffer(recorder, copied, phase) for phase in PHASES}
+        buffers = {phase: StepBuffer(recorder, copied, phase) for phase in PHASES}
         begun = dict.fromkeys(PHASES, 0)
         extras = CopiedExtras(recorder, self._sources)
-        active, copied_steps, total = rows["train"], 0, sum(self._totals.values())
+        active, copied_steps, total = buffers["train"], 0, sum(self._totals.values())
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
-            own = rows[phase]
+            buffer = buffers[phase]
             topics = schema.topics_of(phase)
-            if own is not active:
+            if buffer is not active:
                 active.commit()
-                active = own
-            unit["new_reset"] = own.resets
-            unit["new_step"] = own.place[0]
-            unit["new_position"] = recorder.position + own.filled
+                active = buffer
+            unit["new_reset"] = buffer.resets
+            unit["new_step"] = buffer.progress[0]
+            unit["new_position"] = recorder.position + buffer.filled
             reset, read = source.reset(phase, unit), self._read[source.number]
             environment = source.environment + int(unit["environment"])
-            own.copy_reset(reset, environment)
+            buffer.copy_reset(reset, environment)
             self.content.take(topics.resets, reset)
             read[topics.resets.name] += 1
             unit["new_episode"] = begun[phase]
             for steps, numbers in source.steps(phase, unit):
                 self.content.take(topics.steps, steps)
-                position = recorder.position + own.filled
-                read[topics.extras.name] += extras.copy(source, phase, numbers, own.place[0], position)
-                own.copy(steps, environment)
+                position = recorder.position + buffer.filled
+                read[topics.extras.name] += extras.copy(source, phase, numbers, buffer.progress[0], position)
+                buffer.copy(steps, environment)
                 begun[phase] += int(np.count_nonzero(steps["t"] == 0))
                 copied_steps += len(numbers)
                 self._report(copied_steps, total)
-        for each in rows.values():
-            each.commit()
+        active.commit()
         for source in self._sources:
             for phase in PHASES:  # the units of each as placed, ordered by environment
                 placed = self._units[
@@ -349,9 +356,9 @@ class _Fold:
                 source.units[phase] = placed[np.lexsort((placed["reset"], placed["environment"]))]
         self._begun = {}
         for number, phase in enumerate(PHASES):
-            own = self._units[self._units["phase"] == number]
-            self._begun[phase] = own["key"].copy(), own["new_episode"].copy()
-        return sum(each.off_table for each in rows.values())
+            units = self._units[self._units["phase"] == number]
+            self._begun[phase] = units["key"].copy(), units["new_episode"].copy()
+        return sum(buffer.off_table for buffer in buffers.values())
 
     # --- messages -------------------------------------------------------------------------------------
 
@@ -406,37 +413,38 @@ class _Fold:
             return
         units = source.units[phase]
         for unit in units[units["first"] - units["environment"] == fields["step"]]:
-            own = fields | {"step": int(unit["new_step"])}
-            yield int(unit["new_position"]), encode(schema.INFO, own)
+            moved = fields | {"step": int(unit["new_step"])}
+            yield int(unit["new_position"]), encode(schema.INFO, moved)
 
     def _frame(self, source: Source, phase: str, position: int, fields: Message) -> tuple[int, bytes]:
         environment, is_reset = frame_place(fields)
         step = source.phase_steps(phase, position)
         if is_reset:
-            place = int(source.unit(phase, environment, step + environment)["new_position"])
+            position = int(source.unit(phase, environment, step + environment)["new_position"])
         else:
-            _, place = source.step_place(phase, max(step - source.n, 0) + environment)
-        return place, encode_image(fields["data"], fields["format"], place, frame_id(phase, None, is_reset))
+            _, position = source.step_place(phase, max(step - source.n, 0) + environment)
+        frame = frame_id(phase, None, is_reset)
+        return position, encode_image(fields["data"], fields["format"], position, frame)
 
     def _moment(
         self, source: Source, topic: Topic, position: int, fields: Message
     ) -> Iterator[tuple[int, bytes]]:
         """Yield a message that belongs to a moment: a logged number, a text, an array, a checkpoint."""
-        key, place = self._place(source, position)
+        key, position = self._key_and_position(source, position)
         if topic.message == schema.LOG:
-            seconds, level = place * STEP_NANOSECONDS / 1e9, log_level(fields["level"])
-            yield place, encode_log(fields["message"], seconds, level, fields["name"])
+            seconds, level = position * STEP_NANOSECONDS / 1e9, log_level(fields["level"])
+            yield position, encode_log(fields["message"], seconds, level, fields["name"])
         elif {"phase", "step", "episode"} <= fields.keys():
             keys, episodes = self._begun[fields["phase"]]
             at = int(np.searchsorted(keys, key, side="right")) - 1
-            fields["step"] = place - self._evaluated_by(key)
+            fields["step"] = position - self._evaluated_by(key)
             if fields["phase"] == "eval":
                 fields["step"] = self._evaluated_by(key)
             fields["episode"] = max(int(episodes[at]), 0) if at >= 0 else 0
-            yield place, encode(topic.message, fields)
+            yield position, encode(topic.message, fields)
         elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
             # Of a machine or a process, such as what it printed.
-            yield place, encode(topic.message, fields)
+            yield position, encode(topic.message, fields)
 
 
 def _of_resets(source: Source, topic: Topic) -> Iterator[ResetOptions] | Iterator[ResetState]:
@@ -460,3 +468,69 @@ def _ending_of_run(run: Run, unfolded: Mapping[str, str] | None = None) -> str:
     """Return how a run ended whose processes are gone; it is not finished without what is `unfolded`."""
     status = str(run.facts.get(ENDS_AS) or run.file.status)
     return status if status == "failed" or (status == "finished" and not unfolded) else "interrupted"
+
+
+class Content:
+    """Digests of the values in steps and resets, by topic and field: a fold must not change them.
+
+    Args:
+        layout: the messages of the folded recording, in the dtypes of which values are compared.
+    """
+
+    def __init__(self, layout: Layout) -> None:
+        self._layout = layout
+        self.digests: dict[tuple[str, str], Any] = defaultdict(blake3)
+
+    def take(self, topic: Topic, rows: Any) -> None:
+        """Take the next steps or resets: records, or a record."""
+        for name in {field.name for field in self._layout.message(topic).fields} - _NEW_FIELDS:
+            values = np.atleast_1d(rows)[name]
+            if values.dtype.hasobject:
+                parts = [len(value).to_bytes(4, "little") + value for value in values.tolist()]
+                data = b"".join(parts)
+            else:
+                dtype = self._layout.rows(topic)[name]
+                data = np.ascontiguousarray(values, dtype.base).tobytes()
+            self.digests[topic.name, name].update(data)
+
+    def check(self, path: Path) -> None:
+        """Compare a folded recording with what was copied into it, after checking every byte of it.
+
+        Raises:
+            RecordingError: it is damaged, or holds other values.
+        """
+        content_of(path)
+        folded = Content(self._layout)
+        with open_recording(path) as recording:
+            for topic in recording.topics:
+                if topic.name.endswith(("/step", "/reset")):
+                    for rows in recording.table(topic).rows():
+                        folded.take(topic, rows)
+        for (topic_name, name), digest in self.digests.items():
+            if folded.digests[topic_name, name].digest() != digest.digest():
+                raise RecordingError(
+                    f"{path}: {topic_name}: {name}: found other values than its processes recorded; "
+                    "their recordings are kept as they are."
+                )
+
+
+def left_out(source: Source, read: Mapping[str, int]) -> str:
+    """Return how much of what a process recorded is in the run, if not all of it is.
+
+    Args:
+        read: the number of messages by topic that the fold read.
+    """
+    steps, others = [], []
+    for topic in source.recording.topics:
+        if topic.name.endswith("/episode") or topic in _OWN_TOPICS:
+            continue
+        copied, recorded = read.get(topic.name, 0), source.stated.get(topic.name, 0)
+        recorded = max([recorded, *(stop for _, stop in source.recording.lost.get(topic.name, []))])
+        if topic.message is schema.STEP:
+            copied = source.stops[topic.phase]
+            recorded = max(recorded, source.recording.phase(topic.phase).steps.total())
+            if copied < recorded:
+                steps.append(f"{copied:,} of {recorded:,} {schema.PHASE_NAMES[topic.phase]} steps")
+        elif copied < recorded:
+            others.append(f"{copied:,} of {recorded:,} messages of {topic.name}")
+    return ", ".join(steps or others)

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 
 from runner.environments.gym_types import AnyVectorEnv
@@ -27,14 +27,14 @@ States = dict[int, ResetState]
 """What resets depend on, by the index of the environment."""
 
 
-class GeneratorWatch:
+class _Generator:
     """The generator of one environment: read at the resets at which its state is recorded.
 
     Args:
         sparse: whether the states of emulators, which take kilobytes, are recorded less often.
     """
 
-    def __init__(self, env: object, sparse: bool = False) -> None:
+    def __init__(self, env: object, sparse: bool) -> None:
         self._steps_a_byte = _SPARSE_STEPS_A_BYTE if sparse else 0
         self._base: Any = getattr(env, "unwrapped", env)
         self._ale: Any = self._base.ale if is_atari(self._base) else None
@@ -74,42 +74,40 @@ class GeneratorWatch:
         return state
 
 
-class VectorWatch:
-    """The generators of a vector environment.
-
-    Those of a `SyncVectorEnv` are read, or that of a vector environment of its own class. An `AsyncVectorEnv`
-    is asked for the seeds of its generators once, after its first reset without seeds.
+class GeneratorWatch:
+    """The generators of environments: read at the resets at which their states are recorded.
 
     Args:
-        first: its first environment, or one made as that was; the vector itself if there is none.
+        envs: the environments with generators that can be read, in their order; or a vector environment that
+            has a single generator.
+        sparse: whether the states of emulators, which take kilobytes, are recorded less often.
+        resets_itself: whether a step may reset environments in place of stepping them.
+        vector: an `AsyncVectorEnv`, which is asked for the seeds of its generators once, after its first
+            reset without seeds.
     """
 
     def __init__(
-        self, envs: AnyVectorEnv, first: object, autoreset: AutoresetMode, sparse: bool = False
+        self,
+        envs: Sequence[object],
+        sparse: bool = False,
+        resets_itself: bool = False,
+        vector: AsyncVectorEnv | None = None,
     ) -> None:
-        base: Any = envs.unwrapped
-        self._watches: list[GeneratorWatch] = []
-        self._async: Any = None
+        self._generators = [_Generator(env, sparse) for env in envs]
+        self._vector = vector
+        self._resets_itself = resets_itself
         self._seeded: set[int] = set()
-        """The environments of an `AsyncVectorEnv` whose generators come from the seed of a reset."""
-        mode = mode_of(base)
-        self._resets_itself = mode == "sync" and autoreset == AutoresetMode.NEXT_STEP
-        if mode == "sync":
-            self._watches = [GeneratorWatch(env, sparse) for env in base.envs]
-        elif mode == "custom":
-            self._watches = [GeneratorWatch(base)]
-        elif not (isinstance(first, gymnasium.Env) and is_atari(first.unwrapped)):
-            self._async = base  # the seed of an Atari environment's generator does not determine its emulator
+        """The environments of `vector` whose generators come from the seed of a reset."""
         self.steps = 0
-        """The steps of the vector."""
+        """The steps of the environments, in which the time up to the next state is counted."""
+        self.begin_phase()
+
+    def begin_phase(self) -> None:
+        """Record states at the next resets: the states of the phase so far are in another topic."""
+        for generator in self._generators:
+            generator.due = 0
         self.due: float = 0 if self._resets_itself else math.inf
         """The number of steps from which on `before_step` is to be called before each step."""
-
-    def phase_began(self) -> None:
-        """Record states at the next resets: those of the phase so far are in another topic."""
-        for watch in self._watches:
-            watch.due = 0
-        self.due = 0 if self._resets_itself else math.inf
 
     def before_step(self, over: NDArray[np.bool_]) -> States:
         """Return what the resets that a step does in place of steps are going to depend on.
@@ -117,43 +115,64 @@ class VectorWatch:
         Args:
             over: [N], the environments whose episodes are over.
         """
-        states = self._before(np.flatnonzero(over).tolist())
-        self.due = min(watch.due for watch in self._watches)
+        states = self.before_reset(np.flatnonzero(over).tolist())
+        self.due = min(generator.due for generator in self._generators)
         return states
 
-    def before_reset(self, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
-        """Return what a reset is going to depend on, where it has no seed.
+    def before_reset(self, environments: Sequence[int], seeds: Sequence[int | None] = ()) -> States:
+        """Return what a reset of some environments is going to depend on, where it has no seed.
 
         Args:
-            which: [N], the environments that are reset.
             seeds: of all environments; empty for none.
         """
-        unseeded = [i for i in np.flatnonzero(which).tolist() if not seeds or seeds[i] is None]
-        return self._before(unseeded)
-
-    def _before(self, which: Sequence[int]) -> States:
         states: States = {}
-        for i in which:
-            if i < len(self._watches) and (state := self._watches[i].before(self.steps)) is not None:
-                states[i] = state._replace(environment=i)
+        for i in environments:
+            if i < len(self._generators) and not (seeds and seeds[i] is not None):
+                state = self._generators[i].before(self.steps)
+                if state is not None:
+                    states[i] = state._replace(environment=i)
         return states
 
-    def after_reset(self, states: States, which: NDArray[np.bool_], seeds: Sequence[int | None]) -> States:
+    def after_reset(self, states: States, environments: Sequence[int], seeds: Sequence[int | None]) -> States:
         """Return what a reset depended on; arguments as for `before_reset`, and what that returned."""
-        chosen = {i: seeds[i] if seeds else None for i in np.flatnonzero(which).tolist()}
-        if self._async is not None:
-            self._seeded.update(i for i, seed in chosen.items() if seed is not None)
-        if self._async is not None and None in chosen.values():
-            generators = self._async.get_attr("_np_random")
-            self._async = None
-            drawn = {i: seed_of(generators[i]) for i in chosen if i not in self._seeded}
-            return {i: ResetState(environment=i, np_random_seed=s) for i, s in drawn.items() if s is not None}
-        by_environment = {
-            i: self._watches[i].after(states.get(i), seed)
-            for i, seed in chosen.items()
-            if i < len(self._watches)
-        }
-        return {i: state._replace(environment=i) for i, state in by_environment.items() if state is not None}
+        after: States = {}
+        drawn: dict[int, int | None] = {}
+        if self._vector is not None:
+            unseeded = [i for i in environments if not seeds or seeds[i] is None]
+            self._seeded.update(set(environments).difference(unseeded))
+            if unseeded:
+                generators: Any = self._vector.get_attr("_np_random")
+                self._vector = None
+                drawn = {i: seed_of(generators[i]) for i in environments if i not in self._seeded}
+        for i in environments:
+            if i < len(self._generators):
+                state = self._generators[i].after(states.get(i), seeds[i] if seeds else None)
+            else:
+                state = None if drawn.get(i) is None else ResetState(np_random_seed=drawn[i])
+            if state is not None:
+                after[i] = state._replace(environment=i)
+        return after
+
+
+def vector_watch(
+    envs: AnyVectorEnv, first: object, autoreset: AutoresetMode, sparse: bool = False
+) -> GeneratorWatch:
+    """Return the watch of a vector environment.
+
+    The generators of a `SyncVectorEnv` are read, or the generator of a vector environment of its own class.
+
+    Args:
+        first: its first environment, or one made as that was; the vector itself if there is none.
+    """
+    base: Any = envs.unwrapped
+    mode = mode_of(base)
+    if mode == "sync":
+        return GeneratorWatch(base.envs, sparse, resets_itself=autoreset == AutoresetMode.NEXT_STEP)
+    if mode == "custom":
+        return GeneratorWatch([base])
+    # The seed of an Atari environment's generator does not determine its emulator.
+    is_determined = not (isinstance(first, gymnasium.Env) and is_atari(first.unwrapped))
+    return GeneratorWatch([], vector=base if is_determined else None)
 
 
 def is_atari(base: object) -> bool:

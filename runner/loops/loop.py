@@ -52,7 +52,7 @@ class Loop:
         self.started = self._loop_run.started
         self._recorder = self._loop_run.recorder
         self._recorder.when_full = self._write
-        self._mode, self._make_rows = mode, make_rows
+        self.mode, self._make_rows = mode, make_rows
         self._rows: dict[str, StepBuffer] = {}
         self.active: StepBuffer | None = None
         """The rows of the last step; None before any, and when the loop is closed."""
@@ -98,7 +98,7 @@ class Loop:
         with self.lock:
             if phase not in self._rows:
                 self._rows[phase] = self._make_rows(
-                    self._recorder, self.described, phase, self._first_action, self._mode
+                    self._recorder, self.described, phase, self._first_action, self.mode
                 )
             return self._rows[phase]
 
@@ -167,7 +167,7 @@ class Loop:
 
     def moment(self, rows: StepBuffer) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""
-        step, episode = rows.place
+        step, episode = rows.progress
         if (active := self.active) is None:
             return self.position, step, episode
         counts = self._recorder.steps

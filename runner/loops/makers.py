@@ -301,7 +301,9 @@ def checked_make(make: object) -> str:
     """
     if make is None:
         return ""
-    text = make if isinstance(make, str) else f"{_module_of(make)}:{getattr(make, '__qualname__', '?')}"
+    module = str(getattr(make, "__module__", "?"))
+    module = _main_name() or "?" if module == "__main__" else module  # as another process can import it
+    text = make if isinstance(make, str) else f"{module}:{getattr(make, '__qualname__', '?')}"
     if not FUNCTION_NAME.fullmatch(text) or len(text) > MAX_TEXT:
         raise ConfigError(
             f"make: found {make!r}, expected a function at the top of a module, or its name, such as "
@@ -319,12 +321,6 @@ def checked_make(make: object) -> str:
             f"make: found {target!r} as {text!r}, expected the function that makes environments."
         )
     return text
-
-
-def _module_of(function: object) -> str:
-    """Return the name by which another process can import a function's module."""
-    module = str(getattr(function, "__module__", "?"))
-    return _main_name() or "?" if module == "__main__" else module
 
 
 def _main_name() -> str | None:
@@ -362,7 +358,7 @@ def package_versions(tops: Sequence[str] = ()) -> dict[str, str]:
     """
     names = {"gymnasium", "numpy", *tops, *(name for name in _SIMULATORS if name in sys.modules)}
     packages = (_installed(name) for name in sorted(names))
-    return dict(one for one in packages if one is not None)
+    return dict(package for package in packages if package is not None)
 
 
 @cache

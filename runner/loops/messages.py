@@ -13,10 +13,9 @@ import numpy as np
 from runner.drawing.raster import image_bytes
 from runner.errors import ConfigError
 from runner.loops.checkpointing import content_of
-from runner.loops.media import media_of
+from runner.loops.media import Picture, media_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
-from runner.loops.pictures import Picture
 from runner.loops.step_buffer import StepBuffer
 from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
 from runner.recording import schema
@@ -167,7 +166,7 @@ class Messages:
             if not self._loop.records():
                 return
             position = self._loop.position
-            step, episode = self._loop.rows(phase).place
+            step, episode = self._loop.rows(phase).progress
             for own_name, values in arrays.items():
                 fields = {"name": own_name, "phase": phase, "step": step, "episode": episode}
                 fields |= {"shape": list(values.shape), "dtype": values.dtype.str, "data": values.tobytes()}
@@ -183,7 +182,7 @@ class Messages:
         with self._loop.lock:
             if not self._loop.records():
                 return ""
-            step, episode = self._loop.rows(phase).place
+            step, episode = self._loop.rows(phase).progress
         content, kind = content_of(name, value, pickle)
         digest, size = Store(self._run_folder.parent).put(self._run_folder.name, content)
         fields = {"name": name, "phase": phase, "step": step, "episode": episode}
@@ -199,16 +198,16 @@ class Messages:
     def info(self, phase: str, info: Mapping[str, object], is_reset: bool = False) -> None:
         """Record the chosen fields of an info, of the step or reset that was just put down."""
         names = self._options.info
-        chosen = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
-        if not chosen:
+        fields = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
+        if not fields:
             return
-        text = self._json_of(chosen)
+        text = self._json_of(fields)
         with self._loop.lock:
             if not self._loop.records():
                 return
-            step, _ = self._loop.rows(phase).place
-            fields = {"step": step if is_reset else step - 1, "reset": is_reset, "json": text}
-            self._recorder.append(topics_of(phase).infos, encode(schema.INFO, fields), self._loop.position)
+            step, _ = self._loop.rows(phase).progress
+            message = {"step": step if is_reset else step - 1, "reset": is_reset, "json": text}
+            self._recorder.append(topics_of(phase).infos, encode(schema.INFO, message), self._loop.position)
 
     def options_text(self, options: Mapping[str, object] | None) -> str:
         """Return the options of a reset as JSON; empty for none. The environment may change its own."""
@@ -260,10 +259,10 @@ class Messages:
                     "uint8 of [height, width, 3]."
                 )
             kind, position = self._options.frame_format, self._loop.position
-            place = frame_id(phase, environment, is_reset)
+            frame = frame_id(phase, environment, is_reset)
 
             def make() -> bytes:
-                return encode_image(image_bytes(pixels, kind), kind, position, place)
+                return encode_image(image_bytes(pixels, kind), kind, position, frame)
 
             self._recorder.submit(topics_of(phase).frames, make, position)
 

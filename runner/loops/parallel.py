@@ -30,7 +30,7 @@ class RecordedParallel(RecordedAlone):
 
     def __init__(self, env: object, loop: Loop, phase: str = "train") -> None:
         self.env = env
-        self._watch = GeneratorWatch(env)
+        self._watch = GeneratorWatch([env])
         self._record_into(loop)
         self._enter(phase)
 
@@ -58,10 +58,7 @@ class RecordedParallel(RecordedAlone):
                 over = not self.env.agents
                 self._rows.take_game(given, observations, rewards, terminated, truncated, over)
                 if extras is not None:
-                    try:
-                        self._take_extras(self._extras_by_name(extras))
-                    except ConfigError as error:
-                        self._loop.leave_out(error)
+                    self._put_extras(extras)
             if self._options.info:
                 self._messages.info(self._phase, self._info_by_field(infos))
             if self._options.frames_every:
@@ -73,13 +70,13 @@ class RecordedParallel(RecordedAlone):
     def _extras_by_name(self, values: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the values of agents as `agent/name`."""
         agents = self._loop.described.agents
-        for agent, own in values.items():
-            if agent not in agents or not isinstance(own, Mapping):
+        for agent, named in values.items():
+            if agent not in agents or not isinstance(named, Mapping):
                 raise ConfigError(
-                    f"extras: found {agent!r}: {type(own).__name__}, expected the values of each agent by "
+                    f"extras: found {agent!r}: {type(named).__name__}, expected the values of each agent by "
                     f"name, such as {{{agents[0]!r}: {{'value': 0.5}}}}"
                 )
-        return {f"{agent}/{name}": value for agent, own in values.items() for name, value in own.items()}
+        return {f"{agent}/{name}": value for agent, named in values.items() for name, value in named.items()}
 
     def reset(self, seed: int | None = None, options: ResetOptions | None = None) -> tuple[ByAgent, ByAgent]:
         """Reset the environment, and record it."""

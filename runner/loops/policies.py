@@ -98,10 +98,10 @@ def play_checkpoint(
     is_game = maker.kind == "pettingzoo"
     origin = {"run": run.run_id, "checkpoint": checkpoint.name, "step": checkpoint.step}
     settings = {"origin": origin | {"digest": checkpoint.digest}, "policy": policy}
-    own = game_spaces(env) if is_game else (env.observation_space, env.action_space)
+    env_spaces = game_spaces(env) if is_game else (env.observation_space, env.action_space)
     try:
         with from_policy(policy):
-            act = make(weights, *own)
+            act = make(weights, *env_spaces)
     except BaseException:
         env.close()
         raise
@@ -161,10 +161,10 @@ def values_along(
             f"{recording.path}: the observations of {phase} episode {episode} are not all there: it has not "
             "ended, or a part of it was lost."
         )
-    own = (restore_space(recording.spaces[name]) for name in ("observation", "action"))
+    recorded_spaces = (restore_space(recording.spaces[name]) for name in ("observation", "action"))
     make, weights = policy_named(policy), checkpoint.load(trust)
     with from_policy(policy):
-        act = make(weights, *own)
+        act = make(weights, *recorded_spaces)
     rows: dict[str, list[Array]] = {}
     steps = len(steps_of_episode.rewards)
     for t in range(steps):
@@ -173,10 +173,10 @@ def values_along(
         for name, value in _named(thought).items():
             rows.setdefault(name, []).append(value)
     try:
-        values = {name: np.stack(each) for name, each in rows.items()}
+        values = {name: np.stack(arrays) for name, arrays in rows.items()}
     except ValueError as error:
         raise ConfigError(f"policy: {policy!r} returned arrays of different shapes ({error})") from error
-    if any(len(each) != steps for each in values.values()):
+    if any(len(array) != steps for array in values.values()):
         raise ConfigError(f"policy: {policy!r} returned other names at some steps, expected the same ones")
     return ValuesAlong(steps_of_episode.actions, steps_of_episode.rewards, values)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import contextlib
 import sys
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Self
 
 import numpy as np
 
 from runner.environments.gym_types import Info, ResetOptions, ResetResult
 from runner.errors import ConfigError
-from runner.loops.generators import GeneratorWatch
+from runner.loops.generators import GeneratorWatch, States
 from runner.loops.loop import Loop
 from runner.loops.messages import Messages
 from runner.loops.options import Arguments, Options
@@ -36,6 +36,7 @@ class Recorded:
     """The recorded environment that closes the recording, if it is another; this one keeps it alive."""
     _phase: str
     _rows: StepBuffer
+    _watch: GeneratorWatch
 
     @property
     def run(self) -> Run:
@@ -78,11 +79,11 @@ class Recorded:
         except Exception as error:
             self._loop.leave_out(error)
             return
-        for key, own in name.items():
-            if isinstance(own, Mapping):
-                self.log({f"{key}/{inner}": part for inner, part in own.items()})
+        for key, item in name.items():
+            if isinstance(item, Mapping):
+                self.log({f"{key}/{inner}": part for inner, part in item.items()})
             else:
-                self.log(key, own)
+                self.log(key, item)
 
     def snapshot(self, name: str, array: object) -> None:
         """Record an array of numbers, or each of a mapping of arrays, as it is now: `rec.snapshot("q", q)`.
@@ -140,6 +141,13 @@ class Recorded:
         try:
             self._loop.note(self._phase, self._rows, self._extras_by_name({**(values or {}), **more}))
         except Exception as error:
+            self._loop.leave_out(error)
+
+    def _put_extras(self, extras: Mapping[str, object]) -> None:
+        """Record values with the step that was just put down. The caller holds the loop's lock."""
+        try:
+            self._take_extras(self._extras_by_name(extras))
+        except ConfigError as error:
             self._loop.leave_out(error)
 
     def _extras_by_name(self, values: Mapping[str, object]) -> Mapping[str, object]:
@@ -200,6 +208,72 @@ class Recorded:
         self._rows = self._loop.rows(phase)
         self._take_extras = self._loop.extras.taker(phase, self._rows)
 
+    def _reset(
+        self,
+        seeds: Sequence[int | None],
+        environments: Sequence[int],
+        recorded: ResetOptions | None,
+        arguments: Arguments,
+    ) -> ResetResult:
+        """Reset environments, and record it: the seeds, the options, the observations.
+
+        Args:
+            seeds: of all environments; empty for none.
+            recorded: the options that are recorded.
+            arguments: of the environment's `reset`, which may not have those that are None.
+        """
+        text = self._messages.options_text(recorded)
+        states = self._watch.before_reset(environments, seeds)
+        result: ResetResult = self.env.reset(
+            **{name: value for name, value in arguments.items() if value is not None}
+        )
+        try:
+            states = self._watch.after_reset(states, environments, seeds)
+            self._record_reset(*result, seeds, environments, states, text)
+        except Exception as error:
+            self._loop.fail(error)
+        return result
+
+    def _record_reset(
+        self,
+        observations: object,
+        infos: Any,
+        seeds: Sequence[int | None],
+        environments: Sequence[int],
+        states: States,
+        options: str,
+    ) -> None:
+        """Record a reset of environments that was just done; arguments as for `StepBuffer.reset`."""
+        with self._loop.lock:
+            if not self._loop.activate(self._rows):
+                return
+            self._rows.reset(observations, seeds, environments, states, options)
+        if self._options.info:
+            self._messages.info(self._phase, self._info_by_field(infos), is_reset=True)
+        if self._options.frames_every:
+            self._record_frames(resets=np.isin(range(self._loop.described.environments), environments))
+
+    def _info_by_field(self, info: Any) -> Info:
+        return info  # type: ignore[no-any-return]
+
+    def _record_frames(self, resets: Any = False, ends: Flags | bool = False) -> None:
+        """Record pictures of the environments that were reset or whose episode ended, now and then of all."""
+        n, frames_of = self._loop.described.environments, self._options.frames_of
+        resets, is_due = np.broadcast_to(resets, n), np.broadcast_to(resets | np.asarray(ends), n)
+        if self._until_frame <= 0 or resets.all():
+            self._until_frame, is_due = self._options.frames_every, np.ones(n, np.bool_)
+        due = [i for i in (range(n) if frames_of is None else frames_of) if is_due[i]]
+        images = self._pictures(due) if due else ()
+        if images is None or len(images) < len(due):
+            raise ConfigError(f"frames: found {type(images).__name__} from render(), expected {n} pictures.")
+        for i in due:
+            environment = None if self._loop.mode is None else i
+            self._messages.frame(self._phase, images[i], bool(resets[i]), environment)
+
+    def _pictures(self, due: Sequence[int]) -> Any:
+        """Return pictures of environments, by number."""
+        return {i: self.env.render() for i in due}
+
     def _record_into(self, loop: Loop, is_owner: bool = True) -> None:
         """Record into a loop; its owner closes it when the process ends, if not before."""
         self._loop, self._messages, self._options = loop, loop.messages, loop.options
@@ -226,52 +300,24 @@ def _close_abandoned(loop: Loop) -> None:
     loop.close(*(("interrupted", "") if error is None or is_interactive else ending_of(error)))
 
 
-def without_none(**arguments: object) -> Arguments:
-    """Return the arguments that are not None: an environment's `reset` may not have the others."""
-    return {name: value for name, value in arguments.items() if value is not None}
-
-
 class RecordedAlone(Recorded):
     """What a recorded environment has that steps alone, not in a vector: an environment or a game."""
 
-    _watch: GeneratorWatch
-
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
-        self._watch.due = 0
+        self._watch.begin_phase()
 
-    def _record_frame(self, is_reset: bool = False, is_over: bool = False) -> None:
-        """Record a picture of the last step or reset, if the options include it."""
+    def _record_frame(self, is_over: bool) -> None:
+        """Record a picture of the last step, if it is due."""
         self._until_frame -= 1
-        every = self._options.frames_every
-        if every and (is_reset or is_over or self._until_frame <= 0):
-            self._until_frame = every
-            self._messages.frame(self._phase, self.env.render(), is_reset)
+        if is_over or self._until_frame <= 0:
+            self._record_frames(ends=is_over)
 
     def _recorded_reset(self, seed: int | None, options: ResetOptions | None) -> ResetResult:
-        """Reset the environment, and record it: the seed, the options, the observation."""
-        text = self._messages.options_text(options)
         with self._loop.lock:  # another thread may be committing steps
-            steps = self._rows.place[0]
-        state = self._watch.before(steps) if seed is None else None
-        result: ResetResult = self.env.reset(**without_none(seed=seed, options=options))
-        try:
-            state = self._watch.after(state, seed)
-            observation, info = result
-            with self._loop.lock:
-                if not self._loop.activate(self._rows):
-                    return result
-                states = {} if state is None else {0: state}
-                self._rows.reset(observation, [seed], states=states, options=text)
-            if self._options.info:
-                self._messages.info(self._phase, self._info_by_field(info), is_reset=True)
-            self._record_frame(is_reset=True)
-        except Exception as error:
-            self._loop.fail(error)
-        return result
-
-    def _info_by_field(self, info: Info) -> Info:
-        return info
+            self._watch.steps = self._rows.progress[0]
+        seeds = () if seed is None else (seed,)
+        return self._reset(seeds, (0,), options, {"seed": seed, "options": options})
 
 
 def require_pictures(env: object) -> None:

@@ -81,7 +81,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         if self.training_steps is not None:
             self.recorded.at_step(self.training_steps())
         seeds, options = self.base._seeds, self.base._options
-        if any(own != options[0] for own in options):
+        if any(other != options[0] for other in options):
             warn_user("The options of resets are not recorded where they differ between environments.")
             options = [None]
         is_seeded = any(seed is not None for seed in seeds)

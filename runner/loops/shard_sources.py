@@ -88,9 +88,9 @@ class Source:
 
     def _stop(self, phase: str) -> int:
         """Return the steps of a phase, up to the first that is lost or may lack its reset."""
-        own = self.recording.phase(phase)
-        (step, _), (reset, last_reset) = map(self._first_gap, (own.steps, own.resets))
-        stop = min(self.recording.phase(phase).whole_steps(), step)
+        tables = self.recording.phase(phase)
+        (step, _), (reset, last_reset) = map(self._first_gap, (tables.steps, tables.resets))
+        stop = min(tables.whole_steps(), step)
         return (stop if reset == FOREVER else min(stop, last_reset)) // self.n * self.n
 
     def _first_gap(self, table: TopicChunks) -> tuple[int, int]:
@@ -113,20 +113,14 @@ class Source:
     def _only_resets(self, phase: str) -> NDArray[np.int64]:
         steps = self.recording.phase(phase).steps
         blocks = steps.numbered(range(self.stops[phase] if steps.have_turns else 0))
-        parts = [block["step"][~is_taken(block)] for block in blocks]
-        return np.concatenate([np.empty(0, np.int64), *parts])
+        return np.concatenate([np.empty(0, np.int64), *(block["step"][~is_taken(block)] for block in blocks)])
 
     def _units(self, phase: str) -> NDArray[np.void]:
         """Return the units of a phase, ordered by environment, without key and new numbers."""
         table, stop = self.recording.phase(phase).resets, self.stops[phase]
         dtype = np.dtype([(name, "i8") for name in _RESET])
-        parts = [np.empty(0, dtype)]
-        for block in table.rows():
-            part = np.empty(len(block), dtype)
-            for name in _RESET:
-                part[name] = block[name]
-            parts.append(part)
-        resets = np.concatenate(parts)
+        parts = (block[list(_RESET)].astype(dtype) for block in table.rows())
+        resets = np.concatenate([np.empty(0, dtype), *parts])
         resets = resets[(resets["step"] <= stop) & (resets["environment"] < self.n)]
         resets = resets[np.lexsort((resets["reset"], resets["environment"]))]
         units = np.zeros(len(resets), UNIT)
@@ -143,7 +137,7 @@ class Source:
 
     def phase_steps(self, phase: str, position: int) -> int:
         """Return the steps of a phase that were taken by a position, as its process counted it."""
-        other = next(each for each in PHASES if each != phase)
+        other = next(name for name in PHASES if name != phase)
         if not self.stops[phase]:
             return 0
         if not self.stops[other] and not self.is_placed:
@@ -202,7 +196,8 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
         part, path = run_in(folder), folder / RECORDING_FILE
         stated = part.summary.messages if part is not None else {}
         try:
-            recording = stack.enter_context(_open_whole(path))
+            check_up_to_cut(path)  # every byte is good, up to the end or to where it was cut off
+            recording = stack.enter_context(open_recording(path))
             if not sources and recording.tabular:  # the run is described as in its first recording
                 recording.mdp  # noqa: B018 - an attachment may be lost
         except RecordingError as error:
@@ -227,26 +222,16 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
     return sources, left_out
 
 
-def _open_whole(path: Path) -> Recording:
-    """Open a recording of which every byte is good, up to its end or to where it was cut off.
-
-    Raises:
-        RecordingError: it is damaged.
-    """
-    check_up_to_cut(path)
-    return open_recording(path)
-
-
 def _difference(recording: Recording, first: Recording) -> str:
     """Return why a recording cannot be put together with the first one; empty if it can."""
-    found, expected = (
-        {"kind": kind_of(one.run), "agents": list(one.agents), **_comparable(one.spaces)}
-        for one in (recording, first)
+    facts, expected = (
+        {"kind": kind_of(source.run), "agents": list(source.agents), **_comparable(source.spaces)}
+        for source in (recording, first)
     )
-    if found == expected:
+    if facts == expected:
         return ""
-    key = next(key for key in expected if found.get(key) != expected[key])
-    return f"found {key} {found.get(key)}, expected {expected[key]} as in the other processes."
+    key = next(key for key in expected if facts.get(key) != expected[key])
+    return f"found {key} {facts.get(key)}, expected {expected[key]} as in the other processes."
 
 
 def _comparable(description: Any) -> Any:

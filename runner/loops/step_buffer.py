@@ -84,7 +84,7 @@ class StepBuffer:
         self._seen: Any = zeros((1, self._n), self._dtype)
         """[1, N]: the observations after the last reset or batch."""
         self._attached: dict[int, list[ResetOptions | ResetState]] = defaultdict(list)
-        """The options and states of those resets, by their place, where there are some."""
+        """The options and states of those resets, by number in `_resets`, where there are some."""
         spaces = described.recorded_spaces if described.layout.has_states else {}
         self._starts = tuple(least_number(spaces[name]) for name in sorted(spaces, reverse=True))
         """The least observation and action, where both spaces are discrete."""
@@ -134,7 +134,7 @@ class StepBuffer:
         return self._filled * self._n
 
     @property
-    def place(self) -> tuple[int, int]:
+    def progress(self) -> tuple[int, int]:
         """The steps of the phase so far, and the number of an episode.
 
         Of one environment alone that of the last step, else that of the next episode to end.
@@ -245,11 +245,11 @@ class StepBuffer:
         ends = self._ends[row]
         ends[0], ends[1] = terminated, truncated
         if infos is not None and _TRUE in ends.tobytes() and (final := final_observations(infos)) is not None:
-            which = ends.any(axis=0).nonzero()[0]
-            firsts = self._observations[row, which]
-            for i in which.tolist():
+            environments = ends.any(axis=0).nonzero()[0]
+            firsts = self._observations[row, environments]
+            for i in environments.tolist():
                 self._hold(self._put_last(row * self._n + i, element_of(final, i)))
-            self._add_resets(row + 1, which, firsts)
+            self._add_resets(row + 1, environments, firsts)
         if states:
             self._autoreset_states[row] = states
         self._filled = row = row + 1
@@ -327,8 +327,8 @@ class StepBuffer:
             for column, values in zip(self._block, arrays, strict=False):
                 column[rows] = values[part]
             if firsts is not None:
-                at, which = np.nonzero(self._ends[rows].any(axis=1))
-                self._add_resets(row + at + 1, which, firsts[done + at, which])
+                at, environments = np.nonzero(self._ends[rows].any(axis=1))
+                self._add_resets(row + at + 1, environments, firsts[done + at, environments])
             if self._are_bytes:
                 self._hold(sum(map(len, (*self._actions[rows].flat, *self._observations[rows].flat))))
             done += count
@@ -347,7 +347,7 @@ class StepBuffer:
         self,
         observations: object,
         seeds: Sequence[int | None],
-        which: Sequence[int] = (0,),
+        environments: Sequence[int] = (0,),
         states: States = _NO_STATES,
         options: str = "",
     ) -> None:
@@ -356,7 +356,7 @@ class StepBuffer:
         Args:
             observations: of all environments.
             seeds: of all environments; empty for none.
-            which: the environments.
+            environments: their numbers.
             states: what the reset depended on, by environment, as far as it is to be recorded.
             options: those of the reset as JSON; empty for none.
 
@@ -369,12 +369,13 @@ class StepBuffer:
             self._seen[0] = self._fitted(observations, self._n)  # all or nothing of them
         else:
             self._put_seen(0, observations)
-        seen = self._seen[0] if len(which) == self._n else self._seen[0, which]
-        must_commit = bool(self._batch) and not self.over[which].all()
+        seen = self._seen[0] if len(environments) == self._n else self._seen[0, environments]
+        must_commit = bool(self._batch) and not self.over[environments].all()
         self._ended += not self._batch and self._idle_at != self._filled
         self._idle_at = self._filled
-        seeds = [seeds[i] if len(seeds) else None for i in which]
-        self._add_resets(self._filled, which, seen, seeds, options, states)
+        if len(seeds):
+            seeds = [seeds[i] for i in environments]
+        self._add_resets(self._filled, environments, seen, seeds, options, states)
         if must_commit or self._is_full_of_resets:
             self.commit()
 
@@ -393,7 +394,7 @@ class StepBuffer:
     def _add_resets(
         self,
         rows: Ints | int,
-        which: Ints | Sequence[int],
+        environments: Ints | Sequence[int],
         observations: Array,
         seeds: Sequence[int | None] = (),
         options: str = "",
@@ -402,30 +403,32 @@ class StepBuffer:
         """Put down resets of environments before these rows.
 
         Args:
-            which: the environments.
+            environments: their numbers.
             seeds: of these resets; none have seeds and options unless given.
             states: what they depended on, by environment.
         """
         if self._are_bytes:
             self._hold(sum(map(len, observations)))
-        start, self._waiting = self._waiting, self._waiting + len(which)
+        start, self._waiting = self._waiting, self._waiting + len(environments)
         while self._waiting > len(self._resets):
             self._resets = np.concatenate([self._resets, np.zeros_like(self._resets)])
         added = self._resets[start : self._waiting]
-        added["row"], added["environment"], added["observation"] = rows, which, observations
-        large = [k for k, seed in enumerate(seeds) if seed is not None and seed > MAX_SEED]
+        added["row"], added["environment"], added["observation"] = rows, environments, observations
+        large = []
         for k, seed in enumerate(seeds):
-            if seed is not None and 0 <= seed <= MAX_SEED:
+            if seed is not None and seed > MAX_SEED:
+                large.append(k)
+            elif seed is not None and seed >= 0:
                 added["seed"][k], added["seeded"][k] = seed, True
-        for k in range(len(which)) if large and options else large:
+        for k in range(len(environments)) if large and options else large:
             attached = ResetOptions(json=options, large_seed=seeds[k] if k in large else None)
             self._attached[start + k].append(attached)
         if options and not large:
-            self._attached[start].append(ResetOptions(json=options, resets=len(which)))
-        for k, environment in enumerate(which) if states else ():
+            self._attached[start].append(ResetOptions(json=options, resets=len(environments)))
+        for k, environment in enumerate(environments) if states else ():
             if environment in states:
                 self._attached[start + k].append(states[environment])
-        self.resets += len(which)
+        self.resets += len(environments)
 
     def _fitted(self, observations: object, *batch: int) -> Array:
         """Return a batch of observations as they are recorded."""
@@ -535,8 +538,8 @@ class StepBuffer:
             columns["step"] = first + np.arange(rows * n).reshape(rows, n)
             columns |= {"episode": number, "t": episodes.t}
             if self._has_turns:
-                own = np.arange(n) if environment is None else environment
-                columns["environment"] = np.broadcast_to(own, (rows, n))
+                numbers = np.arange(n) if environment is None else environment
+                columns["environment"] = np.broadcast_to(numbers, (rows, n))
                 columns["taken"] = np.broadcast_to(np.logical_not(only_reset), (rows, n))
             flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
             self._recorder.put(self._topics.steps, flat, np.arange(before + 1, before + 1 + rows * n))
@@ -570,12 +573,12 @@ class StepBuffer:
         over = np.vstack([self._over, self._ends[: self._filled - 1].any(axis=1)])
         only_reset: Flags = over & ~was_reset & (self._mode == AutoresetMode.NEXT_STEP)
         # They come after those that the user called before the step.
-        rows, which = np.nonzero(only_reset)
+        rows, environments = np.nonzero(only_reset)
         start = self._waiting
-        self._add_resets(rows, which, self._observations[rows, which])
+        self._add_resets(rows, environments, self._observations[rows, environments])
         for row, states in self._autoreset_states.items():
             for k in np.flatnonzero(rows == row).tolist():
-                if (i := int(which[k])) in states:
+                if (i := int(environments[k])) in states:
                     self._attached[start + k].append(states[i])
         begins = was_reset | only_reset
         begins[0] |= self._over  # they ended among the steps of another phase, and were not reset since
@@ -632,10 +635,10 @@ class StepBuffer:
         columns["episode"] = episode[resets["row"], resets["environment"] % self._n]
         columns |= {"reset": number + np.arange(len(order)), "step": first + steps}
         self._recorder.put(self._topics.resets, columns, before + steps)
-        for place, k in enumerate(order.tolist() if self._attached else ()):
+        for offset, k in enumerate(order.tolist() if self._attached else ()):
             for attached in self._attached.get(k, ()):
                 is_state = isinstance(attached, ResetState)
                 topic = self._topics.reset_states if is_state else self._topics.reset_options
-                payload = attached._replace(reset=number + place).to_payload()
-                self._recorder.append(topic, payload, before + int(steps[place]))
+                payload = attached._replace(reset=number + offset).to_payload()
+                self._recorder.append(topic, payload, before + int(steps[offset]))
         self._attached.clear()

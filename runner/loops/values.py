@@ -93,7 +93,7 @@ def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
     yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 
-def numbers_of(value: object, where: str, place: str, expected: str) -> Array:
+def numbers_of(value: object, where: str, purpose: str, expected: str) -> Array:
     """Return an array of numbers of at most 64 bits; the other arguments are for the error.
 
     Raises:
@@ -102,10 +102,10 @@ def numbers_of(value: object, where: str, place: str, expected: str) -> Array:
     try:
         values = as_array(value)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        what = f"found no array of numbers {place} ({error})"
+        what = f"found no array of numbers {purpose} ({error})"
         raise ConfigError(f"{where}: {what}, expected {expected}") from error
     if values.dtype.kind not in "biuf" or values.dtype.itemsize > 8:
-        what = f"found {type(value).__name__} of {values.dtype} {place}"
+        what = f"found {type(value).__name__} of {values.dtype} {purpose}"
         raise ConfigError(f"{where}: {what}, expected {expected}")
     return values
 

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
-from numpy.typing import NDArray
 
 from runner.environments.gym_types import AnyVectorEnv, Info, ResetOptions, ResetResult, VectorStepResult
 from runner.environments.layers import class_name, layers_of, spaces_of_one
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
-from runner.loops.generators import States, VectorWatch
+from runner.loops.generators import GeneratorWatch, States, vector_watch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
-from runner.loops.recorded import Recorded, require_pictures, without_none
+from runner.loops.recorded import Recorded, require_pictures
 from runner.loops.values import as_given, check_phase
 from runner.loops.wrappers import return_name
 from runner.recording.spaces import Value
@@ -43,7 +42,7 @@ class RecordedVector(Recorded, _Wrapper):
         env: AnyVectorEnv,
         loop: Loop,
         mode: AutoresetMode,
-        watch: VectorWatch,
+        watch: GeneratorWatch,
         phase: str = "train",
     ) -> None:
         VectorWrapper.__init__(self, env)
@@ -61,7 +60,7 @@ class RecordedVector(Recorded, _Wrapper):
             over = self._rows.over
             super()._enter(phase)
             self._rows.over = over  # the environments are the same ones
-            self._watch.phase_began()
+            self._watch.begin_phase()
 
     def step(self, actions: object, extras: Mapping[str, object] | None = None) -> VectorStepResult:
         """Take a step in every environment, and record it, with values of your own by name.
@@ -109,10 +108,7 @@ class RecordedVector(Recorded, _Wrapper):
                 finals = infos if self._resets_within else None
                 rows.take_vector(actions, observations, rewards, terminated, truncated, finals, states)
                 if extras is not None:
-                    try:
-                        self._take_extras(extras)
-                    except ConfigError as error:
-                        loop.leave_out(error)
+                    self._put_extras(extras)
             if self._has_messages:
                 self._record_messages(infos, np.logical_or(terminated, truncated), over)
         except Exception as error:
@@ -121,7 +117,7 @@ class RecordedVector(Recorded, _Wrapper):
     def _record_messages(self, infos: Info | Sequence[Info], ended: Flags, over: Flags | None) -> None:
         """Record the chosen fields of infos, and the pictures that are due, of a step."""
         if self._options.info:
-            self._messages.info(self._phase, _by_environment(infos))
+            self._messages.info(self._phase, self._info_by_field(infos))
         if self._return_name and ended.any() and isinstance(infos, Mapping):
             self._log_return(infos, ended)
         if self._options.frames_every:
@@ -133,69 +129,29 @@ class RecordedVector(Recorded, _Wrapper):
             else:
                 self._record_frames(ends=ended)
 
-    def _record_frames(self, resets: Any = False, ends: Flags | bool = False) -> None:
-        """Record pictures of the environments that were reset or whose episode ended, now and then of all."""
-        n, every = self.env.num_envs, self._options.frames_every
-        resets, is_due = np.broadcast_to(resets, n), np.broadcast_to(resets | np.asarray(ends), n)
-        if self._until_frame <= 0 or resets.all():
-            self._until_frame, is_due = every, np.ones(n, np.bool_)
-        chosen = range(n) if self._options.frames_of is None else self._options.frames_of
-        which = [i for i in chosen if is_due[i]]
-        if not which:
-            return
+    def _pictures(self, due: Sequence[int]) -> Any:
         inside = getattr(self.env.unwrapped, "envs", None)
-        images = {i: inside[i].render() for i in which} if inside else self.env.render()
-        if images is None or len(images) < len(which):
-            raise ConfigError(f"frames: found {type(images).__name__} from render(), expected {n} pictures.")
-        for i in which:
-            self._messages.frame(self._phase, images[i], bool(resets[i]), i)
+        return {i: inside[i].render() for i in due} if inside else self.env.render()
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: ResetOptions | None = None
     ) -> ResetResult:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
         n, mask = self.env.num_envs, (options or {}).get("reset_mask")
-        text = self._messages.options_text(
-            {key: own for key, own in (options or {}).items() if key != "reset_mask"}
-        )
-        which = np.ones(n, np.bool_) if mask is None else np.array(mask, np.bool_)
+        recorded = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
+        environments = np.flatnonzero(np.ones(n) if mask is None else mask).tolist()
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
-        states = self._watch.before_reset(which, seeds)
-        result = self.env.reset(**without_none(seed=seed, options=options))
-        states = self._watch.after_reset(states, which, seeds)
-        try:
-            self.record_reset(*result, seeds, which, states, text)
-        except Exception as error:
-            self._loop.fail(error)
-        return result
+        return self._reset(seeds, environments, recorded, {"seed": seed, "options": options})
 
-    def record_reset(
-        self,
-        observations: object,
-        infos: Info | Sequence[Info],
-        seeds: Sequence[int | None] = (),
-        which: NDArray[np.bool_] | None = None,
-        states: States | None = None,
-        options: str = "",
-    ) -> None:
-        """Record a reset of some environments, or of all, that was just done.
+    def record_reset(self, observations: object, infos: Info | Sequence[Info]) -> None:
+        """Record a reset of all environments that was just done, without seeds and options."""
+        self._record_reset(observations, infos, (), range(self.env.num_envs), {}, "")
 
-        Args:
-            seeds: of all environments; empty for none.
-            which: [N], the environments; all unless given.
-            states: what the reset depended on, as far as it is to be recorded.
-            options: those of the reset as JSON; empty for none.
-        """
-        which = np.ones(self.env.num_envs, np.bool_) if which is None else which
-        with self._loop.lock:
-            if not self._loop.activate(self._rows):
-                return
-            environments = np.flatnonzero(which).tolist()
-            self._rows.reset(observations, seeds, environments, states or {}, options)
-        if self._options.info:
-            self._messages.info(self._phase, _by_environment(infos), is_reset=True)
-        if self._options.frames_every:
-            self._record_frames(resets=which)
+    def _info_by_field(self, info: Info | Sequence[Info]) -> Info:
+        """Return infos by field; SuperSuit returns a list of them, one for each environment."""
+        if isinstance(info, Mapping):
+            return info
+        return by_field({str(i): part for i, part in enumerate(info)})
 
 
 def record_vector(
@@ -241,33 +197,33 @@ def record_vector(
     with first_of(envs) as first:
         described = described_vector(envs, first, mode)
         maker = vector_maker_of(envs, first, mode, checked_make(make))
-        watch = VectorWatch(envs, first, mode, sparse=options.get("steps") == "actions")
+        watch = vector_watch(envs, first, mode, sparse=options.get("steps") == "actions")
     frames_every = options.get("frames_every", 0)
     if frames_every:
         require_pictures(envs)
-    chosen = None if frames_of is None else tuple(sorted(set(np.atleast_1d(frames_of).tolist())))
-    if chosen is not None and not (frames_every and set(chosen) <= set(range(envs.num_envs))):
+    drawn = None if frames_of is None else tuple(sorted(set(np.atleast_1d(frames_of).tolist())))
+    if drawn is not None and not (frames_every and set(drawn) <= set(range(envs.num_envs))):
         raise ConfigError(
             f"frames_of: found {frames_of!r} with frames_every={frames_every}, expected numbers from 0 to "
             f"{envs.num_envs - 1}, and frames_every"
         )
-    loop = Loop(described, options_of(recordings, options, chosen), maker, mode)
+    loop = Loop(described, options_of(recordings, options, drawn), maker, mode)
     return RecordedVector(envs, loop, mode, watch, phase)
 
 
-def autoreset_mode_of(envs: AnyVectorEnv | None, chosen: AutoresetMode | str | None) -> AutoresetMode:
-    """Return how environments reset themselves: as chosen, else as their metadata states.
+def autoreset_mode_of(envs: AnyVectorEnv | None, mode: AutoresetMode | str | None) -> AutoresetMode:
+    """Return how environments reset themselves: in this mode, else as their metadata states.
 
     Raises:
         ConfigError: there is no such mode.
-        EnvironmentNotUsable: none is chosen and none is stated.
+        EnvironmentNotUsable: there is no mode and none is stated.
     """
-    if chosen is not None or envs is None:
+    if mode is not None or envs is None:
         try:
-            return AutoresetMode(chosen)
+            return AutoresetMode(mode)
         except ValueError as error:
-            modes = ", ".join(repr(mode.value) for mode in AutoresetMode)
-            raise ConfigError(f"autoreset_mode: found {chosen!r}, expected one of {modes}") from error
+            modes = ", ".join(repr(known.value) for known in AutoresetMode)
+            raise ConfigError(f"autoreset_mode: found {mode!r}, expected one of {modes}") from error
     stated = (getattr(envs, "metadata", None) or {}).get("autoreset_mode")
     if not isinstance(stated, AutoresetMode):
         raise EnvironmentNotUsable(
@@ -299,20 +255,13 @@ def first_of(envs: AnyVectorEnv) -> Iterator[object]:
     elif isinstance(unwrapped, AsyncVectorEnv):
         states = random.getstate(), np.random.get_state()
         try:
-            with contextlib.closing(unwrapped.env_fns[0]()) as own:
-                yield own
+            with contextlib.closing(unwrapped.env_fns[0]()) as env:
+                yield env
         finally:
             random.setstate(states[0])
             np.random.set_state(states[1])
     else:
         yield envs
-
-
-def _by_environment(infos: Info | Sequence[Info]) -> Mapping[str, Value]:
-    """Return infos by field; SuperSuit returns a list of them, one for each environment."""
-    if isinstance(infos, Mapping):
-        return infos
-    return by_field({str(i): info for i, info in enumerate(infos)})
 
 
 def by_field(infos: Mapping[str, Info]) -> dict[str, Info]:

@@ -41,7 +41,8 @@ def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]
     left = list(wrappers)
     inner = 0
     if isinstance(spec, EnvSpec) and not isinstance(creator_of(spec), type):
-        firsts = [at for at, each in enumerate(left) if type(each) in (PassiveEnvChecker, OrderEnforcing)]
+        checkers = (PassiveEnvChecker, OrderEnforcing)
+        firsts = [number for number, wrapper in enumerate(left) if type(wrapper) in checkers]
         inner = next(iter(firsts), 0)
         if not firsts:  # both were left out, or only an inner environment is recorded
             assumed.append(name_of(spec.entry_point))
@@ -83,8 +84,8 @@ def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, 
     if spec.kwargs is None:
         module, _, name = spec.entry_point.partition(":")
         parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters.values()
-        others = [each for each in parameters if each.name != "env"]
-        if any(each.default is each.empty for each in others if each.kind not in VARIABLE):
+        others = [parameter for parameter in parameters if parameter.name != "env"]
+        if any(other.default is other.empty for other in others if other.kind not in VARIABLE):
             raise CannotBeMade(f"the wrapper {spec.entry_point} does not record its arguments")
         if others:
             assumed.append(spec.entry_point)
