@@ -62,7 +62,7 @@ def action_names(env: object, space: Space) -> tuple[str, ...]:
 
 
 def action_in_words(space: Space, action: Value, names: Names) -> str:
-    """Return the name of an action, or the names of those of several agents; empty if there is none."""
+    """Return the name of an action, or of the action of each agent; empty if there is none."""
     if isinstance(names, Mapping):
         assert isinstance(space, spaces.Dict)
         words = (
@@ -81,7 +81,7 @@ def parsed_action(space: Space, given: object, recorded: Value, names: Names) ->
     Args:
         given: text, or a value; of a game `AGENT=VALUE`, or a mapping by agent: the others act as recorded.
             None for the recorded action.
-        recorded: the recorded action at the same step; of a game those of the agents that acted.
+        recorded: the recorded action at the same step; of a game, the actions of the agents that acted.
 
     Raises:
         ConfigError: it is not in the space.
@@ -141,7 +141,7 @@ def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], 
 
 
 def _parsed_json(space: Space, given: object, where: str) -> object:
-    """Return an action of a space whose values are recorded as text; as text it is JSON."""
+    """Return an action of a space that is recorded as text; text given for it is JSON."""
     try:
         value = value_of(space, given) if isinstance(given, str) else given
         if value in space:
@@ -152,7 +152,7 @@ def _parsed_json(space: Space, given: object, where: str) -> object:
 
 
 def _parsed_parts(space: Space, given: object, recorded: Value, where: str) -> object:
-    """Return an action of a `Dict` or `Tuple`, whose text is JSON."""
+    """Return an action of a `Dict` or `Tuple`; text given for it is JSON."""
     try:
         values = json.loads(given) if isinstance(given, str) else given
     except (ValueError, RecursionError) as error:

@@ -20,7 +20,7 @@ from runner.environments.layers import class_name
 _SHOWN: Final = "render_mode"
 """A parameter that changes no step."""
 _COPIES: Final = frozenset({"bool", "dict", "float", "int", "list", "str", "tuple"})
-"""Functions whose result makes the same object as their argument."""
+"""Functions that copy: an argument and its copy make the same object."""
 VARIABLE: Final = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 _UNKNOWN: Final = object()
 
@@ -68,7 +68,7 @@ def arguments_of(made: object, inner: str = "") -> tuple[dict[str, object], bool
 
 
 def _recorded(made: Any, parameters: Mapping[str, inspect.Parameter]) -> dict[str, object]:
-    """Return the arguments that an object's own constructor records, not only that of a base class."""
+    """Return the arguments that an object's own constructor records, not only a base class's."""
     names = getattr(getattr(inspect.unwrap(type(made).__init__), "__code__", None), "co_names", ())
     arguments: dict[str, object] = {}
     if "RecordConstructorArgs" in names and isinstance(made, RecordConstructorArgs):
@@ -163,7 +163,7 @@ def plain_number(value: np.generic) -> object:
 
 
 def factory_of(made: Any) -> tuple[str, dict[str, object], bool]:
-    """Return the function of a module that made an object, with its arguments, as those of `arguments_of`.
+    """Return the function of a module that made an object, its arguments, and whether all are certain.
 
     It is known by a function or class that was defined in it and given to the object, and its arguments by
     the variables which that uses.

@@ -1,4 +1,4 @@
-"""`runner.record_batches`: environments whose steps come in batches, as JAX and EnvPool return them."""
+"""`runner.record_batches`: environments that return their steps in batches, as JAX and EnvPool do."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class NamedEnvironments(AnyVectorEnv):
 
 
 class RecordedBatches(Recorded):
-    """The recording of environments whose steps come in batches; made by `record_batches`."""
+    """The recording of environments that return their steps in batches; made by `record_batches`."""
 
     why_not_made = f"it was recorded in batches, and is known by its name alone; {NAME_MAKE}"
     """Why an environment cannot be made again that is known by its name alone."""
@@ -131,7 +131,7 @@ class RecordedBatches(Recorded):
             terminated: [T, N], boolean or 0 and 1.
             truncated: [T, N] likewise; nowhere unless given.
             final_observations: [T, N, ...], with `autoreset_mode="SameStep"`: the last observations of
-                episodes that ended, wherever `observations` are those of the next ones.
+                episodes that ended, wherever `observations` belong to the next episodes.
             extras: values of your own by name, [T, N, ...]; texts, and arrays of any length, in T lists of N.
 
         Raises:
@@ -240,8 +240,8 @@ def record_batches(
             ...
             rec.batch(observations, actions, rewards, terminated)  # [T + 1, N, ...], and [T, N, ...]
 
-    It is for environments that step inside of a compiled function, such as those of gymnax and Brax, and for
-    many quick ones, such as EnvPool's. The run is the same as that of `record_vector`.
+    It is for environments that step inside of a compiled function, as in gymnax and Brax, and for many quick
+    environments, as in EnvPool. The run is the same as with `record_vector`.
 
     Args:
         envs: the name of the environment; or a vector environment, which is described but never called,

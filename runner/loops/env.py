@@ -42,9 +42,8 @@ class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, objec
     def step(self, action: object, extras: Mapping[str, object] | None = None) -> StepResult:
         """Take a step, and record it, with values of your own: `extras={"value": v, "logits": logits}`.
 
-        A name keeps the dtype and the shape of its first value, but for the length of the first axis: once it
-        is another one, such as that of token ids, the name varies in length. Texts are recorded too. A step
-        need not have all names.
+        A name keeps the dtype and the shape of its first value, but the first axis may have another length in
+        a later step, as with token ids. Texts are recorded too. A step need not have all names.
         """
         rows = self._rows
         given = action if action.__class__ in UNCHANGEABLE else rows.keep(action)
@@ -123,8 +122,9 @@ def record(
         make: a function without arguments that makes this environment, at the top of a module, or its name
             ("train:make_env"). It is recorded, and called to repeat the run where wrappers or arguments
             cannot be recorded; `environment_maker` in the recording says where that is.
-        join: a run that is being recorded, by a `Run`, its id or its folder, or True for that of the process
-            that started this one: this process records a shard of it. It has no name, seed and config then.
+        join: a run that is being recorded, by a `Run`, its id or its folder, or True for the run of the
+            process that started this one: this process records a shard of it. It has no name, seed and
+            config then.
         shard: the name of this process in that run, which determines the order of processes in it; by default
             the name that `multiprocessing` gave it.
         on_error: what happens if recording fails while the loop runs, because the disk is full or a value

@@ -69,7 +69,7 @@ class PendingExtras:
     """The extras of a loop that the recorder does not have yet; the caller holds the loop's lock.
 
     Args:
-        batch: (N,) for N environments that step at once, whose values are arrays [N, ...]; else ().
+        batch: (N,) for N environments that step at once, with values [N, ...]; else ().
     """
 
     def __init__(self, recorder: Recorder, batch: tuple[int, ...] = ()) -> None:
@@ -82,10 +82,10 @@ class PendingExtras:
         """The last layout that the recording has."""
         self._columns: dict[str, _Column] = {}
         self._room, self._max_rows = 0, 0
-        """The most rows of the columns, and those that may wait now."""
+        """The rows that the columns hold, and how many of them may wait now."""
         self._phase = ""
         self._steps: list[int] = []
-        """The number of the step of each row; of several environments, that of the first."""
+        """The number of each row's step; of several environments, of the first one's step."""
         self._partial: dict[int, set[str]] = {}
         """The names that were given, in rows that do not have all."""
         self._fixed_bytes = 0
@@ -200,7 +200,7 @@ class PendingExtras:
 
         Args:
             row: the first row that may have them.
-            values: [*lead, ...] each; by default those of one step.
+            values: [*lead, ...] each; by default of one step.
 
         Raises:
             ConfigError: a name or a value cannot be recorded.
@@ -361,7 +361,7 @@ def put_extras(
     """Record the extras of steps, given by number and position.
 
     Args:
-        columns: the values of each name; those of varying size as bytes.
+        columns: the values of each name; values of varying size as bytes.
     """
     varying = layout.varying["spaces"]
     for block, part in recorder.fill(schema.extra_topic(phase, layout.number), positions):
@@ -430,7 +430,7 @@ def _listed(values: _Values, lead: tuple[int, ...]) -> list[Any]:
 
 
 def _needed(name: object, known: Description | None, value: object, lead: tuple[int, ...]) -> Description:
-    """Return the description that a name needs for values, [*lead, ...], besides those that it had before.
+    """Return the description that a name needs for these values, [*lead, ...], and for its earlier values.
 
     It keeps the dtype and the shape of its first value; only the first axis may get another length.
 

@@ -141,7 +141,7 @@ def _fold(run: Run, report: Report) -> Run:
 
 
 def _remove_folded(run: Run, unfolded: Mapping[str, str]) -> None:
-    """Remove the shards of a run that was folded; keep those of which something is left out."""
+    """Remove the shards of a run that was folded; keep the shards that are not whole in it."""
     for folder in shard_folders(run):
         if folder.name in unfolded:
             (run.folder / UNFOLDED_FOLDER).mkdir(exist_ok=True)
@@ -162,7 +162,7 @@ class _Fold:
     """Writes the recordings of several processes into one.
 
     Args:
-        sources: of its processes; that which began it comes first, unless it recorded nothing.
+        sources: of its processes; the process that began it comes first, unless it recorded nothing.
         left_out: why the recordings of other processes cannot be folded, by name.
     """
 
@@ -180,7 +180,7 @@ class _Fold:
         self._units, self._evaluated = self._ordered()
         leads = sources[0].is_placed or any(sources[0].taken.values())
         self._main = sources[0] if leads else max(sources, key=lambda source: sum(source.taken.values()))
-        """The process whose clock becomes that of the run."""
+        """The process with the clock that the run takes over."""
         self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
 
     def write(self, fresh: Path) -> dict[str, object]:
@@ -260,7 +260,7 @@ class _Fold:
         return json.dumps(spaces)
 
     def _own_makers(self) -> dict[str, EnvironmentMaker]:
-        """Return how the environments of shards were made, where it was otherwise than those of the run."""
+        """Return how the environments of shards were made, where they differ from the run's."""
         makers = {}
         for source in self._sources[1:]:
             maker = source.recording.maker
@@ -273,7 +273,7 @@ class _Fold:
     # --- the order ------------------------------------------------------------------------------------
 
     def _ordered(self) -> tuple[NDArray[np.void], tuple[Array, Array]]:
-        """Return the units of all processes in the order of the run, and those of evaluations among them."""
+        """Return the units of all processes in the order of the run; keys and steps of its evaluations."""
         for source in self._sources:
             for phase, units in source.units.items():
                 before = units["first"] - units["environment"]
@@ -363,7 +363,7 @@ class _Fold:
     # --- messages -------------------------------------------------------------------------------------
 
     def _copy_messages(self, topic: Topic, spool: BinaryIO) -> None:
-        """Copy the messages of a topic, but those of steps, in the order of the run."""
+        """Copy the messages of a topic in the order of the run, unless they are steps."""
         if topic in schema.ROW_TOPICS or topic.message in (schema.EXTRA, schema.EXTRA_COLUMNS):
             return
         spool.seek(0)
@@ -465,7 +465,7 @@ def _kept(name: str, reason: str) -> str:
 
 
 def _ending_of_run(run: Run, unfolded: Mapping[str, str] | None = None) -> str:
-    """Return how a run ended whose processes are gone; it is not finished without what is `unfolded`."""
+    """Return how a run ended when its processes are gone; with `unfolded` shards it is not finished."""
     status = str(run.facts.get(ENDS_AS) or run.file.status)
     return status if status == "failed" or (status == "finished" and not unfolded) else "interrupted"
 
@@ -474,7 +474,7 @@ class Content:
     """Digests of the values in steps and resets, by topic and field: a fold must not change them.
 
     Args:
-        layout: the messages of the folded recording, in the dtypes of which values are compared.
+        layout: the messages of the folded recording; values are compared in their dtypes.
     """
 
     def __init__(self, layout: Layout) -> None:

@@ -25,7 +25,7 @@ from runner.runs.run import Run
 from runner.util.values import is_whole
 
 _UNDECIDED_SECONDS: Final = 5.0
-"""The dtype of actions is left open this long while no step is taken; then it is that of their space."""
+"""The dtype of actions is left open this long while no step is taken; then their space decides it."""
 
 
 class Loop:
@@ -60,7 +60,7 @@ class Loop:
         self.lock = threading.RLock()
         self.closed = False
         self.is_foreign = False
-        """Whether this process records nothing: it was forked from the one that does, or recording failed."""
+        """Whether this process records nothing: it was forked from the recorder, or recording failed."""
         self._failure = ""
         """Why recording stopped, if it did and `on_error` is "warn"."""
         self._warnings: set[str] = set()
@@ -200,7 +200,7 @@ class Loop:
             taken["elsewhere"] = steps
 
     def records(self) -> bool:
-        """Return whether this process records, and warn if it was forked from the one that does."""
+        """Return whether this process records, and warn if it was forked from the recording process."""
         if self.is_foreign and not self._failure:
             self.warn_once(
                 f"run {self.run.run_id} is recorded by the process that this one was forked from, and not "

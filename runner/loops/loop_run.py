@@ -53,8 +53,8 @@ class LoopRun:
         self.started = time.monotonic()
         self.described, self._options, self._maker = described, options, maker
         self.own_makers: dict[str, EnvironmentMaker] = {}
-        """How the environments of phases were made, where another one is recorded into the run: those that
-        are not written yet."""
+        """How the environments of phases were made, where another one is recorded into the run; without the
+        phases that are written."""
         self._config = options.config(described)
         self._is_described = False
         self.is_settled = not recorded_space(described.action).can_widen()
@@ -106,7 +106,7 @@ class LoopRun:
         """Create the folder of the run, or of the shard of the run that is joined.
 
         Raises:
-            ConfigError: the spaces are others than those of the run that is joined.
+            ConfigError: the run that is joined has other spaces.
         """
         options, config = self._options, self._config
         if options.join is None:
@@ -248,7 +248,7 @@ class LoopRun:
 
 
 def _mark_unsynced(folder: Path, error: OSError) -> None:
-    """Mark a run as failed whose recording was complete and could not be written to disk, and say so."""
+    """Mark a run as failed, and say so, as its complete recording could not be written to disk."""
     reason = (
         f"{folder}: the recording could not be written to disk ({error.strerror}); `dualtaxi verify` shows "
         "whether it is complete."

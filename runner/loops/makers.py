@@ -44,7 +44,7 @@ from runner.util.values import MAX_TEXT
 
 NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
 _SIMULATORS: Final = ("Box2D", "ale_py", "mujoco", "pettingzoo", "supersuit")
-"""Modules whose versions are recorded if they are loaded."""
+"""Modules: their versions are recorded if they are loaded."""
 _DISTRIBUTIONS: Final = {"Box2D": ("box2d", "box2d-py")}
 """The distributions of modules with other names."""
 
@@ -61,7 +61,7 @@ def maker_of(env: Any, make: str = "") -> EnvironmentMaker:
 
 
 def _maker_of_spec(spec: object) -> EnvironmentMaker:
-    """Return how an environment in another process was made, whose specification has its wrappers."""
+    """Return how an environment in another process was made, by its specification, which has its wrappers."""
     wrappers = getattr(spec, "additional_wrappers", ())
     names = tuple(wrapper.entry_point for wrapper in reversed(wrappers))
 
@@ -85,7 +85,7 @@ def _with_spec(
 
     Args:
         spec: of Gymnasium; None if the environment's class was called.
-        wrapping: returns the fields that describe the wrappers; appends those whose arguments are unknown.
+        wrapping: returns the fields that describe the wrappers; appends wrappers with unknown arguments.
         base: the environment inside of all wrappers; None if it is in another process.
     """
     assumed: list[str] = []
@@ -145,7 +145,7 @@ def _registered(spec: object) -> Registered:
 
 
 def _own_fields(base: object, assumed: list[str]) -> tuple[dict[str, object], str]:
-    """Return the same of an environment whose class was called."""
+    """Return the same as `_spec_fields`, of an environment that was made by calling its class."""
     if base is None:
         raise CannotBeMade("it was not made by gymnasium.make, and is in another process")
     kwargs, is_certain = arguments_of(base)
@@ -354,7 +354,7 @@ def package_versions(tops: Sequence[str] = ()) -> dict[str, str]:
     """Return the versions of Gymnasium, NumPy, simulators that are loaded, and the distributions of modules.
 
     Args:
-        tops: names of further modules, without dots; those that no distribution is named after have no entry.
+        tops: names of further modules, without dots; a module without a distribution of its name is left out.
     """
     names = {"gymnasium", "numpy", *tops, *(name for name in _SIMULATORS if name in sys.modules)}
     packages = (_installed(name) for name in sorted(names))

@@ -125,7 +125,7 @@ def grid_of(value: object, layout: str) -> Array:
 
 
 def histogram_of(values: object) -> dict[str, Array]:
-    """Return counts [bins] and edges [bins + 1] of numbers; those that are not finite are left out."""
+    """Return counts [bins] and edges [bins + 1] of numbers; numbers that are not finite are left out."""
     array = _numbers(values).astype(np.float64).ravel()
     finite = array[np.isfinite(array)]
     counts, edges = np.histogram(finite, bins=BINS)

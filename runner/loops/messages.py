@@ -32,7 +32,7 @@ MAX_INFO_BYTES: Final = 4 << 20
 _MAX_WAITING: Final = 1024
 """Logged numbers that wait for the recorder; it gets them twice a second at the latest."""
 _MAX_SERIES: Final = 4096
-"""The most names of logged numbers whose encoders are kept at hand."""
+"""The most names of logged numbers with encoders at hand."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
 
@@ -56,7 +56,7 @@ class LoopState(Protocol):
 
     lock: threading.RLock
     is_foreign: bool
-    """Whether this process was forked from the one that records."""
+    """Whether this process was forked from the recording process."""
 
     @property
     def position(self) -> int:
@@ -69,7 +69,7 @@ class LoopState(Protocol):
         """Return the steps of a phase; raises `ConfigError` if there is no such phase."""
 
     def records(self) -> bool:
-        """Return whether this process records, and warn if it was forked from the one that does."""
+        """Return whether this process records, and warn if it was forked from the recording process."""
 
     def warn_once(self, message: str) -> None:
         """Warn the user of something once."""
@@ -244,7 +244,7 @@ class Messages:
         """Record a picture, [height, width, 3] of uint8; another thread encodes it.
 
         Args:
-            environment: its number among those of a vector; None for a single one.
+            environment: its number in a vector; None for a single environment.
 
         Raises:
             ConfigError: it is something else.

@@ -28,7 +28,7 @@ ALL_INFO: Final = "*"
 """Among the names of info fields: all of them."""
 PACKING: Final = ("compression", "level", "index", "chunk_steps", "code", "system", "console")
 _ARGUMENTS: Final = ("recordings", "make", "frames_of", "phase", "autoreset_mode")
-"""The other arguments of functions that record, of which a misspelt one may be meant."""
+"""The other arguments of functions that record: one of them may be meant by a misspelt name."""
 _AS_GIVEN: Final = ("name", "frames_every", "frame_format", "shard", "steps", "on_error", "run_id")
 _DEFAULT_PACKING: Final = RecordingSection()
 Arguments = dict[str, Any]
@@ -51,7 +51,7 @@ class PackingOptions(TypedDict, total=False):
 
 
 class OwnRunOptions(PackingOptions, total=False):
-    """Those and the ones of a process that begins a run."""
+    """The arguments of a process that begins a run."""
 
     name: str | None
     seed: int | None
@@ -98,7 +98,7 @@ class Options:
     frames_every: int = 0
     frame_format: str = "png"
     frames_of: tuple[int, ...] | None = None
-    """The environments of a vector of which frames are recorded; None for all."""
+    """The environments of a vector that are drawn; None for all."""
     packing: RecordingSection = field(default_factory=RecordingSection)
     join: Run | None = None
     """The run that this process records a shard of."""
@@ -174,7 +174,7 @@ def options_of(
     """Return the options for the arguments of `record`.
 
     Args:
-        frames_of: the environments of a vector of which frames are recorded.
+        frames_of: the environments of a vector that are drawn; None for all.
         valid: the names of the arguments that the function has.
 
     Raises:

@@ -14,7 +14,7 @@ from runner.recording.metrics import METRICS, RECENT_EPISODES, defined_metrics, 
 from runner.recording.schema import Topic
 
 MAX_NAMES: Final = 64
-"""The most names whose last logged value is in a summary."""
+"""The most names with their last logged value in a summary."""
 MAX_TRIALS: Final = 1 << 17
 """The most trials of an evaluation that are in a summary, the last ones."""
 
@@ -40,7 +40,7 @@ class Outcomes:
         self._logged: dict[str, float | None] = {}
 
     def take_records(self, topic: Topic, records: NDArray[np.void]) -> None:
-        """Add the records of episodes among those that the recorder gets."""
+        """Add what the recorder gets, if it is records of episodes."""
         if topic.name == schema.TRAIN_EPISODE.name:
             self._trained += len(records)
             last = records[-RECENT_EPISODES:]

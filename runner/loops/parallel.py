@@ -167,8 +167,8 @@ def record_aec(env: object, recordings: str | os.PathLike[str] | None = None, **
                 observation, reward, terminated, truncated, info = env.last()
                 env.step(None if terminated or truncated else choose(observation))
 
-    A recorded step is that of one agent, with the rewards of all agents for this step alone and what each
-    can observe after it; steps with None, which only remove an agent, are not recorded.
+    A recorded step is the step of one agent, with the rewards of all agents for this step alone and what
+    each can observe after it; steps with None, which only remove an agent, are not recorded.
 
     Args:
         env: a `pettingzoo.AECEnv`.

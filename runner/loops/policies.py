@@ -79,7 +79,7 @@ def play_checkpoint(
     """Play a checkpoint in the recorded environment; return the run that it was recorded in.
 
     Args:
-        recordings: the recordings folder of the new run, whose settings name the run, step and digest.
+        recordings: the recordings folder of the new run; its settings name the run, step and digest.
         seed: of the first reset; the following ones have the next numbers.
         trust: whether to import what the recording names, and to load a pickle.
 

@@ -220,7 +220,7 @@ class Recorded:
         Args:
             seeds: of all environments; empty for none.
             recorded: the options that are recorded.
-            arguments: of the environment's `reset`, which may not have those that are None.
+            arguments: of the environment's `reset`; None is left out, as it may lack that argument.
         """
         text = self._messages.options_text(recorded)
         states = self._watch.before_reset(environments, seeds)

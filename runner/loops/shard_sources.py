@@ -49,8 +49,8 @@ UNIT: Final = np.dtype(
     ]
 )
 """A unit: `key` is how many training steps of the whole run it comes after; `position`, `reset`, `first` and
-`stop` (steps of the phase) are as its process counted them, `steps` those that it took; the `new_` ones are
-its numbers in the run."""
+`stop` (steps of the phase) are as its process counted them, `steps` is how many it took; the `new_`
+fields are its numbers in the run."""
 _RESET: Final = ("reset", "step", "environment", "log_time")
 
 
@@ -60,7 +60,7 @@ class Source:
     Args:
         name: of the shard; empty for the process that began the run.
         number: its place among the processes of the run.
-        environment: the number of its first environment among those of the run.
+        environment: the number that its first environment has in the run.
         is_placed: whether its process stated after how many training steps of the run it recorded.
         stated: the number of messages of each topic, as its process stated it at its end; empty if it was
             killed.
@@ -82,7 +82,7 @@ class Source:
         self.stops = {phase: self._stop(phase) for phase in PHASES}
         """Steps of each phase."""
         self.only_resets = {phase: self._only_resets(phase) for phase in PHASES}
-        """The numbers of those at which an environment was only reset."""
+        """The numbers of the steps at which an environment was only reset."""
         self.taken = {phase: self.stops[phase] - len(self.only_resets[phase]) for phase in PHASES}
         self.units = {phase: self._units(phase) for phase in PHASES}
 
@@ -180,10 +180,10 @@ class Source:
 
 
 def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, str]]:
-    """Open what each process of a run recorded; leave out those that joined and recorded nothing.
+    """Open what each process of a run recorded; leave out processes that joined and recorded nothing.
 
-    Returns also why recordings are to be kept, by name: those that cannot be folded, and those of which it is
-    not known how much they lack.
+    Returns also why recordings are to be kept, by name: they cannot be folded, or it is not known how much
+    they lack.
 
     Raises:
         RecordingError: a recording is damaged, and can be repaired.

@@ -93,9 +93,9 @@ class StepBuffer:
         self._ends: Flags = np.zeros((0, 2, self._n), np.bool_)
         """[rows, 2, N]: whether each row terminated, and truncated, the episodes."""
         self._over: Flags = np.zeros(self._n, np.bool_)
-        """[N]: the environments whose episodes were over before the block."""
+        """[N]: whether the episode of an environment was over before the block."""
         self._ended, self._counted = 0, 0
-        """Ends of episodes in the block, and in a vector the rows of which they were counted."""
+        """Ends of episodes in the block; in a vector, how many rows are counted so far."""
         self._idle_at, self._last_position = 0, 0
         """The last row before which no episode is in progress, -1 for none in the block; and the steps of the
         run up to the last committed row: of this phase, in a vector of either."""
@@ -130,14 +130,14 @@ class StepBuffer:
 
     @property
     def filled(self) -> int:
-        """Rows of single environments that the recorder does not have yet, also those that only reset one."""
+        """Rows of single environments that the recorder does not have yet, with rows that only reset."""
         return self._filled * self._n
 
     @property
     def progress(self) -> tuple[int, int]:
         """The steps of the phase so far, and the number of an episode.
 
-        Of one environment alone that of the last step, else that of the next episode to end.
+        Of one environment alone, the episode of the last step; else the next episode to end.
         """
         if self._batch and self._counted < self._filled:
             self._ended += int(np.count_nonzero(self._ends[self._counted : self._filled].any(axis=1)))
@@ -156,7 +156,7 @@ class StepBuffer:
 
     @property
     def over(self) -> Flags:
-        """[N]: the environments whose episode ended with the last step and that were not reset since."""
+        """[N]: whether an episode ended with the last step and was followed by no reset."""
         over: Flags = self._ends[self._filled - 1].any(axis=0) if self._filled else self._over.copy()
         resets = self._resets[: self._waiting]
         over[resets["environment"][resets["row"] == self._filled] % self._n] = False
@@ -358,7 +358,7 @@ class StepBuffer:
             seeds: of all environments; empty for none.
             environments: their numbers.
             states: what the reset depended on, by environment, as far as it is to be recorded.
-            options: those of the reset as JSON; empty for none.
+            options: of the reset, as JSON; empty for none.
 
         Raises:
             RecordingError: an observation is none of the space, or a seed has too many digits.
@@ -486,7 +486,7 @@ class StepBuffer:
         terminated: object,
         truncated: object,
     ) -> None:
-        """Put down a step of a game; of one environment alone, one that is not as expected."""
+        """Put down a step of a game, or of one environment alone if a value is not as expected."""
         if self._bytes is not None and action.__class__ is bytes:
             start = row * (len(self._bytes) // len(self._ends))
             self._bytes[start : start + len(action)] = action
@@ -572,7 +572,7 @@ class StepBuffer:
             return was_reset | marks["begins"], False, marks["over"]
         over = np.vstack([self._over, self._ends[: self._filled - 1].any(axis=1)])
         only_reset: Flags = over & ~was_reset & (self._mode == AutoresetMode.NEXT_STEP)
-        # They come after those that the user called before the step.
+        # They come after the resets that the user's loop called before the step.
         rows, environments = np.nonzero(only_reset)
         start = self._waiting
         self._add_resets(rows, environments, self._observations[rows, environments])
@@ -613,7 +613,7 @@ class StepBuffer:
         return columns
 
     def _counts(self, mdp: Mdp, columns: Columns) -> Ints:
-        """Return the events and penalties of each step, and count those that the table excludes."""
+        """Return the events and penalties of each step, and count the rewards that the table excludes."""
         names = ("state", "action", "next_state")
         transitions = (columns[name].ravel().astype(np.int64, copy=False) for name in names)
         counts, excluded = step_counts(mdp, self._rewards[: self._filled, 0], *transitions)

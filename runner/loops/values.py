@@ -73,7 +73,7 @@ def check_log_name(name: object, value: object) -> None:
 
 
 def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
-    """Yield the arrays of a snapshot: the value itself, or those of a mapping as `name/key`.
+    """Yield the arrays of a snapshot: the value itself, or the arrays of a mapping as `name/key`.
 
     Raises:
         ConfigError: a value holds something else than numbers, or too many.

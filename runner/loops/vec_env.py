@@ -20,7 +20,7 @@ class VecEnvVector(AnyVectorEnv):
     rounded for `native`.
 
     Args:
-        base: the `VecEnv`. Its methods are those that it has now: they may be replaced afterwards.
+        base: the `VecEnv`. The methods that it has now are called, also when they are replaced afterwards.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012

@@ -169,7 +169,7 @@ def record_vector(
         with runner.record_vector(gymnasium.make_vec("CartPole-v1", 8), config={"lr": 3e-4}) as envs:
             observations, infos = envs.reset(seed=0)
 
-    All environments are recorded into one run, whose step number n was taken in environment n modulo their
+    All environments are recorded into one run: its step number n was taken in environment n modulo their
     number. Resets that the environments do by themselves (`AutoresetMode`) are recorded as resets.
 
     Args:

@@ -35,8 +35,8 @@ OBSERVERS: Final = frozenset(
 def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]) -> dict[str, object]:
     """Return the fields of an `EnvSpec` that describe wrappers, given from the innermost out.
 
-    Those that the entry point itself puts around its environment are only counted: it does so again. The
-    next three are fields of their own if they are those of `gymnasium.make`.
+    Wrappers that the entry point itself puts around its environment are only counted: it does so again. The
+    wrappers that `gymnasium.make` adds next are fields of their own.
     """
     left = list(wrappers)
     inner = 0

@@ -236,7 +236,7 @@ class Replay:
         return rows if len(index) == len(rows) else rows[index], list(zip(places, resets, strict=True))
 
     def _part(self, whole: Returned, environment: int) -> Returned:
-        """Return what came of the steps of one environment, of those of `ALL`."""
+        """Return the part of one environment of what came of all."""
         n = self._recording.environments
         resets = [placed for placed in whole.resets if placed[1].environment == environment]
         starts = [start for start in whole.starts if start.reset.environment == environment]
@@ -258,7 +258,7 @@ class Replay:
         return self._key(phase, environment) in self._known
 
     def _key(self, phase: str, environment: int) -> _Key:
-        """Return the same for both phases if they are of one environment."""
+        """Return a key of an environment, the same for both phases if both use it."""
         return (phase if self._is_separate else "", environment)
 
     def _adapt(self, seconds: float, frames: Sequence[Frame] | None) -> None:
@@ -405,7 +405,7 @@ class RerunComparison:
         return (digest, "digest") if digest is not None and (first is None or digest < first[0]) else first
 
     def _first_start(self, starts: Sequence[Start]) -> int | None:
-        """Return the number of the first reset whose observation differs; None if none does."""
+        """Return the number of the first reset with another observation; None if all are equal."""
         if not starts:
             return None
         values = np.empty((2, len(starts)), self._recording.train.resets.row_dtype["observation"])

@@ -63,8 +63,8 @@ def rerun(
     Args:
         recording: of a loop.
         phase: `train` or `eval`; None for both, in the order of time, without `episodes`.
-        episodes: numbers of ended episodes of the phase, in any order; of a single environment also that of
-            the last, unfinished one. None for all that happened, in the order of time.
+        episodes: numbers of ended episodes of the phase, in any order; of a single environment also the
+            last, unfinished episode. None for all that happened, in the order of time.
         render: whether to draw a picture after each reset and step.
         trust: whether what the recording names may be imported, see `runner.replay.trust`.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
@@ -178,8 +178,8 @@ def _rerun_path(path: Path, phase: str | None, episodes: Sequence[int] | None, *
 _HELD_STEPS: Final = 64
 _HELD_SECONDS: Final = 0.3
 _HELD_BYTES: Final = 32 << 20
-"""An episode counts as begun in the right state if this many steps agree, or those of this time, or as many
-as have pictures of this size."""
+"""An episode counts as begun in the right state once this many steps agree, or the steps of this many
+seconds, or steps with this many bytes of pictures."""
 
 
 OnReset = Callable[[Stepper, Iterator[object]], None]

@@ -43,7 +43,7 @@ class RecordedReset(NamedTuple):
     seed: int | None
     options: dict[str, object] | None = None
     state: ResetState | None = None
-    """What it depends on, if it has no seed and this was recorded."""
+    """What the reset depends on, if it has no seed and this was recorded."""
 
     def value(self, recording: Recording) -> Value:
         """Return the observation as a value of its space."""
@@ -78,7 +78,7 @@ class Piece:
     rows: NDArray[np.void]
     """The records, [steps of each environment * environments]; values of varying size are objects."""
     resets: Sequence[RecordedReset]
-    """In order; those of a piece with steps come before one of them."""
+    """In order; in a piece with steps, each comes before one of the steps."""
     time: int
     """Nanoseconds before its first step, or at its resets."""
 
@@ -113,7 +113,7 @@ def pieces(
 
 
 def _in_turn(resets: list[Piece], last_phase: str) -> list[Piece]:
-    """Return resets of one time in their order: those of the phase that took the last step came first."""
+    """Return resets of one time in their order: the phase that took the last step reset first."""
     return sorted(resets, key=lambda piece: piece.phase != last_phase)
 
 
@@ -229,7 +229,7 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
 
 
 def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: NDArray[np.void]) -> Iterator[Piece]:
-    """Yield resets that no step of their phase follows at once, those of one time together."""
+    """Yield resets that no step of their phase follows at once, the resets of one time together."""
     for time, group in groupby(resets, key=lambda reset: reset.time):
         here = list(group)
         yield Piece(phase, here[0].step, nothing, here, time)

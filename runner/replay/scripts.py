@@ -21,7 +21,7 @@ from runner.errors import CannotRedo
 MAIN: Final = "__main__"
 """The module in which the definitions of a script are."""
 _script: tuple[str, str] = "", ""
-"""Path and digest of the script whose definitions may be used now."""
+"""Path and digest of the script that definitions may be taken from now."""
 _PURE: Final = (
     "collections",
     "dataclasses",

@@ -104,11 +104,11 @@ class StepReplay:
         return self._learner.tables.greedy
 
     def snapshot(self) -> list[NDArray[np.float64]]:
-        """Return all tables in the order of a snapshot, those of one kind together: views."""
+        """Return all tables in the order of a snapshot, the tables of a kind together: views."""
         return self._learner.snapshot()
 
     def rewind(self, step: int, tables: list[NamedTables]) -> None:
-        """Set all tables to those of a step."""
+        """Set all tables to the tables of a step."""
         self._learner.set_tables(tables)
         self.step = step
 

@@ -311,7 +311,7 @@ class GameStepper(Stepper):
 
 
 class VectorStepper(Stepper):
-    """All environments of a vector; rows are those of all of them, in the order of the recording.
+    """All environments of a vector; rows are their steps in the order of the recording.
 
     Args:
         autoreset: `NextStep`, `SameStep` or `Disabled`; with `SameStep`, the picture after the last step of
@@ -325,7 +325,7 @@ class VectorStepper(Stepper):
         self._autoreset, self._drawn = autoreset, drawn
         self._observation = SpaceValues(self.observation_space, "observation")
         self._over = np.zeros(self.n, np.bool_)
-        """The environments whose episode ended with the last step."""
+        """[n]: whether the episode of an environment ended with the last step."""
         self._last: Array = np.zeros(self.n, self._first_dtype)
         """[n]: what the vector returned last."""
 

@@ -217,7 +217,7 @@ def recorded_frames(
     frame, following = None, next(frames, None)
     after_steps = (time + later for time in chain([earliest], times))
     for t, time in enumerate(after_steps if first else chain([earliest], after_steps), first):
-        # After the reset there may be several, of which the last one shows the state; after a step one.
+        # After the reset there may be several frames, the last one shows the state; after a step one.
         while following is not None and following[0] < time:
             frame, following = following[2], next(frames, None)
         if t and following is not None and following[0] == time and not following[1]:
@@ -241,7 +241,7 @@ def frames_every(recording: Recording) -> int:
 
 
 def environments_with_frames(recording: Recording, phase: str) -> Sequence[int]:
-    """Return the environments of which frames were recorded in a phase; of a job none."""
+    """Return the environments that have frames in a phase; a job has none."""
     if not recording.phase(phase).frames:
         return ()
     frames = recording.config.get("frames")

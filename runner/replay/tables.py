@@ -82,7 +82,7 @@ class TableReplay(StepReplay):
         self.advance(step)
 
     def rewind(self, step: int, tables: list[NamedTables]) -> None:
-        """Set all tables to those of a step; from there on no checkpoints are saved."""
+        """Set all tables to the tables of a step; from there on no checkpoints are saved."""
         super().rewind(step, tables)
         self._origin = None
 

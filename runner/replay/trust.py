@@ -44,7 +44,7 @@ PACKAGES: Final = (
     "mpe2",
     "pettingzoo",
 )
-"""Packages whose environments are made without trust, if they are installed."""
+"""Packages: their environments are made without trust, if they are installed."""
 WRAPPERS: Final[Mapping[str, frozenset[str]]] = {
     "gymnasium.wrappers.vector": frozenset(  # before the package that it is in
         [
@@ -148,7 +148,7 @@ SERVED: Final = (
 
 
 def packages() -> tuple[str, ...]:
-    """Return the packages whose environments are made without trust."""
+    """Return the packages with environments that are made without trust."""
     return *PACKAGES, *filter(None, os.environ.get(MORE_PACKAGES, "").split(","))
 
 
