@@ -23,7 +23,6 @@ from runner.loops.options import RecordOptions, options_of
 from runner.loops.recorded import Recorded, require_pictures
 from runner.loops.values import as_given, check_phase
 from runner.loops.wrappers import return_name
-from runner.recording.spaces import Value
 from runner.util.arrays import Flags
 
 if TYPE_CHECKING:
