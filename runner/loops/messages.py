@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 
 from runner.drawing.raster import image_bytes
-from runner.errors import ConfigError
+from runner.errors import ConfigError, shortened
 from runner.loops.checkpointing import content_of
 from runner.loops.media import Picture, media_of
 from runner.loops.options import ALL_INFO, Options, pillow
@@ -24,7 +24,7 @@ from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, topics_of
 from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
-from runner.util.jsonable import as_json, is_packed, packed
+from runner.util.jsonable import as_json, exact_json, is_exact, is_packed, packed
 from runner.util.values import is_utf8
 
 MAX_INFO_BYTES: Final = 4 << 20
@@ -211,16 +211,21 @@ class Messages:
 
     def options_text(self, options: Mapping[str, object] | None) -> str:
         """Return the options of a reset as JSON; empty for none. The environment may change its own."""
-        if not options:
+        if options is None:
             return ""
         try:
             if not isinstance(options, Mapping):
                 raise ValueError(f"found {type(options).__name__}, expected a mapping")
-            text = json.dumps({str(key): as_json(value) for key, value in options.items()})
+            text = json.dumps(exact_json(options))
             if len(text) > MAX_INFO_BYTES:
                 raise ValueError(f"they take more than {MAX_INFO_BYTES:,} bytes of JSON")
         except (ValueError, RecursionError) as error:
             return self._reason("the options of a reset are", error)
+        if not is_exact(text):
+            self._loop.warn_once(
+                f"the options of a reset cannot be recorded exactly: {shortened(text, 200)}. Where a rerun "
+                "differs, they may be the reason. This warning is given once."
+            )
         return text
 
     def _json_of(self, fields: Mapping[str, object]) -> str:

@@ -10,9 +10,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from runner.errors import ConfigError
 from runner.loops.options import Arguments
 from runner.loops.recorded import Recorded
-from runner.loops.values import as_given, warn_user
+from runner.loops.values import as_given
 from runner.loops.vec_env import VecEnvVector
 from runner.loops.vector import record_vector
+from runner.util.jsonable import exact_json
 
 _METHODS = ("reset", "step_async", "step_wait")
 
@@ -81,11 +82,10 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         if self.training_steps is not None:
             self.recorded.at_step(self.training_steps())
         seeds, options = self.base._seeds, self.base._options
-        if any(other != options[0] for other in options):
-            warn_user("The options of resets are not recorded where they differ between environments.")
-            options = [None]
+        are_alike = all(exact_json(own) == exact_json(options[0]) for own in options)
+        given: Any = options[0] or None if are_alike else options  # a list is not recorded, with a warning
         is_seeded = any(seed is not None for seed in seeds)
-        self.recorded.reset(seed=list(seeds) if is_seeded else None, options=options[0] or None)
+        self.recorded.reset(seed=list(seeds) if is_seeded else None, options=given)
         self.reset_infos = self.base.reset_infos
         return self._vector.native
 

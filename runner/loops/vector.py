@@ -136,11 +136,13 @@ class RecordedVector(Recorded, _Wrapper):
         self, *, seed: int | Sequence[int | None] | None = None, options: ResetOptions | None = None
     ) -> ResetResult:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
-        n, mask = self.env.num_envs, (options or {}).get("reset_mask")
-        recorded = {key: value for key, value in (options or {}).items() if key != "reset_mask"}
+        n, mask, given = self.env.num_envs, None, options
+        if isinstance(options, Mapping) and "reset_mask" in options:
+            mask = options["reset_mask"]
+            given = {key: value for key, value in options.items() if key != "reset_mask"} or None
         environments = np.flatnonzero(np.ones(n) if mask is None else mask).tolist()
         seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
-        return self._reset(seeds, environments, recorded, {"seed": seed, "options": options})
+        return self._reset(seeds, environments, given, {"seed": seed, "options": options})
 
     def record_reset(self, observations: object, infos: Info | Sequence[Info]) -> None:
         """Record a reset of all environments that was just done, without seeds and options."""

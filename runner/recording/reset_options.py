@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.messages import decode, encode
+from runner.util.jsonable import is_exact, restored
 
 MAX_DIGITS: Final = 4000
 MAX_LARGE_SEED: Final = 10**MAX_DIGITS - 1
@@ -20,7 +21,8 @@ class ResetOptions(NamedTuple):
     reset: int = -1
     """The number of the reset in its phase, as in `dualtaxi.Reset`."""
     json: str = ""
-    """The options as a JSON object, or as text the reason why they are not recorded; empty for none."""
+    """The options as `exact_json` writes them, or as text the reason why they are not recorded; empty for
+    none."""
     large_seed: int | None = None
     """The seed, if it has more than 64 bits."""
     resets: int = 1
@@ -29,8 +31,13 @@ class ResetOptions(NamedTuple):
     @property
     def options(self) -> dict[str, object] | None:
         """The options; None if there are none, or none that could be recorded."""
-        options = json.loads(self.json) if self.json else None
+        options = restored(json.loads(self.json)) if self.json else None
         return options if isinstance(options, dict) else None
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the options are those that the environment got."""
+        return is_exact(self.json) and (not self.json or self.options is not None)
 
     def to_payload(self) -> bytes:
         """Return the message."""

@@ -209,7 +209,7 @@ class Replay:
             here = [(row - begin, reset) for row, reset in resets if row < end or end == stop]
             resets = resets[len(here) :]
             for _, reset in () if stepper.is_trusted else here:
-                require_plain("option of a reset,", reset.options or {}, {})
+                require_plain("option of a reset,", reset.given.options or {}, {})
             started = time.monotonic()
             returned = stepper.run(block, here)
             self._adapt(time.monotonic() - started, returned.frames if stepper.draws else None)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from runner.environments.games import as_parallel
 from runner.environments.layers import class_name, creator_of, layers_of, name_of
-from runner.errors import CannotRedo
+from runner.errors import CannotRedo, shortened
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
@@ -49,6 +49,9 @@ if TYPE_CHECKING:
 
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
+
+_MAX_OPTIONS: Final = 300
+"""The most characters of the options of a reset in a reason."""
 
 
 def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
@@ -352,6 +355,13 @@ def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust
 
 def why_uncertain(recording: Recording, trust: bool = False) -> str:
     """Return why a difference shows nothing, as some arguments are not known; empty if all are."""
+    for phase in recording.phases:
+        for given in phase.reset_options():
+            if not given.is_exact:
+                return (
+                    f"The options of {phase.title} reset {given.reset:,} could not be recorded exactly; with "
+                    f"{shortened(given.json, _MAX_OPTIONS)} the environment begins in another way."
+                )
     firsts = itertools.accumulate((shard.environments for shard in recording.shards), initial=0)
     makers = [recording.phase(phase).maker_of(first) for first in firsts for phase in schema.PHASES]
     known = [maker for maker in makers if maker is not None and maker.assumed]

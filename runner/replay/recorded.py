@@ -22,6 +22,7 @@ from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
 
 _BLOCK_BYTES: Final = 16 << 20
+_NOTHING_GIVEN: Final = ResetOptions()
 M = TypeVar("M", ResetOptions, ResetState)
 
 
@@ -41,7 +42,8 @@ class RecordedReset(NamedTuple):
     observation: Value
     """As recorded: a NumPy value, or bytes where values vary in size."""
     seed: int | None
-    options: dict[str, object] | None = None
+    given: ResetOptions = _NOTHING_GIVEN
+    """What it was called with besides the seed."""
     state: ResetState | None = None
     """What the reset depends on, if it has no seed and this was recorded."""
 
@@ -129,7 +131,7 @@ def resets_of(
         for number, environment, episode, step, time, seed, seeded, observation in zip(
             *(block[name].tolist() for name in names), block["observation"], strict=True
         ):
-            given = options_of(number) or ResetOptions()
+            given = options_of(number) or _NOTHING_GIVEN
             known_seed = seed if seeded else given.large_seed
             yield RecordedReset(
                 phase,
@@ -140,7 +142,7 @@ def resets_of(
                 time,
                 observation,
                 known_seed,
-                given.options,
+                given,
                 state_of(number),
             )
 
@@ -186,7 +188,7 @@ def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
     call: list[RecordedReset] = []
     for reset in resets:
         is_next = bool(call) and reset.environment > call[-1].environment
-        if call and not (is_next and reset.options == call[-1].options):
+        if call and not (is_next and reset.given.json == call[-1].given.json):
             yield call
             call = []
         call.append(reset)

@@ -150,7 +150,7 @@ class Stepper:
     def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
         """Do the resets before a step."""
         for reset in resets:
-            arguments = {"seed": self._seed(reset), "options": reset.options}
+            arguments = {"seed": self._seed(reset), "options": reset.given.options}
             given = {name: value for name, value in arguments.items() if value is not None}
             k = len(returned.starts)
             self._put_first(k, self.env.reset(**given)[0])
@@ -368,10 +368,12 @@ class VectorStepper(Stepper):
         """Return the arguments of a call of `reset`."""
         environments = [reset.environment for reset in call]
         mask = np.isin(np.arange(self.n), environments)
-        options = dict(call[0].options or {}) | ({} if mask.all() else {"reset_mask": mask})
+        options = call[0].given.options
+        if not mask.all():
+            options = (options or {}) | {"reset_mask": mask}
         seeds = {reset.environment: self._seed(reset) for reset in call}
         first = seeds[environments[0]]
-        arguments: dict[str, object] = {"options": options} if options else {}
+        arguments: dict[str, object] = {} if options is None else {"options": options}
         if all(seed is None for seed in seeds.values()):
             return arguments
         # Not every vector takes a list

@@ -21,6 +21,8 @@ from multiprocessing import parent_process
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from runner.environments.layers import name_of, top_package
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker
@@ -257,7 +259,9 @@ def require_plain(
 
 
 def _is_plain(value: object) -> bool:
-    """Return whether a JSON value is a number, a truth value or null, or a list of such."""
+    """Return whether a value is a number, a truth value, null, an array of numbers, or a list of such."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.size <= _MAX_ITEMS and value.dtype.kind in "biuf"
     if isinstance(value, list | tuple):
         return len(value) <= _MAX_ITEMS and all(map(_is_plain, value))
     return value is None or isinstance(value, int | float) or value == {}

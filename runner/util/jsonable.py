@@ -7,7 +7,7 @@ import dataclasses
 import math
 import os
 from argparse import Namespace
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import Enum
 from types import SimpleNamespace
 from typing import Any, Final
@@ -20,6 +20,8 @@ MAX_VALUES: Final = 4_000_000
 _MAX_REPR: Final = 10_000
 _MAX_LISTED: Final = 64
 """The most numbers of an array that are written as a list where arrays may be packed."""
+_COLLECTIONS: Final[Mapping[type, str]] = {tuple: "$tuple", set: "$set", frozenset: "$frozenset"}
+_INEXACT: Final = "$inexact"
 
 
 def as_json(value: object, packs: bool = False) -> Any:
@@ -61,13 +63,88 @@ def unpacked(value: Any) -> Any:
         return value
     if value.keys() != {"dtype", "shape", "base64"}:
         return {key: unpacked(part) for key, part in value.items()}
+    return _array_of(value)
+
+
+def _array_of(value: Any) -> Array:
     try:
         dtype = np.dtype(value["dtype"])
         if dtype.kind not in "biuf":
             raise ValueError(f"found {dtype}, expected numbers")
         return np.frombuffer(binascii.a2b_base64(value["base64"]), dtype).reshape(value["shape"]).copy()
-    except TypeError as error:
+    except (KeyError, TypeError) as error:
         raise ValueError(f"found {error}, expected dtype, shape and base64 of an array") from error
+
+
+def exact_json(value: Any) -> Any:
+    """Return a value as JSON from which `restored` makes the same one.
+
+    What JSON lacks is an object with one key, such as `{"$tuple": [1, 2]}`. What `restored` could not make
+    is written as by `as_json`, and `is_exact` is then false.
+
+    Raises:
+        ValueError: the value contains itself, or more than 4,000,000 values.
+        RecursionError: it is nested too deeply.
+    """
+    as_json(value)  # raises for what stands for endless JSON
+    return _exact(value)
+
+
+def _exact(value: Any) -> Any:
+    kind = type(value)
+    if value is None or kind in (bool, int, str) or (kind is float and math.isfinite(value)):
+        return value
+    if kind is list:
+        return [_exact(part) for part in value]
+    if kind is dict and all(type(key) is str and not key.startswith("$") for key in value):
+        return {key: _exact(part) for key, part in value.items()}
+    content: object
+    if kind in _COLLECTIONS:
+        parts = value if kind is tuple else sorted(value, key=repr)
+        tag, content = _COLLECTIONS[kind], [_exact(part) for part in parts]
+    elif kind is dict:
+        tag, content = "$dict", [[_exact(key), _exact(part)] for key, part in value.items()]
+    elif kind is float:
+        tag, content = "$float", repr(value)
+    elif (kind is np.ndarray or isinstance(value, np.generic)) and value.dtype.kind in "biuf":
+        tag, content = "$array" if kind is np.ndarray else "$number", packed(value)
+    else:
+        tag, content = _INEXACT, as_json(value)
+    return {tag: content}
+
+
+def is_exact(text: str) -> bool:
+    """Return whether a JSON text of `exact_json` holds the value exactly."""
+    return f'{{"{_INEXACT}": ' not in text  # in a text within it the quotes are escaped
+
+
+_RESTORED: Final[Mapping[str, Callable[[Any], object]]] = {
+    **{tag: kind for kind, tag in _COLLECTIONS.items()},
+    "$float": float,
+    "$dict": dict,
+    "$array": _array_of,
+    "$number": lambda content: _array_of(content)[()],
+    _INEXACT: lambda content: content,
+}
+
+
+def restored(value: Any) -> Any:
+    """Return the value that `exact_json` wrote.
+
+    Raises:
+        ValueError: `exact_json` writes no such JSON.
+    """
+    if isinstance(value, list):
+        return [restored(part) for part in value]
+    if not isinstance(value, dict):
+        return value
+    tag, content = next(iter(value.items()), ("", None))
+    if len(value) > 1 or tag not in _RESTORED:
+        return {key: restored(part) for key, part in value.items()}
+    try:
+        return _RESTORED[tag](restored(content))
+    except TypeError as error:
+        raise ValueError(f"found {error}, expected the content of {tag}") from error
 
 
 def as_mapping(value: object) -> Mapping[Any, Any] | None:

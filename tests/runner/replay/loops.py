@@ -6,6 +6,7 @@ import contextlib
 import multiprocessing
 import os
 import time
+import zlib
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -75,6 +76,17 @@ class Counter(gymnasium.Env[Any, Any]):
 
     def reward(self) -> float:
         return 1.0
+
+
+class Telling(Counter):
+    """Begins at a number that tells which options of which types it got."""
+
+    observation_space = spaces.Box(0, 2.0**32, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[Any, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        self.start = float(zlib.crc32(repr(options).encode()))
+        return np.array([self.start]), {}
 
 
 def counters() -> SyncVectorEnv:

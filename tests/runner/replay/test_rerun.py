@@ -185,6 +185,42 @@ def test_options_and_large_seeds_of_resets_in_a_vector_are_given_again(tmp_path)
     assert rerun_steps(envs.run.recording, trust=True) == (90, None)
 
 
+OPTIONS = [
+    {},
+    {"start": (1, (2, [3])), "$start": 4},
+    {0: "a", (1, 2): {None: True}},
+    {"of": {3, 4}, "also": frozenset({"x"}), "text": "\ud800"},
+    {"array": np.arange(6, dtype=np.int16).reshape(2, 3), "empty": np.zeros((0, 2), np.float32)},
+    {"number": np.float32(0.1), "flag": np.bool_(True), "high": float("inf"), np.int64(3): -0.0},
+]
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=lambda options: str(list(options)))
+def test_options_come_back_with_the_types_that_the_environment_got(options, tmp_path):
+    vector = SyncVectorEnv([loops.Telling] * 2, autoreset_mode=AutoresetMode.DISABLED)
+    recorders = (runner.record(loops.Telling(), tmp_path), runner.record_vector(vector, tmp_path))
+    for recorded, action in zip(recorders, (0, np.zeros(2, np.int64)), strict=True):
+        with recorded:
+            recorded.reset(seed=1, options=options)
+            recorded.step(action)
+        found = verify(recorded.run.recording, trust=True)
+        assert (found.verdict, found.finding) == ("reproduced", "")
+
+
+@pytest.mark.parametrize("options", [{"deep": [{"thing": 3j}]}, {"loop": [[]]}], ids=["kind", "size"])
+def test_a_difference_proves_nothing_if_options_could_not_be_recorded(options, tmp_path):
+    if "loop" in options:
+        options["loop"].append(options["loop"])
+    with runner.record(loops.Telling(), tmp_path) as recorded:
+        recorded.reset(seed=1)
+        with pytest.warns(RuntimeWarning, match="the options of a reset"):
+            recorded.reset(seed=1, options=options)
+        recorded.step(0)
+    found = verify(recorded.run.recording, trust=True)
+    assert (found.verdict, found.act) == ("consistent", "checked")
+    assert "The options of training reset 1 could not be recorded exactly" in found.reason
+
+
 def test_options_that_the_environment_changes_are_recorded_as_they_were(tmp_path):
     class Taking(loops.Counter):
         def reset(self, *, seed=None, options=None):
