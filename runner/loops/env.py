@@ -57,7 +57,7 @@ class RecordedEnv(RecordedAlone, gymnasium.Wrapper[object, object, object, objec
                     return result
                 rows.take(given, observation, reward, terminated, truncated)
                 if extras is not None:
-                    self._put_extras(extras)
+                    self._take_extras(extras)
             finally:
                 loop.lock.release()
             if self._has_messages:

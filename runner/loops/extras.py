@@ -69,11 +69,14 @@ class PendingExtras:
     """The extras of a loop that the recorder does not have yet; the caller holds the loop's lock.
 
     Args:
+        leave_out: called with the error of each value that cannot be recorded; the others of its step are.
         batch: (N,) for N environments that step at once, with values [N, ...]; else ().
     """
 
-    def __init__(self, recorder: Recorder, batch: tuple[int, ...] = ()) -> None:
-        self._recorder, self._batch = recorder, batch
+    def __init__(
+        self, recorder: Recorder, leave_out: Callable[[Exception], None], batch: tuple[int, ...] = ()
+    ) -> None:
+        self._recorder, self._leave_out, self._batch = recorder, leave_out, batch
         self._n = batch[0] if batch else 1
         self._taken = recorder.steps
         self._described: dict[str, Description] = {}
@@ -107,7 +110,7 @@ class PendingExtras:
         def take(values: Mapping[str, Value]) -> None:
             if not values:
                 return
-            row = len(steps)
+            row, name = len(steps), ""
             try:
                 for name, value in values.items():
                     dtype, shape, scalars, cells, fit = columns[name]
@@ -116,11 +119,16 @@ class PendingExtras:
                     )
                     cells[row] = value if is_fitting else fit(row, value)
             except (AttributeError, KeyError):  # no mapping, a new name, or values of another length
-                self._grow(row, values)
-                take(values)
+                take(self._grow(row, values))
                 return
-            except OverflowError as error:
-                raise ConfigError(f"extras: found {value} for {name!r}, which {dtype} cannot hold") from error
+            except (OverflowError, ConfigError) as error:
+                self._leave_out(
+                    ConfigError(f"extras: found {value} for {name!r}, which {dtype} cannot hold")
+                    if isinstance(error, OverflowError)
+                    else error
+                )
+                take({other: value for other, value in values.items() if other != name})
+                return
             if not row:
                 self._phase = phase
             steps.append(taken[phase] + rows.filled - n)
@@ -146,13 +154,18 @@ class PendingExtras:
         if not self._steps or self._steps[-1] != step:
             self.taker(phase, rows)(values)
             return
-        self._grow(len(self._steps) - 1, values)
+        values = self._grow(len(self._steps) - 1, values)
         row = len(self._steps) - 1
-        fitting = {name: self._columns[name].fit(row, value) for name, value in values.items()}
+        fitting = {}
+        for name, value in values.items():
+            try:
+                fitting[name] = self._columns[name].fit(row, value)
+            except ConfigError as error:
+                self._leave_out(error)
         for name, value in fitting.items():
             self._columns[name].values[row] = value
         if row in self._partial:
-            self._partial[row].update(values)
+            self._partial[row].update(fitting)
 
     def checked_batch(self, values: Mapping[str, object], shape: tuple[int, ...]) -> dict[str, Array]:
         """Return the values of T steps of N environments, by name, as `put_batch` takes them.
@@ -162,9 +175,9 @@ class PendingExtras:
             shape: T and N.
 
         Raises:
-            ConfigError: a name or a value cannot be recorded.
+            ConfigError: they are too large together.
         """
-        self._grow(len(self._steps), values, shape)
+        values = self._grow(len(self._steps), values, shape)
         sizes = np.full(shape[0] * self._n, self._fixed_bytes)
         flat = {}
         for name, value in values.items():
@@ -176,7 +189,7 @@ class PendingExtras:
                 assert isinstance(whole, np.ndarray)
                 flat[name] = whole.reshape(len(sizes), *whole.shape[2:])
         if sizes.max() > MAX_EXTRA_BYTES:
-            raise _too_large(int(sizes.max()))
+            raise _too_large(", ".join(flat), int(sizes.max()))
         return flat
 
     def put_batch(self, phase: str, rows: StepBuffer, values: Mapping[str, Array]) -> None:
@@ -195,33 +208,28 @@ class PendingExtras:
         given = {name: np.full(count, name in values) for name in self._columns}
         self._send(np.arange(first, first + count), columns, given)
 
-    def _grow(self, row: int, values: Mapping[str, object], lead: tuple[int, ...] | None = None) -> None:
+    def _grow(self, row: int, values: Any, lead: tuple[int, ...] | None = None) -> Mapping[str, object]:
         """Add the names that are new, and let arrays vary in length that have another one for the first time.
+
+        Returns the values that can be recorded.
 
         Args:
             row: the first row that may have them.
             values: [*lead, ...] each; by default of one step.
-
-        Raises:
-            ConfigError: a name or a value cannot be recorded.
         """
         if not isinstance(values, Mapping):
-            raise ConfigError(f"extras: found {type(values).__name__}, expected values by name")
-        lead = self._batch if lead is None else lead
-        described = self._described | {
-            name: _needed(name, self._described.get(name), value, lead) for name, value in values.items()
-        }
+            self._leave_out(ConfigError(f"extras: found {type(values).__name__}, expected values by name"))
+            return {}
+        described, size = self._descriptions(values, self._batch if lead is None else lead)
+        fitting = {name: value for name, value in values.items() if name in described}
+        described = self._described | described
         if described == self._described:
-            return
+            return fitting
         self._write(row)  # with the names so far, which begins a layout if they are new
-        if len(described) > MAX_NAMES or self._layout.number + 1 == schema.MAX_LAYOUTS:
-            raise ConfigError(
-                f"extras: found more than {MAX_NAMES} names, or {schema.MAX_LAYOUTS} steps with names that "
-                f"were new or began to vary in length, the last {list(values)[-1]!r}"
-            )
-        size = sum(dtype.itemsize for dtype in map(leaf_dtype, described.values()) if dtype is not None)
-        if size > MAX_EXTRA_BYTES:
-            raise _too_large(size)
+        if self._layout.number + 1 == schema.MAX_LAYOUTS:
+            changed = [name for name in fitting if self._described.get(name) != described[name]]
+            self._leave_out(_too_many(changed[0]))
+            return {name: value for name, value in fitting.items() if name not in changed}
         if self._steps:
             self._partial.setdefault(0, set(self._described))
         self._fixed_bytes, self._described = size, described
@@ -238,6 +246,28 @@ class PendingExtras:
             else:
                 for k in range(left):
                     column.values[k] = column.fit(k, before.values[k])
+        return fitting
+
+    def _descriptions(
+        self, values: Mapping[str, object], lead: tuple[int, ...]
+    ) -> tuple[dict[str, Description], int]:
+        """Return the descriptions of the values that can be recorded, and the bytes of all of one size."""
+        described, size, names = dict[str, Description](), self._fixed_bytes, set(self._described)
+        for name, value in values.items():
+            known = self._described.get(name)
+            try:
+                needed = _needed(name, known, value, lead)
+                larger = size + _fixed_size(needed) - _fixed_size(known)
+                if larger > MAX_EXTRA_BYTES:
+                    raise _too_large(name, larger)
+                if len(names | {name}) > MAX_NAMES:
+                    raise _too_many(name)
+            except ConfigError as error:
+                self._leave_out(error)
+                continue
+            described[name], size = needed, larger
+            names.add(name)
+        return described, size
 
     def _column(self, name: str, description: Description) -> _Column:
         """Return a column for values of a description."""
@@ -280,7 +310,8 @@ class PendingExtras:
                 self._held_row, self._row_bytes = row, {}
             self._row_bytes[name] = max(map(len, data))
             if (size := self._fixed_bytes + sum(self._row_bytes.values())) > MAX_EXTRA_BYTES:
-                raise _too_large(size)
+                del self._row_bytes[name]
+                raise _too_large(name, size)
             self._held += sum(map(len, data))
             if self._held > _MAX_BYTES:
                 self._max_rows = min(self._max_rows, row)
@@ -386,10 +417,23 @@ def blank_extras(description: Description, count: int) -> Array:
     return _objects([NOTHING] * count) if dtype is None else np.zeros(count, dtype)
 
 
-def _too_large(size: int) -> ConfigError:
+def _fixed_size(description: Description | None) -> int:
+    """Return the bytes of a step's values of one size."""
+    dtype = None if description is None else leaf_dtype(description)
+    return 0 if dtype is None else dtype.itemsize
+
+
+def _too_large(name: str, size: int) -> ConfigError:
     return ConfigError(
-        f"extras: found {size:,} bytes a step, expected at most {MAX_EXTRA_BYTES:,}; snapshot() records a "
-        "larger array now and then."
+        f"extras: found {size:,} bytes a step, expected at most {MAX_EXTRA_BYTES:,}: {name!r} is too large. "
+        "snapshot() records a larger array now and then."
+    )
+
+
+def _too_many(name: str) -> ConfigError:
+    return ConfigError(
+        f"extras: found more than {MAX_NAMES} names, or {schema.MAX_LAYOUTS} steps with names that were new "
+        f"or began to vary in length, the last {name!r}"
     )
 
 
@@ -400,7 +444,7 @@ def _values(name: str, value: object, lead: tuple[int, ...]) -> _Values:
         ConfigError: it holds something else, or not as many.
     """
     if not lead:
-        return [value] if isinstance(value, str) else _numbers(name, value)
+        return [value] if isinstance(value, str) else _numbers(repr(name), value)
     try:
         array = as_array(value)
     except (TypeError, ValueError, RuntimeError, OverflowError):
@@ -416,8 +460,12 @@ def _values(name: str, value: object, lead: tuple[int, ...]) -> _Values:
             if not (is_array or isinstance(item, list | tuple)) or len(item) != n:
                 raise _wrong_shape(name, f"{type(item).__name__} {str(item)[:40]!r}", lead)
         items = [part for item in items for part in item]
-    items = [item if isinstance(item, str) else _numbers(name, item) for item in items]
-    if len({np.shape(item) for item in items}) == 1 and not isinstance(items[0], str) and items[0].size:
+    items = [
+        item if isinstance(item, str) else _numbers(_place(name, i, lead), item)
+        for i, item in enumerate(items)
+    ]
+    has_text = any(isinstance(item, str) for item in items)
+    if len({np.shape(item) for item in items}) == 1 and not has_text and items[0].size:
         return np.stack(items).reshape(*lead, *items[0].shape)
     return items
 
@@ -465,20 +513,20 @@ def _needed(name: object, known: Description | None, value: object, lead: tuple[
 def _described(name: str, values: _Values, lead: tuple[int, ...]) -> Description:
     """Return the description of the first values of a name."""
     if isinstance(values, list):
-        if all(isinstance(item, str) for item in values):
-            return {"type": "Text"}
-        if any(isinstance(item, str) or not item.ndim for item in values):
+        kinds = ["" if np.shape(item) == (0,) else _kind(item) for item in values]  # "" fits any array
+        common = max(kinds, key=lambda kind: (kind != "", kinds.count(kind)))
+        are_texts, are_numbers = common == "a text", common == "a number"
+        odd = [k for k, kind in enumerate(kinds) if kind != common and (kind or are_texts or are_numbers)]
+        if odd:
             raise ConfigError(
-                f"extras: found values of different kinds for {name!r}, expected texts or arrays"
+                f"extras: found {kinds[odd[0]] or 'an empty array'} for {_place(name, odd[0], lead)}, and "
+                f"{common} for others; expected texts, or arrays that differ in their first axis only"
             )
+        if are_texts:
+            return {"type": "Text"}
         shapes = {item.shape[1:] for item in values if item.shape != (0,)} or {()}
-        if len(shapes) == 1:
-            dtype = np.result_type(*(item.dtype for item in values))
-            return lengthened(box_of(dtype.newbyteorder("<"), (0, *shapes.pop())))
-        raise ConfigError(
-            f"extras: found arrays of other shapes than each other for {name!r}, expected arrays that differ "
-            "in their first axis only"
-        )
+        dtype = np.result_type(*(item.dtype for item in values))
+        return lengthened(box_of(dtype.newbyteorder("<"), (0, *shapes.pop())))
     shape = values.shape[len(lead) :]
     if 0 in shape[1:] or values.ndim > _MAX_DIMENSIONS:
         raise ConfigError(
@@ -487,6 +535,13 @@ def _described(name: str, values: _Values, lead: tuple[int, ...]) -> Description
         )
     box = box_of(values.dtype.newbyteorder("<"), shape)
     return lengthened(box) if shape[:1] == (0,) else box
+
+
+def _kind(item: str | Array) -> str:
+    """Return what one value is, for an error."""
+    if isinstance(item, str):
+        return "a text"
+    return f"an array of shape ({', '.join(['T', *map(str, item.shape[1:])])})" if item.ndim else "a number"
 
 
 def _named(description: Description) -> str:
@@ -507,9 +562,14 @@ def _wrong_shape(name: str, given: str, lead: tuple[int, ...]) -> ConfigError:
     )
 
 
-def _numbers(name: str, value: object) -> Array:
+def _place(name: str, i: int, lead: tuple[int, ...]) -> str:
+    """Return the name of a value, with the environment of the i-th one if there are several."""
+    return f"{name!r} of environment {i % lead[-1]}" if lead else repr(name)
+
+
+def _numbers(place: str, value: object) -> Array:
     if isinstance(value, list | tuple) and not value:
         return np.zeros(0, np.bool_)  # which fits into any dtype
     return numbers_of(
-        value, "extras", f"for {name!r}", "a number or an array of numbers, of one shape, or a text"
+        value, "extras", f"for {place}", "a number or an array of numbers, of one shape, or a text"
     )

@@ -64,7 +64,9 @@ class Loop:
         self._failure = ""
         """Why recording stopped, if it did and `on_error` is "warn"."""
         self._warnings: set[str] = set()
-        self.extras = PendingExtras(self._recorder, () if mode is None else (described.environments,))
+        self.extras = PendingExtras(
+            self._recorder, self.leave_out, () if mode is None else (described.environments,)
+        )
         self.messages = Messages(
             self,
             self._recorder,

@@ -58,7 +58,7 @@ class RecordedParallel(RecordedAlone):
                 over = not self.env.agents
                 self._rows.take_game(given, observations, rewards, terminated, truncated, over)
                 if extras is not None:
-                    self._put_extras(extras)
+                    self._take_extras(self._extras_by_name(extras))
             if self._options.info:
                 self._messages.info(self._phase, self._info_by_field(infos))
             if self._options.frames_every:
@@ -69,14 +69,18 @@ class RecordedParallel(RecordedAlone):
 
     def _extras_by_name(self, values: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the values of agents as `agent/name`."""
-        agents = self._loop.described.agents
+        agents, by_name = self._loop.described.agents, dict[str, Value]()
         for agent, named in values.items():
-            if agent not in agents or not isinstance(named, Mapping):
-                raise ConfigError(
+            if agent in agents and isinstance(named, Mapping):
+                by_name |= {f"{agent}/{name}": value for name, value in named.items()}
+                continue
+            self._loop.leave_out(
+                ConfigError(
                     f"extras: found {agent!r}: {type(named).__name__}, expected the values of each agent by "
                     f"name, such as {{{agents[0]!r}: {{'value': 0.5}}}}"
                 )
-        return {f"{agent}/{name}": value for agent, named in values.items() for name, value in named.items()}
+            )
+        return by_name
 
     def reset(self, seed: int | None = None, options: ResetOptions | None = None) -> tuple[ByAgent, ByAgent]:
         """Reset the environment, and record it."""

@@ -143,13 +143,6 @@ class Recorded:
         except Exception as error:
             self._loop.leave_out(error)
 
-    def _put_extras(self, extras: Mapping[str, object]) -> None:
-        """Record values with the step that was just put down. The caller holds the loop's lock."""
-        try:
-            self._take_extras(self._extras_by_name(extras))
-        except ConfigError as error:
-            self._loop.leave_out(error)
-
     def _extras_by_name(self, values: Mapping[str, object]) -> Mapping[str, object]:
         return values
 

@@ -107,7 +107,7 @@ class RecordedVector(Recorded, _Wrapper):
                 finals = infos if self._resets_within else None
                 rows.take_vector(actions, observations, rewards, terminated, truncated, finals, states)
                 if extras is not None:
-                    self._put_extras(extras)
+                    self._take_extras(extras)
             if self._has_messages:
                 self._record_messages(infos, np.logical_or(terminated, truncated), over)
         except Exception as error:

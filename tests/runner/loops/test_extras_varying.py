@@ -288,6 +288,7 @@ def test_a_step_has_at_most_a_megabyte_and_memory_is_bounded(tmp_path):
 def test_more_layouts_than_a_recording_holds_are_refused(tmp_path):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as rec:
         rec.reset(seed=0)
+        rec.action_space.seed(0)
         names = [(f"a{k}", length) for length in (1, 2) for k in range(140)]
         for name, length in names[:256]:
             if rec.step(rec.action_space.sample(), extras={name: np.zeros(length)})[2]:

@@ -39,6 +39,9 @@ class Odd(gymnasium.Env):
         return np.full(shape, action, np.float32), 1.0, False, self.steps % 7 == 0, {}
 
 
+SPACES = {"observation_space": Odd.observation_space, "action_space": Odd.action_space}
+
+
 class Broken(Odd):
     """Fails by itself."""
 
@@ -178,9 +181,72 @@ def test_extras_that_cannot_be_recorded_are_left_out_of_their_step(tmp_path):
         game.reset(seed=0)
         with pytest.warns(RuntimeWarning, match="a value was left out: extras: found 'nobody'"):
             game.step(
-                {agent: game.action_space(agent).sample() for agent in game.agents}, {"nobody": {"v": 1}}
+                {agent: game.action_space(agent).sample() for agent in game.agents},
+                {"nobody": {"v": 1}, game.agents[0]: {"v": 2}},
             )
-    assert only_run(tmp_path / "game").summary.train_steps == 1
+    run = only_run(tmp_path / "game")
+    assert run.summary.train_steps == 1
+    with open_recording(run.recording) as recording:
+        assert list(recording.train.extras) == [f"{Leaving.possible_agents[0]}/v"]
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        ({"b": "x"}, "extras: found str for 'b', expected float64 of shape"),
+        ({"c": object()}, "found object of object for 'c', expected a number"),
+        ({"n": 2**63}, "found 9223372036854775808 for 'n', which int64 cannot hold"),
+        ({"large": np.zeros(200_000)}, "expected at most 1,048,576: 'large' is too large"),
+        ({"words": "x" * 2_000_000}, "expected at most 1,048,576: 'words' is too large"),
+    ],
+)
+def test_only_the_extra_that_cannot_be_recorded_is_lost(tmp_path, bad, reason):
+    with runner.record(Odd(until=100), tmp_path, on_error="warn") as rec:
+        rec.reset(seed=0)
+        rec.step(0, extras={"a": 1.0, "b": 1.0, "n": 1, "words": "long"})
+        with pytest.warns(RuntimeWarning, match=reason):
+            rec.step(0, extras={"a": 2.0, **bad, "z": 2.0, "more": "text"})
+        rec.step(0)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # given once if it has the same words
+            rec.note_step(a=3.0, **bad, z=3.0, more="text")
+    with open_recording(rec.run.recording) as recording:
+        values = recording.train.extras.at(np.arange(3))
+        assert values["a"].tolist() == [1, 2, 3]
+        assert values["z"].tolist() == [None, 2, 3]
+        assert values["more"].tolist() == [None, "text", "text"]
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason"),
+    [
+        ([1.0, object()], "found object of object for 'v' of environment 1"),
+        ([1.0, "x"], "found a text for 'v' of environment 1, and a number for others"),
+        ([np.zeros(2), np.zeros((2, 3))], r"found an array of shape \(T, 3\) for 'v' of environment 1"),
+        (["x", 1.0], "found a number for 'v' of environment 1, and a text"),
+    ],
+)
+def test_an_extra_of_a_vector_is_refused_by_name_and_environment(tmp_path, bad, reason):
+    with runner.record_vector(SyncVectorEnv([Odd, Odd]), tmp_path, on_error="warn") as envs:
+        envs.reset(seed=0)
+        with pytest.warns(RuntimeWarning, match=reason):
+            envs.step(np.array([0, 1]), extras={"a": [1.0, 2.0], "v": bad, "z": ["x", "y"]})
+        batch = (
+            np.zeros((1, 2, 2), np.float32),
+            np.zeros((1, 2), np.int64),
+            np.zeros((1, 2)),
+            np.zeros((1, 2)),
+        )
+    with runner.record_batches(
+        "two", tmp_path / "batches", autoreset_mode="NextStep", on_error="warn", **SPACES
+    ) as rec:
+        rec.reset(batch[0][0])
+        with pytest.warns(RuntimeWarning, match=reason):
+            rec.batch(*batch, extras={"a": [[1.0, 2.0]], "v": [bad], "z": [["x", "y"]]})
+    for run in (envs.run, rec.run):
+        with open_recording(run.recording) as recording:
+            values = recording.train.extras.at(np.arange(2))
+            assert (values["a"].tolist(), values["z"].tolist()) == ([1, 2], ["x", "y"])
 
 
 def test_errors_of_the_environment_are_raised(tmp_path):
