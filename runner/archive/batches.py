@@ -12,7 +12,7 @@ from blake3 import blake3
 from runner.archive.columns import Shape, Table
 from runner.archive.manifest import Entry
 from runner.archive.rows import batch_of, bytes_of, records_of, whole
-from runner.errors import RecordingError
+from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.reader import Recording, extra_layouts
@@ -127,6 +127,12 @@ class Batches:
             if len(records) > 1:  # one by one, to name the message
                 for k in range(len(records)):
                     self._checked(table, topic, records[k : k + 1], number + k)
+            if isinstance(error, UnicodeEncodeError):
+                raise RunnerError(
+                    f"{self._recording.path}: message {number} of {topic.name} has a text with the unpaired "
+                    f"surrogate {error.object[error.start]!r}, which no Parquet or CSV file can hold; it is "
+                    "read in Python, by open_recording."
+                ) from error
             why = f" ({error})"
         raise self.unarchivable(topic, number, why)
 

@@ -188,7 +188,11 @@ class LoopTracks:
         """Yield texts as documents, and arrays of varying length as bars."""
         entity = self._entity(phase, member.name, f"extra/{entity_name(name)}")
         title, placed = f"{member.name} {name}".strip(), [*zip(steps.tolist(), values.tolist(), strict=True)]
-        if texts := [(step, rr.TextDocument(text)) for step, text in placed if isinstance(text, str)]:
+        if texts := [
+            (step, rr.TextDocument(text.encode(errors="replace").decode()))
+            for step, text in placed
+            if isinstance(text, str)
+        ]:
             yield rows_of(entity, texts, TrackView("texts", title, rrb.TextDocumentView))
         bars = [
             (step, rr.BarChart(array.ravel().astype(np.float64)))

@@ -271,6 +271,20 @@ def test_a_damaged_recording_keeps_what_is_whole(tmp_path):
     assert all(value is not np.ma.masked for value in some)
 
 
+def test_a_text_with_half_a_character_is_exported_to_rerun_and_refused_by_tables(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path / "runs", name="half") as rec:
+        rec.reset(seed=0)
+        rec.step(0, extras={"said": "whole"})
+        rec.step(0, extras={"said": "half \ud800"})
+    rrd = dualtaxi(tmp_path / "runs", "export", "rerun", "half", "-o", str(tmp_path / "half.rrd"))
+    assert rrd.exit_code == 0, rrd.output
+    for command in (["archive", "half"], ["export", "csv", "half", "-o", str(tmp_path / "tables")]):
+        done = dualtaxi(tmp_path / "runs", *command)
+        assert done.exit_code == 2
+        assert "message 1 of /train/extra has a text with the unpaired surrogate" in done.output
+        assert "repair" not in done.output
+
+
 def test_a_step_has_at_most_a_megabyte_and_memory_is_bounded(tmp_path):
     with runner.record(make("CartPole-v1"), tmp_path) as rec:
         rec.reset(seed=0)
