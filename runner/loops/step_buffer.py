@@ -51,6 +51,9 @@ class StepBuffer:
         mode: how the environments of a vector reset themselves; None for one environment, alone.
     """
 
+    is_reset_twice = False
+    """Whether a step after the end of an episode is a reset though the environment was reset since."""
+
     def __init__(
         self,
         recorder: Recorder,
@@ -156,10 +159,14 @@ class StepBuffer:
 
     @property
     def over(self) -> Flags:
-        """[N]: whether an episode ended with the last step and was followed by no reset."""
+        """[N]: the environments whose episode ended with the last step and that were not reset since.
+
+        With `is_reset_twice` also those that were.
+        """
         over: Flags = self._ends[self._filled - 1].any(axis=0) if self._filled else self._over.copy()
         resets = self._resets[: self._waiting]
-        over[resets["environment"][resets["row"] == self._filled] % self._n] = False
+        if not self.is_reset_twice:
+            over[resets["environment"][resets["row"] == self._filled] % self._n] = False
         return over
 
     @over.setter
@@ -571,7 +578,8 @@ class StepBuffer:
             marks = self._marks[: len(was_reset), np.newaxis]
             return was_reset | marks["begins"], False, marks["over"]
         over = np.vstack([self._over, self._ends[: self._filled - 1].any(axis=1)])
-        only_reset: Flags = over & ~was_reset & (self._mode == AutoresetMode.NEXT_STEP)
+        waits = over if self.is_reset_twice else over & ~was_reset
+        only_reset: Flags = waits & (self._mode == AutoresetMode.NEXT_STEP)
         # They come after the resets that the user's loop called before the step.
         rows, environments = np.nonzero(only_reset)
         start = self._waiting

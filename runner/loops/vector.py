@@ -52,12 +52,17 @@ class RecordedVector(Recorded, _Wrapper):
         self._return_name = return_name(list(map(class_name, layers)))
         self._has_messages = bool(loop.options.info or loop.options.frames_every or self._return_name)
         self._record_into(loop)
+        base = env.unwrapped
+        self._is_reset_twice = isinstance(base, AsyncVectorEnv) and not base.shared_memory
+        """Without shared memory, Gymnasium's workers do not forget the end of an episode at a reset."""
         Recorded._enter(self, phase)
+        self._rows.is_reset_twice = self._is_reset_twice
 
     def _enter(self, phase: str) -> None:
         with self._loop.lock:
             over = self._rows.over
             super()._enter(phase)
+            self._rows.is_reset_twice = self._is_reset_twice
             self._rows.over = over  # the environments are the same ones
             self._watch.begin_phase()
 

@@ -335,7 +335,8 @@ class VectorStepper(Stepper):
         return spaces_of_one(self.env)
 
     def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
-        are_steps, explicit, automatic = is_taken(returned.rows[step * self.n :][: self.n]), [], []
+        are_steps, explicit = is_taken(returned.rows[step * self.n :][: self.n]), []
+        automatic = list[RecordedReset]()
 
         def add(reset: RecordedReset) -> None:
             frame = self.draw() if self.draws and reset.environment == self._drawn else None
@@ -344,6 +345,11 @@ class VectorStepper(Stepper):
         for reset in resets:
             environment = reset.environment
             if len(are_steps) and not are_steps[environment]:
+                if any(other.environment == environment for other in automatic):
+                    raise CannotRedo(
+                        f"Environment {environment} was reset before step {step:,} and again in place of it, "
+                        "as AsyncVectorEnv does without shared memory; no other vector does."
+                    )
                 automatic.append(reset)  # the step does it
             elif self._autoreset == "SameStep" and self._over[environment]:
                 self._over[environment] = False  # the step before did it

@@ -185,6 +185,38 @@ def test_options_and_large_seeds_of_resets_in_a_vector_are_given_again(tmp_path)
     assert rerun_steps(envs.run.recording, trust=True) == (90, None)
 
 
+@pytest.mark.parametrize("is_shared", [True, False])
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_reset_while_the_end_of_an_episode_is_pending_is_recorded_as_it_happened(
+    tmp_path, is_shared, is_whole
+):
+    vector = AsyncVectorEnv([loops.counter] * 2, shared_memory=is_shared)
+    envs = NormalizeVector(vector) if is_whole else vector
+    with runner.record_vector(envs, tmp_path) as recorded:
+        recorded.reset(seed=0)
+        for k in range(15):
+            if k == 10:
+                first, _ = recorded.reset()
+            after, rewards, *_ = recorded.step(np.zeros(2, np.int64))
+            if k == 10:
+                second = after
+                assert rewards.tolist() == ([1, 1] if is_shared else [0, 0])
+    with open_recording(recorded.run.recording) as recording:
+        steps, resets = recording.train.steps.array(), recording.train.resets.array()
+        lengths = recording.train.episodes.array()["length"].tolist()
+    assert steps["taken"].reshape(15, 2).all(axis=1).tolist() == [True] * 10 + [is_shared] + [True] * 4
+    observed = resets["observation"].reshape(-1, 2).tolist()
+    assert observed[1:] == (
+        [first.ravel().tolist()] if is_shared else [first.ravel().tolist(), second.ravel().tolist()]
+    )
+    assert lengths == [10, 10]
+    found = verify(recorded.run.recording, trust=True)
+    if is_whole and not is_shared:
+        assert "as AsyncVectorEnv does without shared memory" in found.reason
+    else:
+        assert (found.verdict, found.finding) == ("reproduced", "")
+
+
 OPTIONS = [
     {},
     {"start": (1, (2, [3])), "$start": 4},
