@@ -46,7 +46,17 @@ Phase = Literal["train", "eval"]
 _BEFORE: Final = ("step", "episode", "t", "environment", "state", "action", "next_state", "next_observation")
 _AFTER: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
 """The fields of a step that are columns before, and after, the columns of rewards."""
-_OF_EPISODE: Final = ("episode", "length", "penalties", "success", "terminated", "truncated", "last_step")
+_OF_EPISODE: Final = (
+    "episode",
+    "environment",
+    "length",
+    "penalties",
+    "success",
+    "terminated",
+    "truncated",
+    "first_step",
+    "last_step",
+)
 
 
 def evaluations(run: Source) -> pd.DataFrame:
@@ -81,8 +91,8 @@ def training(run: Source) -> pd.DataFrame:
 def episodes(run: Source, phase: Phase = "train", start: int = 0, stop: int | None = None) -> pd.DataFrame:
     """Return a row for each episode of a phase, number `start` up to `stop`.
 
-    Columns: episode, length, penalties, success, terminated, truncated, last_step, `return.AGENT`, and a
-    column for each event.
+    Columns: episode, environment (where there are several), length, penalties, success, terminated,
+    truncated, first_step, last_step, `return.AGENT`, and a column for each event.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -174,7 +184,8 @@ def episode_columns(
 ) -> dict[str, Array]:
     """Return the columns of `episodes`, an array each."""
     records = recording.phase(phase).episodes.array(start, stop)
-    columns = _plain_columns(records, _OF_EPISODE)
+    names = records.dtype.names or ()
+    columns = _plain_columns(records, [name for name in _OF_EPISODE if name in names])
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
     return columns | _by_name(records["events"], recording.environment["event_names"])
 

@@ -12,6 +12,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.csv
@@ -22,6 +23,7 @@ from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.export.scalars import measures, wall_clock
 from runner.recording.reader import Recording
+from runner.recording.schema import STEP_NANOSECONDS
 from runner.util.values import Ranges
 
 _TABLES: Final = {
@@ -49,6 +51,8 @@ _METRICS: Final = pa.schema(
     ]
 )
 _ROWS: Final = 8192
+_OF_STEP: Final = ("episode", "t", "environment", "taken")
+"""The columns of steps that the rows of extras have too."""
 _ENVIRONMENT_BITS: Final = 40
 """Bits of an episode's number, above which its environment stands."""
 
@@ -74,11 +78,11 @@ def write_tables(
     source = Batches(recording)
     own = source.shape.tables
     keys = _keys_of(recording, phase, episodes) if phase is not None and episodes else None
-    tables = {
-        name: _selected(source.of(own[table]), phase, episodes, keys)
-        for name, table in _TABLES.items()
-        if table in own
-    } | {"metrics": _metrics(recording)}
+    sources = {name: source.of(own[table]) for name, table in _TABLES.items() if table in own}
+    if "extras" in sources:
+        sources["extras"] = _with_episodes(sources["extras"], recording, own[layout.STEPS].columns)
+    tables = {name: _selected(rows, phase, episodes, keys) for name, rows in sources.items()}
+    tables["metrics"] = _metrics(recording)
     rows = {}
     for name, batches in tables.items():
         path = folder / f"{name}.{form}{'.gz' if gz else ''}"
@@ -108,6 +112,27 @@ def _episode_count(recording: Recording, phase: str) -> int:
     ended = recording.phase(phase).episodes.count()
     steps = int(recording.phase(phase).episodes.array(ended - 1, ended)[0]["last_step"]) + 1 if ended else 0
     return ended + (recording.phase(phase).steps.total() > steps)
+
+
+def _with_episodes(
+    batches: Iterator[pa.RecordBatch], recording: Recording, schema: pa.Schema
+) -> Iterator[pa.RecordBatch]:
+    """Yield extras with the places of their steps, whose table has this schema."""
+    for batch in batches:
+        steps, numbers = recording.phase(batch["phase"][0].as_py()).steps, batch["step"].to_numpy()
+        names = [name for name in _OF_STEP if name in (steps.row_dtype.names or ())]
+        first, last = (batch["position"][k].as_py() * STEP_NANOSECONDS for k in (0, -1))
+        blocks = steps.rows(range(first, last + 1))
+        rows = [block[["step", *names]][np.isin(block["step"], numbers)] for block in blocks]
+        known = np.concatenate([np.empty(0, steps.row_dtype)[["step", *names]], *rows])
+        is_known = np.isin(numbers, known["step"])  # others were lost
+        at = np.searchsorted(known["step"], numbers[is_known])
+        for k, name in enumerate(names, batch.schema.get_field_index("step") + 1):
+            kind = schema.field(name).type
+            values = np.zeros(len(numbers), kind.to_pandas_dtype())
+            values[is_known] = known[name][at]
+            batch = batch.add_column(k, name, pa.array(values, kind, mask=~is_known))  # noqa: PLW2901
+        yield batch
 
 
 def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:

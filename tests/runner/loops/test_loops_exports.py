@@ -36,14 +36,22 @@ def test_the_grid_of_a_loop_becomes_a_film(folder, tmp_path):
 def test_episodes_of_a_vector_are_exported_with_their_own_steps_and_resets(tmp_path):
     envs = SyncVectorEnv([lambda: make("CartPole-v1")] * 3)
     with runner.record_vector(envs, tmp_path / "runs") as rec:
-        drive(rec, 120)
+        drive(rec, 30)
+        for k in range(90):
+            rec.step(np.array([0, 1, 0]), extras={"k": np.arange(3) + k, "text": ["a", "b", "c"]})
     folder = str(tmp_path / "tables")
     words = ["export", "parquet", rec.run.run_id, "--episodes", "2..5", "-o", folder]
     done = dualtaxi(tmp_path / "runs", *words)
     assert done.exit_code == 0, done.output
-    steps, resets, ended = (
-        pandas.read_parquet(f"{folder}/{name}.parquet") for name in ("steps", "resets", "episodes")
+    steps, resets, ended, extras = (
+        pandas.read_parquet(f"{folder}/{name}.parquet") for name in ("steps", "resets", "episodes", "extras")
     )
+    places = ["step", "episode", "environment", "t"]
+    assert extras[places].equals(steps[steps["step"] >= 90][places].reset_index(drop=True))
+    assert extras["extra_k"].tolist() == [step // 3 - 30 + step % 3 for step in extras["step"]]
+    frame = runner.frames.episodes(rec.run)
+    both = ["episode", "environment", "first_step", "last_step", "length"]
+    assert frame[both].iloc[2:5].to_numpy().tolist() == ended[both].to_numpy().tolist()
     assert ended["episode"].tolist() == [2, 3, 4]
     with open_recording(rec.run.recording) as recording:
         episodes = [recording.train.episode(number) for number in (2, 3, 4)]
