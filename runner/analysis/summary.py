@@ -23,6 +23,7 @@ from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import Summary
 from runner.recording.spaces import Description
+from runner.replay.recorded import RecordedReset, resets_of
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
 from runner.util.values import JsonView
@@ -83,6 +84,8 @@ class RunDetails:
     extras: Mapping[str, RecordedExtras] = field(default_factory=dict)
     """The values that a loop recorded with the steps of each phase, where there are some."""
 
+    first_resets: Mapping[str, RecordedReset] = field(default_factory=dict)
+    """The first reset of each phase of a loop that has one."""
     checkpoints: tuple[Checkpoint, ...] = ()
     """What a loop kept of its agent."""
     shards: tuple[Shard, ...] = ()
@@ -116,6 +119,7 @@ class RunDetails:
             "tables": [table.as_json() for table in self.tables],
             "loop": None if self.loop is None else _loop_as_json(self.loop),
             "extras": {phase: extras.as_json() for phase, extras in self.extras.items()},
+            "first_resets": {phase: reset.arguments for phase, reset in self.first_resets.items()},
         }
 
     def as_json(self) -> dict[str, object]:
@@ -154,6 +158,11 @@ def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> Ru
                     training=tuple(training_records(recording)),
                     loop=None if recording.eval.has_metrics else loop_summary(recording),
                     extras=_extras(recording),
+                    first_resets={
+                        phase: reset
+                        for phase in schema.PHASES
+                        if (reset := next(resets_of(recording, phase), None)) is not None
+                    },
                     checkpoints=tuple(read_checkpoints(recording, run.folder.parent)),
                 )
         except RecordingError as error:

@@ -14,6 +14,7 @@ from runner.environments.naming import actions_in_words, states_in_words
 from runner.export.pictures import PictureMoment, moments_of
 from runner.export.values import plain_value, step_actions_in_words, value_in_words
 from runner.recording.spaces import least_number
+from runner.replay.recorded import reset_of
 from runner.replay.steps import check_steps, transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
@@ -37,12 +38,17 @@ class ShownEpisode:
         self._title = title
 
     def steps(self) -> Iterator[dict[str, object]]:
-        """Yield each step as JSON: with names where the environment's table has them."""
+        """Yield each step as JSON: with names where the environment's table has them.
+
+        The first step of a loop's episode has the seed and the options of its reset.
+        """
         recording, agents = self._recording, self._recording.agents
         describe = _named(recording) if recording.tabular else _valued(recording, self._phase)
+        reset = reset_of(recording, self._phase, self._number)
         for row in transitions_of(recording, self._phase, self._number):
             yield {
                 "t": int(row["t"]),
+                **({"reset": reset.arguments} if reset is not None and not row["t"] else {}),
                 **describe(row),
                 "rewards": dict(zip(agents, as_json(np.asarray(row["rewards"])), strict=True)),
                 "terminated": bool(row["terminated"]),
@@ -54,14 +60,20 @@ class ShownEpisode:
         from rich.text import Text
 
         draw = _state_drawer(self._recording)
+        reset = reset_of(self._recording, self._phase, self._number)
+        start = "the start" + (
+            f", reset with {reset.in_words}" if reset is not None and reset.in_words else ""
+        )
         for moment in moments_of(self._recording, self._phase, self._number):
             step = f"\nstep {moment.t:,} of {self._length:,}\n\n"
-            yield Text.assemble((self._title, "bold"), step, draw(moment.observation), _in_words(moment))
+            yield Text.assemble(
+                (self._title, "bold"), step, draw(moment.observation), _in_words(moment) or start
+            )
 
 
 def _in_words(moment: PictureMoment) -> str:
     if not moment.action:
-        return "the start"
+        return ""
     return (
         f"{moment.action}\nreward {_joined(moment.rewards)}, so far {_joined(moment.returns)}\n"
         + ", ".join(filter(None, [moment.events, moment.ended]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
@@ -11,7 +12,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.errors import RecordingError
+from runner.errors import RecordingError, shortened
 from runner.recording.description import environment_count
 from runner.recording.reader import Recording
 from runner.recording.reset_options import ResetOptions
@@ -20,9 +21,12 @@ from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value, decode
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
+from runner.util.jsonable import as_json
 
 _BLOCK_BYTES: Final = 16 << 20
 _NOTHING_GIVEN: Final = ResetOptions()
+_MAX_WORDS: Final = 200
+"""The most letters of a seed or of options in words."""
 M = TypeVar("M", ResetOptions, ResetState)
 
 
@@ -58,6 +62,22 @@ class RecordedReset(NamedTuple):
         """Whether its episode can be repeated without those before it, but for what outlives a reset."""
         state = self.state
         return self.seed is not None or (state is not None and not is_empty(state))
+
+    @property
+    def arguments(self) -> dict[str, object]:
+        """The seed and the options, as JSON can hold them; None for each that it had not."""
+        options = (
+            self.given.options if self.given.options is not None else json.loads(self.given.json or "null")
+        )
+        return {"seed": self.seed, "options": as_json(options)}
+
+    @property
+    def in_words(self) -> str:
+        """The seed and the options, such as `seed 7 and options {"map": 3}`; empty for neither."""
+        given = {name: value for name, value in self.arguments.items() if value is not None}
+        return " and ".join(
+            f"{name} {shortened(json.dumps(value), _MAX_WORDS)}" for name, value in given.items()
+        )
 
     def may_begin(self, start: RecordedReset | None) -> bool:
         """Return whether a rerun can begin here; with `start`, whether this is that reset."""

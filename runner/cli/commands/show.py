@@ -53,9 +53,9 @@ def show_command(
     before it, success_percent, mean_length, mean_penalties and the count of every event; `optimality` its
     exact measures, if the run takes them; `train` an object for each report of training; `loop` the last
     results of a loop: its last evaluation, the means of its last 100 training episodes and the last values it
-    logged; `extras` the names of the values that it recorded with its steps; `checkpoints` those of its
-    agent; `processes` those that recorded it together; `origin` what it was branched from; and `branches` its
-    branches by run id.
+    logged; `extras` the names of the values that it recorded with its steps; `first_resets` the seed and the
+    options of the first reset of each phase; `checkpoints` those of its agent; `processes` those that
+    recorded it together; `origin` what it was branched from; and `branches` its branches by run id.
 
     Examples:
       dualtaxi show @latest
@@ -174,6 +174,7 @@ def _draw_random_policy(run: Run) -> None:
 
 def _head(details: RunDetails) -> dict[str, str]:
     from runner.recording.run_file import has_environment
+    from runner.recording.schema import PHASE_NAMES
 
     run, summary, origin = details.run, details.run.summary, origin_in(details.config)
     took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
@@ -197,6 +198,11 @@ def _head(details: RunDetails) -> dict[str, str]:
         "processes": _processes(details.shards),
         "environment": str(details.environment or ""),
         "steps": steps,
+        "first reset": "; ".join(
+            f"{PHASE_NAMES[phase]} with {reset.in_words}"
+            for phase, reset in details.first_resets.items()
+            if reset.in_words
+        ),
         "time": time,
         "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
         "file": f"{run.recording}  {size(details.bytes)}" if details.bytes else "no recording",

@@ -110,11 +110,13 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
         total = float(phase.episodes.array(number, number + 1)["returns"].sum())
     elif first + limit >= length:
         total = float(before.sum() + reward.sum())
+    reset = reset_of(recording, at.phase, number)
+    begun = f" Reset with {reset.in_words}." if reset is not None and reset.in_words else ""
     texts, series = _frames(parts, observations)
     extra_texts, extra_series = _extras(recording, at.phase, np.concatenate(numbers), notes)
     return Playback(
         title=at.heading + (f", in environment {environment}" if recording.environments > 1 else ""),
-        description=outcome_in_words(length, ended, total),
+        description=outcome_in_words(length, ended, total) + begun,
         length=length,
         first=first,
         end=ENDINGS[ended],

@@ -13,13 +13,42 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.analysis.contents import shortcomings
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.series import read_series
+from runner.export.reports.playback import playback_of
 from runner.recording.reader import open_recording
 from runner.recording.run_file import Summary
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from tests.runner.loops.making import dualtaxi, make, play
+
+NEITHER = {"seed": None, "options": None}
+
+
+def test_the_seed_and_the_options_of_resets_are_shown(tmp_path):
+    with runner.record(make("CartPole-v1"), tmp_path, name="reset") as rec:
+        for seed, options in ((7, {"low": -0.01, "high": np.float32(0.03125)}), (None, None)):
+            rec.reset(seed=seed, options=options)
+            while not any(rec.step(0)[2:4]):
+                pass
+    words = 'seed 7 and options {"low": -0.01, "high": 0.03125}'
+    given = {"seed": 7, "options": {"low": -0.01, "high": 0.03125}}
+    shown = " ".join(dualtaxi(tmp_path, "show", "reset").output.split())
+    assert f"training with {words}" in shown
+    assert json.loads(dualtaxi(tmp_path, "show", "reset", "--json").output)["first_resets"] == {
+        "train": given
+    }
+    starts = ("0", given, f"the start, reset with {words}\n"), ("1", NEITHER, "the start\n")
+    for episode, reset, start in starts:
+        chosen = ("play", "reset", "--episode", episode)
+        assert start in dualtaxi(tmp_path, *chosen).output
+        first, second, *_ = map(json.loads, dualtaxi(tmp_path, *chosen, "--json").output.splitlines())
+        assert (first["reset"], "reset" in second) == (reset, False)
+    with open_recording(rec.run.recording) as recording:
+        descriptions = [playback_of(recording, EpisodeRef(episode)).description for episode in (0, 1)]
+    assert descriptions[0].endswith(f" Reset with {words}.")
+    assert "eset" not in descriptions[1]
 
 
 def test_ls_and_show_describe_loops(folder):
