@@ -42,6 +42,7 @@ from runner.runs.locking import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import Run, unless_empty
 from runner.util.files import storage_errors
+from runner.util.humanize import counted
 from runner.util.processes import report_progress
 
 Start = int | Literal["random", "each"]
@@ -262,6 +263,7 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     """Rerun the environment, and write the whole steps.
 
     Raises:
+        CannotRedo: the state of the random generators before some steps is not known.
         Diverged: they differ from the recorded ones.
     """
     topics = {phase: recording.phase(phase).steps.topic for phase in schema.PHASES}
@@ -277,8 +279,6 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
                 names = (field.name for field in recording.layout.message(topic).fields)
                 recorder.put(topic, {name: records[name] for name in names}, positions)
                 report_progress(replay.taken)
-        if replay.skipped:
-            raise CannotRedo(f"The states of the generators before {replay.skipped:,} steps are not known.")
         digests = recorder.drain()
     except BaseException:
         recorder.abandon()
@@ -297,6 +297,15 @@ def _whole_steps(
     for environment in replay.environments:
         for steps in replay.steps(piece, environment, draws=False):
             records[steps.recorded["step"] - piece.first] = whole_records(recording, steps)
+        if replay.skipped:
+            rows, _ = replay.recorded_steps(piece, environment)
+            of_environment = f" of environment {environment}" if len(replay.environments) > 1 else ""
+            raise CannotRedo(
+                f"{counted(replay.skipped, 'step')} of {schema.PHASE_NAMES[piece.phase]}{of_environment} "
+                f"cannot be rerun, from its episode {rows['episode'][0]:,} on: the reset had no seed, and "
+                "the state of the random generators before it was not recorded. Whole steps are recorded of "
+                f"all episodes or of none; `dualtaxi verify {recording.run_id}` reruns the others."
+            )
     are_steps, begun = is_taken(records), []
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment

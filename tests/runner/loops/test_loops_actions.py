@@ -33,6 +33,7 @@ from runner.replay.steps import whole_steps
 from runner.runs.marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
+from tests.runner.replay import loops as replayed
 from tests.waiting import until
 
 
@@ -133,6 +134,21 @@ def test_the_content_is_that_of_whole_steps_which_come_again(runs, tmp_path):
             parts = [[block.tobytes() for block in each.table(topic).blocks()] for each in (recording, full)]
             assert b"".join(parts[0]) == b"".join(parts[1])
     assert rerecord(after).summary == after.summary, "there is nothing left to do"
+
+
+def test_rerecord_says_which_episodes_cannot_be_rerun(tmp_path):
+    options = {"make": replayed.twisted, "steps": "actions", "name": "twisted"}
+    with runner.record(replayed.twisted(), tmp_path, **options) as rec:
+        for seed in (None, None, 7, None):
+            rec.reset(seed=seed)
+            for _ in range(10):
+                rec.step(0)
+    found = verify(rec.run.recording, trust=True)
+    assert (found.verdict, found.steps, found.left_out) == ("reproduced", 20, 20)
+    size = rec.run.recording.stat().st_size
+    with pytest.raises(CannotRedo, match="20 steps of training cannot be rerun, from its episode 0 on"):
+        rerecord(rec.run, trust=True)
+    assert rec.run.recording.stat().st_size == size
 
 
 def test_steps_of_actions_alone_are_found_by_number_and_not_taken_for_none(tmp_path, monkeypatch):

@@ -94,6 +94,18 @@ def counters() -> SyncVectorEnv:
     return SyncVectorEnv([counter] * 3, autoreset_mode=AutoresetMode.DISABLED)
 
 
+class Twisted(Counter):
+    """Has a generator whose state is not recorded, until a reset with a seed."""
+
+    def __init__(self) -> None:
+        self._np_random = np.random.Generator(np.random.MT19937())
+
+
+def twisted() -> Twisted:
+    """Return one."""
+    return Twisted()
+
+
 class Ordered(Counter):
     """Rewards depend on the order of a set of texts."""
 
