@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RecordingError, StorageError
+from runner.runs.marks import copy_mark
 from runner.runs.run import RUN_FILE, Run
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
@@ -66,6 +67,7 @@ def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Repor
                         restore_to(folder, fresh, digest, report)
                     fresh.replace(cached)
                 cached.touch()
+                copy_mark(run.folder, cached)
         except Timeout as error:
             raise StorageError(
                 f"{cached}: another process has been restoring it for {LOCK_SECONDS:.0f} s."

@@ -87,10 +87,10 @@ def merge_marks(folder: Path, others: list[Path]) -> None:
         _write(folder, marks, key)
 
 
-def mark_of(folder: Path) -> Mark:
+def mark_of(folder: Path, name: str = MARK_FILE) -> Mark:
     """Return what the mark in a folder states; nothing if none was made there with this user's key."""
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
-        values = read_object(folder / MARK_FILE, _MAX_BYTES)
+        values = read_object(folder / name, _MAX_BYTES)
         seal = values.pop("seal")
         key = _key(False)
         if key is not None and hmac.compare_digest(str(seal).encode(), _seal(values, key).encode()):
@@ -101,9 +101,19 @@ def mark_of(folder: Path) -> Mark:
 
 def own_mark(recording: Path, environment: EnvironmentMaker | JsonView) -> Mark | None:
     """Return the mark next to a recording if it covers an environment; None if it does not."""
-    found = mark_of(recording.parent)
+    marks = (mark_of(recording.parent, name) for name in (MARK_FILE, _restored_name(recording)))
     digest = hashlib.sha256(_canonical(environment).encode()).hexdigest()
-    return found if digest in found.environments else None
+    return next((found for found in marks if digest in found.environments), None)
+
+
+def copy_mark(folder: Path, restored: Path) -> None:
+    """Put the mark of a run, if it has one, next to its recording that was restored into the cache."""
+    copy = restored.with_name(_restored_name(restored))
+    with contextlib.suppress(OSError, ValueError):
+        try:
+            write_object(copy, read_object(folder / MARK_FILE, _MAX_BYTES))
+        except FileNotFoundError:
+            copy.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
@@ -118,6 +128,11 @@ def marking_nothing(is_strange: bool = True) -> Iterator[None]:
 
 
 # --- help ---------------------------------------------------------------------------------------------
+
+
+def _restored_name(recording: Path) -> str:
+    """Return the name of the mark next to a recording in the cache, where others are too."""
+    return f"{recording.stem}.{MARK_FILE}"
 
 
 def _canonical(environment: EnvironmentMaker | JsonView) -> str:

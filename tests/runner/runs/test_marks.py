@@ -14,8 +14,11 @@ import gymnasium
 import pytest
 
 import runner
+from runner.archive.places import at_hand
+from runner.archive.runs import archive_run
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
+from runner.runs.listing import run_at
 from runner.runs.marks import KEY_FILE, MARK_FILE, Mark, _make_key, mark, mark_of, merge_marks
 from runner.runs.run import Run
 
@@ -157,6 +160,17 @@ def test_every_environment_of_a_run_is_marked(tmp_path):
             each.reset(seed=1)
             each.step(0)
     assert len(mark_of(env.run.folder).environments) == 2
+
+
+def test_an_archived_run_has_its_mark_until_its_folder_has_none(own, tmp_path):
+    archived = archive_run(run_at(own / "recording.mcap"), str(tmp_path / "archive"), remove=True).run
+    assert not (own / "recording.mcap").exists()
+    recording = at_hand(archived).recording
+    assert own not in recording.parents
+    found = verify(recording)
+    assert (found.verdict, found.steps) == ("reproduced", 60)
+    (own / MARK_FILE).unlink()
+    assert "--trust" in verify(at_hand(archived).recording).reason
 
 
 def test_a_mark_that_is_extended_is_replaced_at_once(own, recorded):
