@@ -103,13 +103,19 @@ class RecordedAec(RecordedParallel):
             raise AttributeError(name)
         return getattr(self.env.env, name)
 
-    def step(self, action: object, extras: Mapping[str, object] | None = None) -> None:  # type: ignore[override]
-        """Take the step of the selected agent, and record it, with values of your own by name."""
+    def step(  # type: ignore[override]
+        self, action: object, extras: Mapping[str, Mapping[str, object]] | None = None
+    ) -> None:
+        """Take the step of the selected agent, and record it, with values of your own by agent.
+
+        Args:
+            extras: as `extras={agent: {"value": v}}`, of the selected agent or others.
+        """
         agent = self.env.env.agent_selection
         if action is None:  # it only removes the agent
             self.env.env.step(None)
         else:
-            super().step({agent: action}, None if extras is None else {agent: extras})
+            super().step({agent: action}, extras)
 
     def reset(  # type: ignore[override]
         self, seed: int | None = None, options: ResetOptions | None = None

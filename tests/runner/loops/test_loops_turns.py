@@ -76,7 +76,9 @@ def test_steps_are_those_of_one_agent_with_what_all_can_observe(tmp_path):
     with runner.record_aec(tictactoe.env(), tmp_path, info=["*"]) as rec:
         rec.reset(seed=0)
         for action in (0, 3, 1, 4, 2):  # the first player wins
-            rec.step(action, extras={"value": 0.5})
+            agent = rec.agent_selection
+            rec.step(action, extras={agent: {"value": 0.5}})
+            rec.note_step({agent: {"late": 1.0}})
         assert rec.terminations == {"player_1": True, "player_2": True}
         rec.step(None)
         rec.step(None)
@@ -90,7 +92,9 @@ def test_steps_are_those_of_one_agent_with_what_all_can_observe(tmp_path):
         assert first["player_1"]["observation"][0, 0].tolist() == [1, 0]
         assert first["player_2"]["observation"][0, 0].tolist() == [0, 1]
         assert first["player_2"]["action_mask"].tolist() == [0, *[1] * 8]
-        assert set(recording.train.extras) == {"player_1/value", "player_2/value"}
+        assert set(recording.train.extras) == {
+            f"player_{k}/{name}" for k in (1, 2) for name in ("value", "late")
+        }
 
 
 def test_pages_films_and_diffs_show_games_in_turns(tmp_path):
