@@ -1,13 +1,21 @@
-"""What the shapes of other trackers have in common: nothing in them ends a script."""
+"""What the shapes of other trackers have in common: how values are logged, and what has no effect.
+
+Nothing in them ends a script.
+"""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
 from functools import wraps
-from typing import Any
+from typing import Any, Literal, Self
 
-from runner.loops.values import warn_user
+import numpy as np
+
+from runner.errors import ConfigError
+from runner.integrations.script import ScriptRun
+from runner.loops.recorded import ending_of
+from runner.loops.values import as_array, warn_user
 
 _warned: set[str] = set()
 
@@ -15,6 +23,25 @@ _warned: set[str] = set()
 def as_run_name(text: str) -> str | None:
     """Return a text as a run can have it for its name; None if nothing is left of it."""
     return re.sub(r"[^A-Za-z0-9_.+/-]", "-", text)[:100].lstrip(".-+/") or None
+
+
+# --- what is logged ----------------------------------------------------------------------------------------
+
+
+def as_number(name: str, value: object) -> object:
+    """Return a number, also one that stands in an array or tensor of one; text is refused.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if value.__class__ is float:
+        return value
+    try:
+        return float(np.asarray(as_array(value)).astype(np.float64, casting="same_kind").item())
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(
+            f"add_scalar: found {type(value).__name__} for {name!r}, expected a number"
+        ) from error
 
 
 def forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -29,6 +56,54 @@ def forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
             return None
 
     return call
+
+
+def logs(
+    log: Callable[..., None], convert: Callable[..., object], arguments: str, **layout: object
+) -> Callable[..., None]:
+    """Return a method of a tracker that logs a value, and leaves out what cannot be recorded.
+
+        add_video = logs(ScriptRun.picture, film_of, "tag vid_tensor global_step fps", dataformats="NTCHW")
+
+    Args:
+        log: a method of `ScriptRun`, or what takes the same arguments.
+        convert: returns what `log` takes for the script's value, and for the layout by name.
+        arguments: what the tracker calls the name, the value, the step and further arguments, in its order.
+        layout: the arguments that say how to read the value, with their defaults; others are ignored.
+    """
+    names = arguments.split()
+
+    def method(self: Any, *given: object, **named: object) -> None:
+        by_name = dict(zip(names, given, strict=False)) | named
+        name, value, step = map(by_name.get, names[:3])
+        chosen = {key: by_name.get(key, default) for key, default in layout.items()}
+        log(self.script, name, convert(value, **chosen), step)
+
+    method.__name__, method.__doc__ = arguments, f"Log a value; takes {', '.join(names)}."
+    return forgiving(method)
+
+
+# --- what another tracker has -------------------------------------------------------------------------------
+
+
+class Tracker:
+    """What a script logs into, in the shape of another tracker's; a context manager."""
+
+    script: ScriptRun
+    _shape: str
+    """Its name, for warnings."""
+    _end: Callable[[str, str], None]
+    """Ends the run with a status and an error."""
+
+    def __getattr__(self, name: str) -> WithoutEffect:
+        return without_effect(self._shape, name)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: Any) -> Literal[False]:
+        self._end(*ending_of(raised[1]))
+        return False
 
 
 class WithoutEffect:

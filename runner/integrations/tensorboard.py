@@ -19,17 +19,12 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import wraps
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, Final
 
-import numpy as np
-
-from runner.errors import ConfigError
 from runner.integrations.hooks import open_runs
 from runner.integrations.script import ScriptRun
-from runner.integrations.shapes import WithoutEffect, as_run_name, forgiving, without_effect
-from runner.loops.media import film_of, grid_of, histogram_of, picture_of
-from runner.loops.recorded import ending_of
-from runner.loops.values import as_array
+from runner.integrations.shapes import Tracker, as_number, as_run_name, forgiving, logs
+from runner.loops.media import film_of, histogram_of, picture_of
 from runner.runs.run import Run
 
 _HYPERPARAMETERS: Final = re.compile(r"\|param\|value\|\n\|-\|-\|\n", re.ASCII)
@@ -38,7 +33,27 @@ _WRITERS: Final = ("torch.utils.tensorboard.writer", "tensorboardX.writer")
 """The modules of the writers from which `forward` takes values."""
 
 
-class SummaryWriter:
+def log_text(script: ScriptRun, name: str, text: str, step: object) -> None:
+    """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
+    if script.is_waiting and (match := _HYPERPARAMETERS.search(text)):
+        script.settings = _settings(text[match.end() :]) | script.settings
+    script.log(name, text, step)
+
+
+def _settings(table: str) -> dict[str, object]:
+    """Return the rows `|name|value|` of a Markdown table; values as Python writes them, else as text."""
+    settings: dict[str, object] = {}
+    for line in table.splitlines():
+        if match := re.fullmatch(r"\|([^|]+)\|(.*)\|", line.strip()):
+            name, text = match.groups()
+            try:
+                settings[name] = ast.literal_eval(text)
+            except (ValueError, SyntaxError, MemoryError, RecursionError):
+                settings[name] = text
+    return settings
+
+
+class SummaryWriter(Tracker):
     """Records what is written as TensorBoard's own writer would log it; a context manager.
 
         writer = SummaryWriter("runs/CartPole-v1__ppo__1")
@@ -59,6 +74,8 @@ class SummaryWriter:
     What cannot be recorded gives a warning for each method, and no error unless `on_error="raise"`. Methods
     that TensorBoard's writer may have and this one has not do nothing, with a warning.
     """
+
+    _shape = "SummaryWriter"
 
     def __init__(
         self,
@@ -112,83 +129,19 @@ class SummaryWriter:
         """Log a number."""
         try:
             self.script.log(tag, as_number(tag, scalar_value), global_step)
-        except Exception as error:  # as `forgiving` does, which would take a tenth of the time
+        except Exception as error:  # as `logs` does, which would double the time
             self.script.leave_out(error, "add_scalar")
 
-    @forgiving
-    def add_scalars(
-        self,
-        main_tag: str,
-        tag_scalar_dict: Mapping[str, object],
-        global_step: object = None,
-        *_: object,
-        **__: object,
-    ) -> None:
-        """Log several numbers, as `main_tag/name`."""
-        for name, value in tag_scalar_dict.items():
-            self.add_scalar(f"{main_tag}/{name}", value, global_step)
-
-    @forgiving
-    def add_text(
-        self,
-        tag: str,
-        text_string: str,
-        global_step: object = None,
-        *_: object,
-        **__: object,
-    ) -> None:
-        """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
-        if self.script.is_waiting and (match := _HYPERPARAMETERS.search(str(text_string))):
-            self.script.settings = _settings(text_string[match.end() :]) | self.script.settings
-        self.script.log(tag, str(text_string), global_step)
-
-    @forgiving
-    def add_histogram(
-        self,
-        tag: str,
-        values: object,
-        global_step: object = None,
-        *_: object,
-        **__: object,
-    ) -> None:
-        """Record a histogram of 64 bins: the arrays `tag/counts` and `tag/edges`."""
-        self.script.snapshot(tag, histogram_of(values), global_step)
-
-    @forgiving
-    def add_tensor(
-        self,
-        tag: str,
-        tensor: object,
-        global_step: object = None,
-        *_: object,
-        **__: object,
-    ) -> None:
-        """Record an array."""
-        self.script.snapshot(tag, tensor, global_step)
-
-    @forgiving
-    def add_image(
-        self,
-        tag: str,
-        img_tensor: object,
-        global_step: object = None,
-        dataformats: str = "CHW",
-        **_: object,
-    ) -> None:
-        """Record a picture."""
-        self.script.picture(tag, picture_of(img_tensor, dataformats.upper()), global_step)
-
-    @forgiving
-    def add_images(
-        self,
-        tag: str,
-        img_tensor: object,
-        global_step: object = None,
-        dataformats: str = "NCHW",
-        **_: object,
-    ) -> None:
-        """Record several pictures as one."""
-        self.script.picture(tag, picture_of(grid_of(img_tensor, dataformats.upper())), global_step)
+    add_text = logs(log_text, str, "tag text_string global_step")
+    add_histogram = logs(ScriptRun.snapshot, histogram_of, "tag values global_step")
+    add_tensor = logs(ScriptRun.snapshot, lambda tensor: tensor, "tag tensor global_step")
+    add_image = logs(
+        ScriptRun.picture, picture_of, "tag img_tensor global_step walltime dataformats", dataformats="CHW"
+    )
+    add_images = logs(
+        ScriptRun.picture, picture_of, "tag img_tensor global_step walltime dataformats", dataformats="NCHW"
+    )
+    add_video = logs(ScriptRun.picture, film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
 
     @forgiving
     def add_figure(
@@ -206,17 +159,17 @@ class SummaryWriter:
                 pyplot.close(each)
 
     @forgiving
-    def add_video(
+    def add_scalars(
         self,
-        tag: str,
-        vid_tensor: object,
+        main_tag: str,
+        tag_scalar_dict: Mapping[str, object],
         global_step: object = None,
-        fps: float = 4,
-        dataformats: str = "NTCHW",
-        **_: object,
+        *_: object,
+        **__: object,
     ) -> None:
-        """Record a film."""
-        self.script.picture(tag, film_of(vid_tensor, dataformats.upper(), fps), global_step)
+        """Log several numbers, as `main_tag/name`."""
+        for name, value in tag_scalar_dict.items():
+            self.add_scalar(f"{main_tag}/{name}", value, global_step)
 
     @forgiving
     def add_hparams(
@@ -235,9 +188,6 @@ class SummaryWriter:
         for name, value in metric_dict.items():
             self.add_scalar(name, value, global_step)
 
-    def __getattr__(self, name: str) -> WithoutEffect:
-        return without_effect("SummaryWriter", name)
-
     # --- the end ------------------------------------------------------------------------------------------
 
     def flush(self) -> None:
@@ -245,18 +195,13 @@ class SummaryWriter:
 
     def close(self) -> None:
         """End the run as finished, unless something else does."""
-        if self._is_own:
-            self.script.close()
+        self._end()
 
     finish = close  # TorchRL's loggers end by it what has it
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: Any) -> Literal[False]:
+    def _end(self, status: str = "finished", error: str = "") -> None:
         if self._is_own:
-            self.script.close(*ending_of(raised[1]))
-        return False
+            self.script.close(status, error)
 
 
 def run_name(log_dir: str) -> str | None:
@@ -264,35 +209,6 @@ def run_name(log_dir: str) -> str | None:
     parts = Path(log_dir).parts
     inside = parts[parts.index("runs") + 1 :] if "runs" in parts[:-1] else parts[-1:]
     return as_run_name("/".join(inside))
-
-
-def as_number(name: str, value: object) -> object:
-    """Return a number, also one that stands in an array or tensor of one; text is refused.
-
-    Raises:
-        ConfigError: it is something else.
-    """
-    if value.__class__ is float:
-        return value
-    try:
-        return float(np.asarray(as_array(value)).astype(np.float64, casting="same_kind").item())
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise ConfigError(
-            f"add_scalar: found {type(value).__name__} for {name!r}, expected a number"
-        ) from error
-
-
-def _settings(table: str) -> dict[str, object]:
-    """Return the rows `|name|value|` of a Markdown table; values as Python writes them, else as text."""
-    settings: dict[str, object] = {}
-    for line in table.splitlines():
-        if match := re.fullmatch(r"\|([^|]+)\|(.*)\|", line.strip()):
-            name, text = match.groups()
-            try:
-                settings[name] = ast.literal_eval(text)
-            except (ValueError, SyntaxError, MemoryError, RecursionError):
-                settings[name] = text
-    return settings
 
 
 # --- other writers ------------------------------------------------------------------------------------------

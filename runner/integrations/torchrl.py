@@ -20,10 +20,13 @@ from numpy.typing import NDArray
 
 from runner.errors import ConfigError
 from runner.integrations.libraries import require_tested
-from runner.integrations.tensorboard import SummaryWriter
+from runner.integrations.script import ScriptRun
+from runner.integrations.shapes import logs
+from runner.integrations.tensorboard import SummaryWriter, log_text
 from runner.loops.batches import RecordedBatches, record_batches
 from runner.loops.env import record as record_env
 from runner.loops.loop import Loop
+from runner.loops.media import film_of, histogram_of
 from runner.loops.options import RunOptions
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array
@@ -243,28 +246,21 @@ class Logger(_Logger):  # type: ignore[misc]
 
     def _create_experiment(self) -> SummaryWriter:
         writer = SummaryWriter(recordings=self.log_dir)
-        writer.script.name = self.exp_name
+        self.script = writer.script
+        self.script.name = self.exp_name
         return writer
+
+    log_str = logs(log_text, str, "name value step")
+    log_histogram = logs(ScriptRun.snapshot, histogram_of, "name data step")
+    log_video = logs(ScriptRun.picture, film_of, "name video step", dataformats="NTCHW", fps=30)
 
     def log_scalar(self, name: str, value: object, step: int | None = None) -> None:
         """Log a number."""
         self.experiment.add_scalar(name, value, step)
 
-    def log_str(self, name: str, value: str, step: int | None = None) -> None:
-        """Log a text."""
-        self.experiment.add_text(name, value, step)
-
-    def log_video(self, name: str, video: object, step: int | None = None, **more: object) -> None:
-        """Record a film, [batch, time, channels, height, width]."""
-        self.experiment.add_video(name, video, step, more.get("fps", 30))
-
     def log_hparams(self, cfg: object) -> None:
         """Record settings."""
         self.experiment.add_hparams(as_mapping(cfg) or {"config": str(cfg)}, {})
-
-    def log_histogram(self, name: str, data: object, **more: object) -> None:
-        """Record a histogram of 64 bins: the arrays `name/counts` and `name/edges`."""
-        self.experiment.add_histogram(name, data, more.get("step"))
 
     def shutdown(self, timeout: float | None = None) -> None:
         """Close the logger, and the recordings of environments that are closed."""

@@ -64,7 +64,7 @@ class Picture:
 BINS: Final = 64
 
 
-def picture_of(value: Any, layout: str = "HWC", fps: float = 4.0) -> Picture:
+def picture_of(value: Any, dataformats: str = "HWC", fps: float = 4.0) -> Picture:
     """Return an array, tensor, Pillow image, Matplotlib figure or image file as a picture or film.
 
     Floats are taken as 0 to 1, whole numbers as 0 to 255, booleans as black and white. Gray becomes RGB, and
@@ -72,7 +72,7 @@ def picture_of(value: Any, layout: str = "HWC", fps: float = 4.0) -> Picture:
 
     Args:
         value: the picture.
-        layout: what the axes of an array are, in TensorBoard's letters: N or T (frames), C, H, W.
+        dataformats: what the axes of an array are, in TensorBoard's letters: N or T (frames), C, H, W.
         fps: frames per second of a film.
 
     Raises:
@@ -88,11 +88,11 @@ def picture_of(value: Any, layout: str = "HWC", fps: float = 4.0) -> Picture:
         save(drawn := io.BytesIO(), format="png")
         value = pillow().open(drawn)
     if callable(convert := getattr(value, "convert", None)):
-        value, layout = np.asarray(convert("RGB")), "HWC"
-    return Picture(_pixels(_numbers(value), layout), fps)
+        value, dataformats = np.asarray(convert("RGB")), "HWC"
+    return Picture(_pixels(_numbers(value), dataformats), fps)
 
 
-def film_of(value: object, layout: str, fps: float | None) -> Picture:
+def film_of(value: object, dataformats: str, fps: float | None) -> Picture:
     """Return a film: an array or tensor, or the path of a video file.
 
     Raises:
@@ -100,7 +100,7 @@ def film_of(value: object, layout: str, fps: float | None) -> Picture:
         MissingExtra: PyAV, which reads video files, is not installed.
     """
     if not isinstance(value, str | os.PathLike):
-        return picture_of(value, layout, fps or 4.0)
+        return picture_of(value, dataformats, fps or 4.0)
     av = require("av", extra="film", purpose="reading a video file")
     try:
         with av.open(os.fspath(value)) as file:
@@ -111,17 +111,6 @@ def film_of(value: object, layout: str, fps: float | None) -> Picture:
     if not frames:
         raise ConfigError(f"film: {os.fspath(value)} has no frames")
     return Picture(np.stack(frames), fps or own_fps)
-
-
-def grid_of(value: object, layout: str) -> Array:
-    """Return several pictures as one, next to each other in rows: [height, width, channels]."""
-    array = _numbers(value)
-    if array.ndim != 4 or sorted(layout) != sorted("NCHW"):
-        raise ConfigError(
-            f"images: found shape {list(array.shape)} as {layout}, expected four axes of N, C, H, W"
-        )
-    images = array.transpose([layout.index(axis) for axis in "NHWC"])
-    return _tiled(images)
 
 
 def histogram_of(values: object) -> dict[str, Array]:
@@ -148,8 +137,7 @@ def _tiled(images: NDArray[Any]) -> NDArray[Any]:
 
 def _pixels(array: NDArray[Any], layout: str) -> NDArray[np.uint8]:
     """Return an array as [frames, height, width, 3] of uint8."""
-    if layout == "HWC" and array.ndim == 2:
-        layout = "HW"
+    layout = "HW" if layout == "HWC" and array.ndim == 2 else layout.upper()
     if (
         len(layout) != array.ndim
         or len(set(layout)) != len(layout)

@@ -19,18 +19,25 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, Final
 
 import numpy as np
 
 from runner.errors import ConfigError, RunnerError
 from runner.integrations.script import ScriptRun
-from runner.integrations.shapes import WithoutEffect, as_run_name, forgiving, warn_once, without_effect
-from runner.integrations.tensorboard import as_number, end_forwarding, forward
+from runner.integrations.shapes import (
+    Tracker,
+    WithoutEffect,
+    as_number,
+    as_run_name,
+    forgiving,
+    warn_once,
+    without_effect,
+)
+from runner.integrations.tensorboard import end_forwarding, forward
 from runner.integrations.wandb.settings import Config, Summary
 from runner.loops.media import Histogram, Image
 from runner.loops.options import settings_in
-from runner.loops.recorded import ending_of
 from runner.runs.listing import list_runs
 from runner.util.jsonable import as_json
 from runner.util.values import flatten
@@ -55,10 +62,11 @@ _IGNORED: Final = frozenset(
 # --- a run --------------------------------------------------------------------------------------------------
 
 
-class Tracked:
+class Tracked(Tracker):
     """A run, as `wandb.init` returns it; a context manager."""
 
     resumed = False
+    _shape = "wandb"
 
     def __init__(self, script: ScriptRun, own_id: str | None, is_disabled: bool) -> None:
         self.script, self._id, self._is_disabled = script, own_id, is_disabled
@@ -175,9 +183,12 @@ class Tracked:
 
     def finish(self, exit_code: int | None = None, quiet: bool | None = None) -> None:  # noqa: ARG002
         """End the run: as failed if the exit code is not 0."""
-        self._end("failed" if exit_code else "finished", f"exit code {exit_code}" if exit_code else "")
+        if exit_code:
+            self._end("failed", f"exit code {exit_code}")
+        else:
+            self._end()
 
-    def _end(self, status: str, error: str) -> None:
+    def _end(self, status: str = "finished", error: str = "") -> None:
         global run  # noqa: PLW0603 - wandb.run is part of the shape
         if self.script.has_writer is False:
             self.script.warn_once(
@@ -194,16 +205,6 @@ class Tracked:
         if not self._is_disabled:
             for name, value in self.summary.own.items():
                 self._log(f"summary/{name}", value, None)
-
-    def __getattr__(self, name: str) -> WithoutEffect:
-        return without_effect("wandb", name)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *raised: Any) -> Literal[False]:
-        self._end(*ending_of(raised[1]))
-        return False
 
 
 run: Tracked | None = None
