@@ -22,13 +22,14 @@ from gymnasium.vector import VectorEnv
 from runner.loops.recorded import Recorded
 
 OTHERS: Final = "other environments"
-"""What the one warning of environments that a run does not record is about."""
+"""The subject of the warning that a run does not record further environments."""
+_BASES: Final[tuple[Any, ...]] = (gymnasium.Env, VectorEnv)
 _VECTORS_OF_OTHERS: Final = {
     "stable_baselines3": "runner.integrations.sb3.Recording",
     "torchrl": "runner.integrations.torchrl.record",
     "ray": "runner.integrations.rllib.Recording",
 }
-"""Libraries that step several environments one by one, and what records these."""
+"""Libraries that step environments in vectors of their own, and what records these."""
 
 
 class WaitingRun(Protocol):
@@ -61,14 +62,14 @@ class WaitingRun(Protocol):
 class WatchedEnvironment:
     """An environment of a script whose resets and steps go through its recorded twin.
 
-    The script keeps its own object, whose `step` and `reset` call the twin; the twin calls what they were.
+    The script keeps its object. The object's `step` and `reset` call the twin, which calls the original ones.
     """
 
     def __init__(self, env: object, recorded: Recorded) -> None:
         self._env = env
         self._recorded: Any = recorded
         self.is_inside = False
-        """Whether the twin is being called, so that calls of the environment are its own."""
+        """Whether the twin is calling the environment."""
         _watched[id(env)] = self
         for name, method in _METHODS.items():
             object.__setattr__(env, name, MethodType(method, env))
@@ -80,7 +81,7 @@ class WatchedEnvironment:
         arguments: Sequence[object],
         named: Mapping[str, object],
     ) -> object:
-        """Call `step` or `reset` of the twin, or the environment's own if the twin is being called."""
+        """Call `step` or `reset` of the twin, or the original one if the twin is calling."""
         if self.is_inside:
             return original(*arguments, **named)
         self.is_inside = True
@@ -100,13 +101,13 @@ class WatchedEnvironment:
 open_runs: list[WaitingRun] = []
 """The runs of scripts that are not closed, the oldest first."""
 _watched: dict[int, WatchedEnvironment] = {}
-"""By the id of the environment; a copy of it is not one of them."""
+"""By the id of the environment, so that a copy of it is not watched."""
 _hooked: weakref.WeakKeyDictionary[Any, tuple[Callable[..., object], bool]] = weakref.WeakKeyDictionary()
-"""The classes whose `reset` looks for a run that waits, with that function, and whether they had one."""
+"""The classes that are hooked: the function that replaces `reset`, and whether the class had its own."""
 
 
 def _own(name: str) -> Callable[..., object]:
-    """Return a method of an environment that is recorded; a copy of it, which is not, just does it."""
+    """Return the `step` or `reset` of a recorded environment; a copy is not recorded."""
 
     def call(env: Any, *arguments: object, **named: object) -> object:
         original = MethodType(getattr(type(env), name), env)
@@ -115,7 +116,7 @@ def _own(name: str) -> Callable[..., object]:
             return original(*arguments, **named)
         return watched.call(name, original, arguments, named)
 
-    call.__name__ = name  # by which a pickled environment finds its own
+    call.__name__ = name  # pickle finds the method of an unpickled environment by it
     return call
 
 
@@ -126,7 +127,7 @@ def _reset(
     env: object, original: Callable[..., object], arguments: Sequence[object], named: Mapping[str, object]
 ) -> object:
     """Reset an environment; begin to record it if a run waits for one."""
-    if id(env) in _watched or any(each.is_inside for each in _watched.values()):
+    if id(env) in _watched or any(watched.is_inside for watched in _watched.values()):
         return original(env, *arguments, **named)
     _find_run(env)
     watched = _watched.get(id(env))
@@ -159,9 +160,7 @@ def _find_run(env: object) -> None:
 
 
 def _library_that_resets() -> str | None:
-    """Return the library of vectors of its own whose code resets the environment, if one does."""
-    if not any(name in sys.modules for name in _VECTORS_OF_OTHERS):
-        return None
+    """Return the library that resets the environment, if it steps vectors of its own."""
     frame: FrameType | None = sys._getframe(2)
     while frame is not None:
         top = str(frame.f_globals.get("__name__")).partition(".")[0]
@@ -173,29 +172,22 @@ def _library_that_resets() -> str | None:
 
 def update_hooks() -> None:
     """Let every class of environments look for a run when one is reset, as long as a run needs it."""
-    bases: tuple[Any, ...] = (gymnasium.Env, VectorEnv)
     is_needed = any(run.looks_at_resets for run in open_runs)
-    if is_needed == bool(_hooked):
-        return
-    for base in bases:
-        if not is_needed:
-            del base.__init_subclass__
-            continue
-        classes = [base]
-        while classes:
-            cls = classes.pop()
-            _hook(cls)
-            classes += cls.__subclasses__()
-        _hook_subclasses(base)
-    for cls, (reset, has_own) in list(_hooked.items()) if not is_needed else ():
-        if vars(cls).get("reset") is reset:  # nobody else replaced it meanwhile
-            del cls.reset
-            if has_own:
-                cls.reset = reset.__wrapped__
-        del _hooked[cls]
+    if is_needed and not _hooked:
+        for base in _BASES:
+            _hook_with_subclasses(base)
+    elif _hooked and not is_needed:
+        _take_hooks_off()
 
 
-def _hook_subclasses(base: Any) -> None:
+def _hook_with_subclasses(base: Any) -> None:
+    """Hook a class of environments, its subclasses, and those that are defined from now on."""
+    classes = [base]
+    while classes:
+        cls = classes.pop()
+        _hook(cls)
+        classes += cls.__subclasses__()
+
     def hook_subclass(cls: Any, /, **named: object) -> None:
         super(base, cls).__init_subclass__(**named)
         _hook(cls)
@@ -204,10 +196,11 @@ def _hook_subclasses(base: Any) -> None:
 
 
 def _hook(cls: Any) -> None:
-    owner = next((each for each in cls.__mro__ if "reset" in vars(each)), None)
+    """Replace the `reset` of a class, wherever it inherits it: EnvPool's is not of a class of Gymnasium's."""
+    owner = next((base for base in cls.__mro__ if "reset" in vars(base)), None)
     if owner is None or owner in _hooked:
         return
-    original = vars(owner)["reset"]  # of EnvPool's classes that of one that is none of Gymnasium's
+    original = vars(owner)["reset"]
 
     @functools.wraps(original)
     def reset(self: object, *arguments: object, **named: object) -> object:
@@ -215,6 +208,18 @@ def _hook(cls: Any) -> None:
 
     _hooked[cls] = reset, owner is cls
     cls.reset = reset
+
+
+def _take_hooks_off() -> None:
+    """Give all classes their own `reset` back, unless somebody else replaced it meanwhile."""
+    for base in _BASES:
+        del base.__init_subclass__
+    for cls, (reset, has_own) in _hooked.items():
+        if vars(cls).get("reset") is reset:
+            del cls.reset
+            if has_own:
+                cls.reset = reset.__wrapped__
+    _hooked.clear()
 
 
 def _after_fork() -> None:

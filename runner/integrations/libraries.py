@@ -66,7 +66,7 @@ def check_callback(
 
 def as_setting(value: object, depth: int = 0) -> object:
     """Return a library's setting as JSON holds it; what JSON cannot hold, such as a class, by its name."""
-    if value is None or isinstance(value, bool | int | float | str | np.generic | np.ndarray):
+    if isinstance(value, int | float | str | np.generic | np.ndarray | None):
         return value
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         return {str(key): as_setting(part, depth + 1) for key, part in value.items()}
@@ -74,7 +74,7 @@ def as_setting(value: object, depth: int = 0) -> object:
         value = sorted(value, key=repr)
     if isinstance(value, list | tuple) and depth < _MAX_DEPTH:
         return [as_setting(part, depth + 1) for part in value]
-    if isinstance(value, type) or callable(value):
+    if callable(value):
         return getattr(value, "__qualname__", type(value).__name__)
     text = str(value)
     return type(value).__name__ if " at 0x" in text else text[:_MAX_TEXT]

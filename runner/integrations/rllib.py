@@ -9,8 +9,8 @@ from __future__ import annotations
 import inspect
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, Final, Unpack
@@ -35,7 +35,6 @@ from runner.loops.vector import (
     record_vector,
 )
 from runner.recording.maker import EnvironmentMaker
-from runner.runs.run import Run
 from runner.util.values import Json, flatten
 
 require_tested("ray", "rllib", ("2.60", "2.60"))
@@ -49,16 +48,9 @@ _RESULTS: Final = ("training_iteration", "env_runners", "learners", "evaluation"
 """What is logged of an iteration's result, in this order: plots and pages show the first names."""
 _CLOCK: Final = re.compile(r"(^|/)(timers|sample|[^/]*(_timer|throughput|_sec_|_between_)[^/]*)(/|$)")
 """What is not logged, because it differs between two runs that are otherwise the same."""
+_OF_THE_RUN: Final = ("name", "seed", "config")
+"""The arguments that env runners, which join the run, do not get."""
 _STEPS: Final = "num_env_steps_sampled_lifetime"
-
-
-@dataclass(frozen=True)
-class _Join:
-    """What an env runner needs to record its environments."""
-
-    run: Run
-    phase: str
-    options: Mapping[str, Any]
 
 
 class Recording:
@@ -91,9 +83,8 @@ class Recording:
         **options: Unpack[CallbackOptions],
     ) -> None:
         check_callback(recordings, checkpoint_every, options)
-        own = ("name", "seed", "config")
-        self.name, self.seed, self.config = (options.get(name) for name in own)
-        self.options = {name: value for name, value in options.items() if name not in own}
+        self.name, self.seed, self.config = (options.get(name) for name in _OF_THE_RUN)
+        self.options = {name: value for name, value in options.items() if name not in _OF_THE_RUN}
         self.make = checked_make(self.options.get("make"))
         folder = recordings if recordings is None else os.fspath(recordings)
         self.recordings = folder if folder is None or "://" in folder else os.path.abspath(folder)  # noqa: PTH100
@@ -113,13 +104,9 @@ class _Run(Recorded):
         self._record_into(loop)
         self._enter("train")
 
-    def end(self, error: str = "") -> None:
-        """Close the run."""
-        self._loop.close("failed" if error else "finished", error)
-
 
 class _Callbacks(RLlibCallback):  # type: ignore[misc]
-    """What RLlib calls: in the algorithm's process, and in those of env runners."""
+    """What RLlib calls, in the process of the algorithm and in the processes of env runners."""
 
     def __init__(self, recording: Recording) -> None:
         super().__init__()
@@ -136,15 +123,13 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             RunnerError: one cannot record its environments.
         """
         run = self._begin(algorithm)
-        self._run = run
         for group in _groups(algorithm):
-            reasons = group.foreach_env_runner(self._joining(group is not algorithm.env_runner_group))
-            if reason := next(filter(None, reasons), ""):
-                self._run = None
-                for each in _groups(algorithm):
-                    each.foreach_env_runner(_leave)
-                run.end(reason)
+            if reason := self._join(run, group, group is not algorithm.env_runner_group):
+                for joined in _groups(algorithm):
+                    joined.foreach_env_runner(_leave)
+                run._loop.close("failed", reason)
                 raise RunnerError(reason)
+        self._run = run
         stop = algorithm.cleanup
 
         def cleanup() -> None:
@@ -163,12 +148,12 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         """
         recording, config = self._recording, algorithm.config
         describe = partial(_described, recording.make)
-        descriptions = [each for each in algorithm.env_runner_group.foreach_env_runner(describe) if each]
-        if not descriptions:
+        described_by = next(filter(None, algorithm.env_runner_group.foreach_env_runner(describe)), None)
+        if described_by is None:
             raise EnvironmentNotUsable(
                 f"found no environment in the env runners of {type(algorithm).__name__}, expected one"
             )
-        described, maker = descriptions[0]
+        described, maker = described_by
         name = f"{type(algorithm).__name__}-{described.env_id.rpartition('/')[2]}"
         if trial := getattr(getattr(algorithm, "_storage", None), "trial_dir_name", None):
             name = re.sub(r"_[\d-]{10}_[\d-]{8}$", "", trial)  # RLlib keeps no other name of a trial
@@ -189,22 +174,21 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         )
         return _Run(Loop(described, options, maker))
 
-    def _joining(self, is_evaluation: bool) -> Callable[[object], str]:
-        """Return what has an env runner record its environments; it is sent to the process of each."""
-        assert self._run is not None
+    def _join(self, run: _Run, group: Any, is_evaluation: bool, **runners: object) -> str:
+        """Have env runners record their environments; return why one of them cannot."""
         phase = "eval" if is_evaluation else "train"
-        return partial(_why_not_joined, _Join(self._run.run, phase, self._recording.options))
+        join = partial(_why_not_joined, {"join": run.run, "phase": phase, **self._recording.options})
+        return next(filter(None, group.foreach_env_runner(join, **runners)), "")
 
     def on_env_runners_recreated(
         self, *, env_runner_group: Any, env_runner_indices: list[int], is_evaluation: bool, **_: object
     ) -> None:
         """Have env runners join that take the place of others which failed."""
-        if self._run is not None:
-            reasons = env_runner_group.foreach_env_runner(
-                self._joining(is_evaluation), remote_worker_ids=env_runner_indices, local_env_runner=False
-            )
-            if reason := next(filter(None, reasons), ""):
-                warn_user(f"run {self._run.run.run_id}: an env runner is not recorded any more: {reason}")
+        if self._run is None:
+            return
+        runners = {"remote_worker_ids": env_runner_indices, "local_env_runner": False}
+        if reason := self._join(self._run, env_runner_group, is_evaluation, **runners):
+            warn_user(f"run {self._run.run.run_id}: an env runner is not recorded any more: {reason}")
 
     def on_evaluate_start(self, *, algorithm: Algorithm, **_: object) -> None:
         """State in the evaluating env runners how many steps were trained on."""
@@ -222,37 +206,25 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         self._iterations += 1
         every = self._recording.checkpoint_every
         if every and self._iterations % every == 0:
-            self._checkpoint(algorithm)
-
-    def _checkpoint(self, algorithm: Algorithm) -> None:
-        """Keep the weights of the algorithm's module, or of the module of each policy."""
-        assert self._run is not None
-        policies = algorithm.config.policies if algorithm.config.is_multi_agent else ()
-        modules = {name: algorithm.get_module(name) for name in policies} or {
-            "module": algorithm.get_module()
-        }
-        for name, module in modules.items():
-            state = flatten(module.get_state(inference_only=True), separator="/")
-            if arrays := {key: value for key, value in state.items() if hasattr(value, "dtype")}:
-                self._run.checkpoint(name, arrays)
+            _checkpoint(self._run, algorithm)
 
     def _end(self, algorithm: Algorithm) -> None:
         """End the run; the env runners are still there."""
-        if self._run is None:
+        run, self._run = self._run, None
+        if run is None:
             return
-        run, self._run, error = self._run, None, ""
         every = self._recording.checkpoint_every
         try:
             if every and self._iterations % every:
-                self._run = run
-                self._checkpoint(algorithm)
-                self._run = None
+                _checkpoint(run, algorithm)
             for group in _groups(algorithm):
                 group.foreach_env_runner(_leave)
         except Exception as failure:
-            error = truncated_message(failure)
-            warn_user(f"run {run.run.run_id}: its env runners could not be asked to finish: {error}")
-        run.end()
+            warn_user(
+                f"run {run.run.run_id}: its env runners could not be asked to finish: "
+                f"{truncated_message(failure)}"
+            )
+        run.close()
 
     # --- in the process of an env runner --------------------------------------------------------------
 
@@ -260,6 +232,16 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         """Record environments that an env runner made again."""
         if (join := getattr(env_runner, "_recorded_join", None)) is not None:
             _join(join, env_runner)
+
+
+def _checkpoint(run: _Run, algorithm: Algorithm) -> None:
+    """Keep the weights of the algorithm's module, or of the module of each policy."""
+    policies = algorithm.config.policies if algorithm.config.is_multi_agent else ()
+    modules = {name: algorithm.get_module(name) for name in policies} or {"module": algorithm.get_module()}
+    for name, module in modules.items():
+        state = flatten(module.get_state(inference_only=True), separator="/")
+        if arrays := {key: value for key, value in state.items() if hasattr(value, "dtype")}:
+            run.checkpoint(name, arrays)
 
 
 def _groups(algorithm: Algorithm) -> Iterator[Any]:
@@ -311,42 +293,47 @@ def _game(env_runner: Any, env: object) -> MultiAgent:
     return MultiAgent(env, name, creator, {first.name: dict(env_runner.config.env_config)})
 
 
-def _why_not_joined(join: _Join, env_runner: object) -> str:
+def _why_not_joined(options: Mapping[str, Any], env_runner: object) -> str:
     """Have an env runner record its environments; return why it cannot, because RLlib only logs an error."""
     try:
-        _join(join, env_runner)
+        _join(options, env_runner)
     except Exception as error:
         return truncated_message(error)
     return ""
 
 
-def _join(join: _Join, env_runner: Any) -> None:
-    """Record the environments of an env runner from now on; called in its process."""
+def _join(options: Mapping[str, Any], env_runner: Any) -> None:
+    """Record the environments of an env runner from now on; called in its process.
+
+    Args:
+        options: the arguments with which they are recorded, `join` and `phase` among them.
+        env_runner: the env runner.
+    """
     outer = getattr(env_runner, "env", None)
     if outer is None or _recorded(env_runner):
         return
-    kind = "evaluation" if join.phase == "eval" else "env-runner"
+    kind = "evaluation" if options["phase"] == "eval" else "env-runner"
     shard = f"{kind}-{env_runner.worker_index or 0}"
-    if not join.run.folder.is_dir():
+    folder = options["join"].folder
+    if not folder.is_dir():
         raise RunnerError(
-            f"found no folder {join.run.folder} on the node of an env runner, expected a recordings folder "
-            "that all nodes share"
+            f"found no folder {folder} on the node of an env runner, expected a recordings folder that all "
+            "nodes share"
         )
-    options: dict[str, Any] = {"join": join.run, "phase": join.phase, **join.options}
     if isinstance(outer, VectorMultiAgentEnv):
         for i, env in enumerate(outer.envs):
-            own = shard if len(outer.envs) == 1 else f"{shard}.{i}"
-            outer.envs[i] = record_parallel(_game(env_runner, env), shard=own, **options)
+            name = shard if len(outer.envs) == 1 else f"{shard}.{i}"
+            outer.envs[i] = record_parallel(_game(env_runner, env), shard=name, **options)
     else:
         outer.env = record_vector(outer.env, shard=shard, **options)
-    env_runner._recorded_join = join
+    env_runner._recorded_join = options
 
 
 def _recorded(env_runner: object) -> list[Recorded]:
     """Return what an env runner has recorded: its vector, or each of its environments of several agents."""
     outer = getattr(env_runner, "env", None)
     inner = outer.envs if isinstance(outer, VectorMultiAgentEnv) else [getattr(outer, "env", None)]
-    return [each for each in inner if isinstance(each, Recorded)]
+    return [env for env in inner if isinstance(env, Recorded)]
 
 
 def _evaluate_at(steps: int, env_runner: object) -> None:

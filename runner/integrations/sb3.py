@@ -159,7 +159,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
     def _write_into(self, recorded: Logs) -> None:
         """Let the model's logger write into a recording."""
         formats = self.logger.output_formats
-        formats[:] = [one for one in formats if not isinstance(one, _LogWriter)]
+        formats[:] = [output for output in formats if not isinstance(output, _LogWriter)]
         self._writer = _LogWriter(recorded)
         formats.append(self._writer)
 
@@ -179,8 +179,10 @@ class Recording(BaseCallback):  # type: ignore[misc]
         return self._envs is None or not self.recorded.should_stop
 
     def _on_training_end(self) -> None:
-        has_updated = self.model._n_updates != self._updates
-        self._writer.write_rest(self.logger.name_to_value, has_updated)
+        if self.model._n_updates != self._updates:
+            self._writer.log(self.logger.name_to_value)
+        else:  # the numbers of updates are of an earlier one
+            self._writer.write(self.logger.name_to_value, {})
         if self._writer in self.logger.output_formats:  # another callback may have set another logger
             self.logger.output_formats.remove(self._writer)
         if self._checkpoint_every:
@@ -191,7 +193,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
     def record_evaluations(self, envs: VecEnv) -> None:
         """Record the environments of an `EvalCallback` as the evaluation phase of the run.
 
-        They become a shard of it, because they may be another number than those of training.
+        They become a shard of it, because there may be more or fewer of them than in training.
         """
         base = envs.unwrapped
         earlier = RecordedVecEnv.replacing(base)
@@ -200,13 +202,13 @@ class Recording(BaseCallback):  # type: ignore[misc]
         if earlier is not None:
             earlier.end("interrupted")
         try:
-            own = RecordedVecEnv(base, {"join": self.run, "phase": "eval", "shard": "evaluation"})
+            evaluated = RecordedVecEnv(base, {"join": self.run, "phase": "eval", "shard": "evaluation"})
         except (ConfigError, EnvironmentNotUsable) as error:
             warn_user(f"The evaluations of EvalCallback are not recorded: {error}")
             return
-        own.training_steps = lambda: self.recorded._rows.progress[0]
-        own.replace_methods()
-        self._evaluations.append(own)
+        evaluated.training_steps = lambda: self.recorded._rows.progress[0]
+        evaluated.replace_methods()
+        self._evaluations.append(evaluated)
 
     def _checkpoint(self) -> None:
         self.recorded.checkpoint("policy", self.model.policy.state_dict())
@@ -222,8 +224,8 @@ class Logs(Protocol):
 class _LogWriter(KVWriter):  # type: ignore[misc]
     """Records what the library's logger writes: numbers and texts.
 
-    A model writes the numbers of an update later, with those of the next rollout or episode. Here those of
-    the first update after each time that it writes are recorded, and those of the last, at their own steps.
+    A model writes the numbers of an update late, with the numbers of the next rollout or episode. Recorded
+    are the first update after each time that it writes, and the last one, each at its own step.
     """
 
     def __init__(self, recorded: Logs) -> None:
@@ -245,16 +247,6 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
         if self._is_update_due and not self._of_updates.isdisjoint(key_values):
             self.log({name: value for name, value in key_values.items() if name in self._of_updates})
             self._is_update_due = False
-
-    def write_rest(self, key_values: Mapping[str, object], has_updated: bool) -> None:
-        """Record at the end what the library does not write any more.
-
-        Args:
-            key_values: numbers and texts by name.
-            has_updated: whether an update followed the last steps; else its numbers are of an earlier one.
-        """
-        names = set(key_values) if has_updated else key_values.keys() - self._of_updates
-        self.log({name: value for name, value in key_values.items() if name in names})
 
     def log(self, key_values: Mapping[str, Any]) -> None:
         """Record numbers and texts by name; figures, pictures, films and histograms are left out."""
@@ -343,12 +335,12 @@ def _announce(setup_learn: Callable[..., object]) -> Callable[..., object]:
         **named: object,
     ) -> object:
         callbacks = list(_callbacks_in(callback))
-        recordings = [one for one in callbacks if isinstance(one, Recording)]
+        recordings = [part for part in callbacks if isinstance(part, Recording)]
         if len(recordings) > 1:
             raise ConfigError(f"found {len(recordings)} callbacks Recording, expected one")
         for recording in recordings:
             recording.begin(model, is_continued=not reset_num_timesteps and model._last_obs is not None)
-            for evaluation in (one for one in callbacks if isinstance(one, EvalCallback)):
+            for evaluation in (part for part in callbacks if isinstance(part, EvalCallback)):
                 recording.record_evaluations(evaluation.eval_env)
         return setup_learn(model, total_timesteps, callback, reset_num_timesteps, *arguments, **named)
 

@@ -36,7 +36,7 @@ from runner.loops.vector import record_vector
 from runner.recording.labels import MAX_NOTE, is_tag
 from runner.runs.run import Run, label, new_run_id, recordings_folder
 from runner.util.jsonable import as_json
-from runner.util.values import Json, JsonView, is_whole
+from runner.util.values import Json, is_whole
 
 STEP_NAME: Final = "global_step"
 """The name under which the script's own step is recorded, before the values that it gave with it."""
@@ -48,7 +48,7 @@ _MAX_WAITING: Final = 10_000
 _MAX_WAITING_BYTES: Final = 1 << 28
 _MAX_STEP: Final = 2**62
 _WAITING_SECONDS: Final = 10.0
-"""How long they do, at most; looked at when another value is logged."""
+"""How long values wait at most; looked at when another value is logged."""
 
 
 class Watched(Protocol):
@@ -63,8 +63,7 @@ class ScriptRun:
 
     Args:
         recordings: the recordings folder, or the address of a server, as for `runner.record`.
-        name: its name; that of the environment unless given.
-        settings: the script's settings, which may be changed until the recording begins.
+        name: its name; the environment's unless given.
         tags: labels; those that a run cannot have are left out, with a warning.
         note: a note.
         has_environment: whether to wait for an environment, and to record it.
@@ -77,7 +76,6 @@ class ScriptRun:
         self,
         recordings: str | os.PathLike[str] | None = None,
         name: str | None = None,
-        settings: JsonView | None = None,
         tags: tuple[str, ...] = (),
         note: str = "",
         has_environment: bool = True,
@@ -89,7 +87,8 @@ class ScriptRun:
             hint = nearest(unknown, {*OPTIONS, "monitor_gym", "recordings"})
             self.warn_once(f"the argument {unknown}={options.pop(unknown)!r} has no effect here.{hint}")
         self._options = {"on_error": "warn"} | options
-        self.settings: Json = dict(settings or {})
+        self.settings: Json = {}
+        """The script's settings, which may be changed until the recording begins."""
         self.name, self.takes_writers = name, takes_writers
         self.closed = False
         self.has_writer: bool | None = None
@@ -122,8 +121,7 @@ class ScriptRun:
         update_hooks()
 
     def _new_run_id(self) -> str:
-        is_folder = "://" not in str(self._recordings or "")
-        return new_run_id(recordings_folder(self._recordings if is_folder else None))
+        return new_run_id(recordings_folder(local_folder(self._recordings)))
 
     # --- what is logged -----------------------------------------------------------------------------------
 
@@ -133,9 +131,9 @@ class ScriptRun:
 
     def snapshot(self, name: str, array: object, step: object = None) -> None:
         """Record an array of numbers, or each of a mapping of arrays."""
-        for own_name, values in arrays_of(name, array):
+        for full_name, values in arrays_of(name, array):
             self._waiting_bytes += values.nbytes
-            self._do("snapshot", own_name, values.copy() if self._loop is None else values, step)
+            self._do("snapshot", full_name, values.copy() if self._loop is None else values, step)
 
     def picture(self, name: str, picture: Picture, step: object = None) -> None:
         """Record a picture or a film under a name."""
@@ -146,8 +144,8 @@ class ScriptRun:
         """Call a method of the recording's `Messages`, now or when there is a recording."""
         if (self.closed or self._is_foreign or name not in self._names) and self._refuses(name):
             return
-        own = step if step.__class__ is int and 0 <= step < _MAX_STEP else self.step_of(step)
-        if (call := self.calls) is None and own is None:
+        whole = step if step.__class__ is int and 0 <= step < _MAX_STEP else self.step_of(step)
+        if (call := self.calls) is None and whole is None:
             call = self._names[name]
             self._names[name] = call + 1
         loop = self._loop
@@ -157,9 +155,9 @@ class ScriptRun:
             self._leave_loop()
             loop = None
         if loop is not None:
-            self._record(loop, method, name, value, own, call)
+            self._record(loop, method, name, value, whole, call)
             return
-        self._waiting.append((method, name, value, own, call))
+        self._waiting.append((method, name, value, whole, call))
         self._since = self._since or time.monotonic()
         has_room = len(self._waiting) < _MAX_WAITING and self._waiting_bytes < _MAX_WAITING_BYTES
         is_early = has_room and time.monotonic() - self._since < _WAITING_SECONDS
@@ -200,7 +198,7 @@ class ScriptRun:
         return None
 
     def _leave_loop(self) -> None:
-        """Let values wait for the next recording: this one failed, or the script ended its own."""
+        """Let values wait for the next recording: this one failed, or was ended."""
         self._loop = None
         self._step = None
         self._has_joined, self._since, self._waiting_bytes = not self._is_own, 0.0, 0
@@ -276,8 +274,8 @@ class ScriptRun:
 
     def _join_loop(self) -> bool:
         """Log into the newest loop that the script records itself, if there is one."""
-        own = {id(other._loop) for other in open_runs if isinstance(other, ScriptRun) and other._is_own}
-        loops = [loop for loop in open_loops() if id(loop) not in own]
+        ours = {id(other._loop) for other in open_runs if isinstance(other, ScriptRun) and other._is_own}
+        loops = [loop for loop in open_loops() if id(loop) not in ours]
         if not loops:
             return False
         self._begin(loops[-1])
@@ -287,8 +285,8 @@ class ScriptRun:
         self._loop = loop
         update_hooks()
         waiting, self._waiting = self._waiting, []
-        for each in waiting:
-            self._record(loop, *each)
+        for values in waiting:
+            self._record(loop, *values)
 
     def _begin_own(self, loop: Loop) -> None:
         self._is_own = True
@@ -339,8 +337,7 @@ class ScriptRun:
         if self._join_loop():
             return
         recorder: Any = record_vector if isinstance(env, VectorEnv) else record
-        missed = 0 if isinstance(env, VectorEnv) else _elapsed_steps(env)
-        if missed:
+        if missed := _elapsed_steps(env):
             self.warn_once(
                 f"run {self.run_id} records {env} from this reset on. It was stepped before the run began: "
                 f"{missed:,} steps of its last episode, and any earlier episodes, are not in this run."
@@ -413,6 +410,11 @@ def _elapsed_steps(env: Any) -> int:
         return env.get_wrapper_attr("_elapsed_steps") or 0
     except AttributeError:
         return 0
+
+
+def local_folder(recordings: str | os.PathLike[str] | None) -> str | os.PathLike[str] | None:
+    """Return a recordings folder as a script gave it; None, for the usual one, where it gave a server."""
+    return None if "://" in str(recordings) else recordings
 
 
 def script_name() -> str:

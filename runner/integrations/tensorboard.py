@@ -153,10 +153,10 @@ class SummaryWriter(Tracker):
         **_: object,
     ) -> None:
         """Record a figure of Matplotlib, or a list of them, as pictures."""
-        for each in figure if isinstance(figure, list) else [figure]:
-            self.script.picture(tag, picture_of(each), global_step)
+        for part in figure if isinstance(figure, list) else [figure]:
+            self.script.picture(tag, picture_of(part), global_step)
             if close and (pyplot := sys.modules.get("matplotlib.pyplot")):
-                pyplot.close(each)
+                pyplot.close(part)
 
     @forgiving
     def add_scalars(
@@ -220,7 +220,7 @@ _left_out: weakref.WeakSet[object] = weakref.WeakSet()
 def _other_writers() -> list[Any]:
     """Return the writers of other libraries that are loaded."""
     loaded = (getattr(sys.modules.get(module), "SummaryWriter", None) for module in _WRITERS)
-    return [writer for writer in loaded if writer is not None]
+    return list(filter(None, loaded))
 
 
 def forward() -> bool:
@@ -228,12 +228,12 @@ def forward() -> bool:
 
     Returns whether such a writer is loaded.
     """
-    own = SummaryWriter()
+    ours = SummaryWriter()
     for writer in _other_writers():
-        for name in [name for name in vars(SummaryWriter) if name.startswith("add_")]:
-            method = getattr(writer, name, None)
+        for name in vars(SummaryWriter):
+            method = getattr(writer, name, None) if name.startswith("add_") else None
             if method is not None and not hasattr(method, "forwards"):
-                setattr(writer, name, _forwarding(name, method, own))
+                setattr(writer, name, _forwarding(name, method, ours))
     return bool(_other_writers())
 
 
@@ -250,12 +250,17 @@ def do_not_forward(writer: object) -> None:
     _left_out.add(writer)
 
 
-def _forwarding(name: str, method: Callable[..., object], own: SummaryWriter) -> Callable[..., object]:
+def _forwarding(name: str, method: Callable[..., object], ours: SummaryWriter) -> Callable[..., object]:
     @wraps(method)
     def both(self: object, *arguments: object, **named: object) -> object:
-        if not own.script.closed and self not in _left_out:
-            getattr(own, name)(*arguments, **named)
-        return method(self, *arguments, **named)
+        if ours.script.closed or self in _left_out:
+            return method(self, *arguments, **named)
+        getattr(ours, name)(*arguments, **named)
+        _left_out.add(self)  # it may call its other methods, as `add_figure` calls `add_image`
+        try:
+            return method(self, *arguments, **named)
+        finally:
+            _left_out.discard(self)
 
     both.forwards = True  # type: ignore[attr-defined]
     return both

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, Final, Unpack
 
@@ -23,6 +23,7 @@ from runner.integrations.libraries import require_tested
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import logs
 from runner.integrations.tensorboard import SummaryWriter, log_text
+from runner.integrations.workers import Workers
 from runner.loops.batches import RecordedBatches, record_batches
 from runner.loops.env import record as record_env
 from runner.loops.loop import Loop
@@ -62,25 +63,49 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
         EnvironmentNotUsable: a space cannot be recorded.
         StorageError: the recordings folder cannot be written.
     """
-    base = env
-    while not isinstance(base, GymWrapper) and hasattr(base, "base_env"):
-        base = base.base_env
-    if not isinstance(base, GymWrapper):
-        raise ConfigError(
-            f"found {type(base).__name__}, expected GymEnv or GymWrapper. Steps of other environments are "
-            "recorded where they are collected: for data in runner.integrations.torchrl.recorded(collector)"
-        )
-    if isinstance(base._env, Recorded):
+    wrapper = _wrapper_in(env)
+    if isinstance(wrapper._env, Recorded):
         raise ConfigError("found an environment that is recorded already, expected one that is not")
-    recorder: Any = record_vector if isinstance(base._env, VectorEnv) else record_env
-    made = recorder(base._env, recordings, **options)
-    base._env = made
+    recorder: Any = record_vector if isinstance(wrapper._env, VectorEnv) else record_env
+    made = recorder(wrapper._env, recordings, **options)
+    wrapper._env = made
     made.close = partial(_close, made)
     return env
 
 
+def _wrapper_in(env: Any) -> GymWrapper:
+    """Return what wraps the Gymnasium environment inside of TorchRL's.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    while not isinstance(env, GymWrapper) and hasattr(env, "base_env"):
+        env = env.base_env
+    if not isinstance(env, GymWrapper):
+        raise ConfigError(
+            f"found {type(env).__name__}, expected GymEnv or GymWrapper. Steps of other environments are "
+            "recorded where they are collected: for data in runner.integrations.torchrl.recorded(collector)"
+        )
+    return env
+
+
+class Recording(Workers):
+    """Records the environments that a `ParallelEnv` or the workers of a `Multi` collector make, as one run.
+
+    recording = runner.integrations.torchrl.Recording(lambda: GymEnv("CartPole-v1"), name="ppo")
+    env = ParallelEnv(4, recording.train)
+    """
+
+    record = staticmethod(record)
+
+    @staticmethod
+    def inside(env: Any) -> Recorded:
+        """Return the recorded environment inside of TorchRL's."""
+        return _wrapper_in(env)._env  # type: ignore[no-any-return]
+
+
 _loggers: weakref.WeakSet[object] = weakref.WeakSet()
-"""Those that are not closed."""
+"""The loggers that are not closed."""
 _to_close: list[Loop] = []
 """The recordings of closed environments, which end with the logger."""
 
@@ -146,66 +171,53 @@ def recorded(
 
 
 def _recorded(collector: Any, env: Any, rec: RecordedBatches) -> Iterator[Any]:
-    keys = list(env.observation_spec.keys(include_nested=True, leaves_only=True))
-    error: BaseException | None = None
-    try:
+    with rec:
         for data in collector:
-            _record_batch(rec, data, getattr(collector, "_carrier", None), keys, env)
+            _record_batch(rec, data, getattr(collector, "_carrier", None), env)
             yield data
-    except GeneratorExit:  # the loop was left by `break`
-        raise
-    except BaseException as raised:
-        error = raised
-        raise
-    finally:
-        rec.__exit__(None, error, None)
 
 
-def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, keys: Sequence[Any], env: Any) -> None:
-    """Record the steps of a batch, [*environments, time]."""
-    number = int(np.prod(env.batch_size, dtype=np.int64))
+def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, env: Any) -> None:
+    """Record the steps of a batch, [*environments, time]; the carrier has the observations that follow."""
+    number, axes = env.batch_size.numel(), len(env.batch_size)
 
     def by_time(values: object) -> NDArray[Any]:
         """Return a tensor [*environments, time, ...] as a copy [time, environments, ...]."""
         array = np.array(as_array(values))
-        array = array.reshape(number, -1, *array.shape[len(env.batch_size) + 1 :])
+        array = array.reshape(number, -1, *array.shape[axes + 1 :])
         return np.ascontiguousarray(array.swapaxes(0, 1))
 
-    def flag(key: str, default: NDArray[Any]) -> NDArray[Any]:
-        return by_time(after[key])[..., 0] if key in after.keys() else default  # noqa: SIM118 - no mapping
-
     after = data["next"]
-    done = by_time(after["done"])[..., 0]
-    terminated = flag("terminated", done)
-    truncated = flag("truncated", done & ~terminated)
     rewards = by_time(after["reward"])
     if rewards.shape[2:] != (1,):
         raise ConfigError(f"found rewards of shape {rewards.shape[2:]}, expected one for each environment")
-    roots = {_text(key): by_time(data[key]) for key in keys}
-    finals = {_text(key): by_time(after[key]) for key in keys}
-    following = {}
-    for key in keys:
-        name = _text(key)
-        last = finals[name][-1]
-        if carrier is not None and carrier.get(key, None) is not None:  # after a reset, if the episode ended
-            last = np.array(as_array(carrier.get(key))).reshape(last.shape)
-        following[name] = np.concatenate([roots[name], last[np.newaxis]])
+    observations, finals = {}, {}
+    for key in env.observation_spec.keys(include_nested=True, leaves_only=True):
+        name = key if isinstance(key, str) else "/".join(key)
+        finals[name] = by_time(after[key])
+        last = finals[name][-1:]
+        if carrier is not None and (following := carrier.get(key, None)) is not None:
+            last = np.array(as_array(following)).reshape(last.shape)  # after a reset, if the episode ended
+        observations[name] = np.concatenate([by_time(data[key]), last])
     actions = by_time(data[env.action_key])
     if isinstance(env.action_spec_unbatched, OneHot):
         actions = actions.argmax(-1)
-    is_one = len(keys) == 1
+    done = after["done"]
+    terminated = after.get("terminated", done)
+    truncated = after.get("truncated", done & ~terminated)
     rec.batch(
-        next(iter(following.values())) if is_one else following,
+        _alone(observations),
         actions,
         rewards[..., 0],
-        terminated,
-        truncated,
-        final_observations=next(iter(finals.values())) if is_one else finals,
+        by_time(terminated)[..., 0],
+        by_time(truncated)[..., 0],
+        final_observations=_alone(finals),
     )
 
 
-def _text(key: str | Sequence[str]) -> str:
-    return key if isinstance(key, str) else "/".join(key)
+def _alone(values: dict[str, NDArray[Any]]) -> object:
+    """Return the only observation, or all by name."""
+    return values if len(values) > 1 else next(iter(values.values()))
 
 
 def _name_of(env: object) -> str:
@@ -213,8 +225,8 @@ def _name_of(env: object) -> str:
     while True:  # a `SerialEnv` looks up what it does not have in its environments, `base_env` too
         if isinstance(env, TransformedEnv):
             env = env.base_env
-        elif own := vars(env).get("_envs"):
-            env = own[0]
+        elif inside := vars(env).get("_envs"):
+            env = inside[0]
         else:
             break
     name = getattr(env, "env_name", None)
@@ -232,8 +244,8 @@ def _action_space(env: Any) -> Any:
 class Logger(_Logger):  # type: ignore[misc]
     """A logger of TorchRL whose values go into the recording.
 
-    That is the one that the script makes by `record`, `recorded` or `runner.record`, or of the environment of
-    Gymnasium that it resets first; a script that steps none gets a run of its own for the values.
+    The recording is the one that the script makes by `record`, `recorded` or `runner.record`, or a recording
+    of the Gymnasium environment that it resets first. A script that steps none gets a run for the values.
 
     Args:
         exp_name: the name of the run, if the script does not record one itself.
@@ -267,7 +279,7 @@ class Logger(_Logger):  # type: ignore[misc]
         super().shutdown(timeout)
         _loggers.discard(self)
         while _to_close:
-            _to_close.pop().close()
+            _to_close.pop(0).close()  # processes of a run before the run
 
     def __repr__(self) -> str:
         return f"Logger({self.exp_name!r})"

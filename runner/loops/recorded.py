@@ -276,7 +276,7 @@ class Recorded:
 
 def ending_of(error: object) -> tuple[str, str]:
     """Return the status of a run that ended with this error, None without one, and the text of the error."""
-    if error is None:
+    if error is None or isinstance(error, GeneratorExit):  # a loop over a generator was left by `break`
         return "finished", ""
     if isinstance(error, KeyboardInterrupt) or (isinstance(error, SystemExit) and not error.code):
         return "interrupted", ""

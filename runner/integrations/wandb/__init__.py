@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 
 from runner.errors import ConfigError, RunnerError
-from runner.integrations.script import ScriptRun
+from runner.integrations.script import ScriptRun, local_folder
 from runner.integrations.shapes import (
     Tracker,
     WithoutEffect,
@@ -77,7 +77,7 @@ class Tracked(Tracker):
 
     @property
     def id(self) -> str:
-        """The id that the script gave the run, or that of the recording."""
+        """The id that the script gave the run, or the id of the recording."""
         return self._id or self.script.run_id
 
     @property
@@ -123,7 +123,7 @@ class Tracked(Tracker):
 
     @forgiving
     def _log(self, name: str, value: Any, step: int | None) -> None:
-        if isinstance(value, list | tuple) and any(isinstance(each, Image) for each in value):
+        if isinstance(value, list | tuple) and any(isinstance(part, Image) for part in value):
             value = dict(enumerate(value))
         if isinstance(value, Mapping):
             for key, inner in value.items():
@@ -202,9 +202,8 @@ class Tracked(Tracker):
             run = None
 
     def _log_summary(self) -> None:
-        if not self._is_disabled:
-            for name, value in self.summary.own.items():
-                self._log(f"summary/{name}", value, None)
+        for name, value in self.summary.own.items():
+            self._log(f"summary/{name}", value, None)
 
 
 run: Tracked | None = None
@@ -308,8 +307,7 @@ def _open_run(what: str) -> Tracked:
 
 def _predecessor(tag: str, recordings: str | os.PathLike[str] | None) -> str:
     """Warn that the last run with a tag is not continued, and return a line of the note that names it."""
-    is_folder = "://" not in str(recordings or "")
-    earlier = [run for run in list_runs(recordings if is_folder else None) if tag in run.tags]
+    earlier = [run for run in list_runs(local_folder(recordings)) if tag in run.tags]
     if not earlier:
         return ""
     last = max(earlier, key=lambda run: run.created)

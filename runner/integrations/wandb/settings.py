@@ -22,8 +22,8 @@ class Config(MutableMapping[str, Any]):
     def update(self, *settings: Any, **more: object) -> None:
         """Take the settings of a mapping, dataclass or namespace."""
         more.pop("allow_val_change", None)
-        for each in settings:
-            self._configure(each)
+        for part in settings:
+            self._configure(part)
         self._configure(more)
 
     def setdefaults(self, settings: Any) -> None:

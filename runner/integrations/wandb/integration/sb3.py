@@ -79,7 +79,7 @@ class WandbCallback(Recording):
         self.__exit__(None, None, None)
 
     def record_evaluations(self, envs: VecEnv) -> None:
-        """Record the environments of an `EvalCallback`, if those of training are recorded."""
+        """Record the environments of an `EvalCallback`, if the training is recorded."""
         if self._envs is not None:
             super().record_evaluations(envs)
 
