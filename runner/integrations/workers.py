@@ -22,9 +22,9 @@ _OF_THE_RUN: Final = ("name", "seed", "config", "run_id")
 class Workers:
     """Records the environments that a library makes by a function, in this process or in others, as one run.
 
-    `train` and `eval` make environments that join the run, in its training and its evaluation phase: give
-    them to the library in the place of the function. `recorded` is what `runner.record` returns, for `log`
-    and `checkpoint`; it takes no steps. Close the workers, then this; it is a context manager.
+    `train` makes an environment that joins the run: give it to the library in the place of the function.
+    `recorded` is what `runner.record` returns, for `log` and `checkpoint`; it takes no steps. Close the
+    workers, then this; it is a context manager.
 
     Args:
         make: makes an environment; it has to be sent to the workers, as without recording.
@@ -46,10 +46,10 @@ class Workers:
         recordings: str | os.PathLike[str] | None = None,
         **options: Unpack[RecordOptions],
     ) -> None:
-        self.recorded = self.inside(self.record(make(), recordings, **options))
+        self._env = self.record(make(), recordings, **options)  # it may close itself when it is collected
+        self.recorded = self.inside(self._env)
         shared = {name: value for name, value in options.items() if name not in _OF_THE_RUN}
-        joined = partial(_made, self.record, make, join=self.run, **shared)
-        self.train, self.eval = partial(joined, phase="train"), partial(joined, phase="eval")
+        self.train = partial(_made, self.record, make, join=self.run, **shared)
 
     @staticmethod
     def inside(env: Any) -> Recorded:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 
 import gymnasium
@@ -16,6 +17,7 @@ from torchrl.envs import (
     DoubleToFloat,
     GymEnv,
     ObservationNorm,
+    ParallelEnv,
     RewardSum,
     SerialEnv,
     StepCounter,
@@ -186,3 +188,20 @@ def test_an_environment_of_torchrl_itself(recordings):
     steps, _, spaces = steps_of(run)
     assert set(spaces["observation"]["spaces"]) >= {"th", "thdot", "step_count"}
     assert (steps["next_observation"]["th"] == torch.cat(batches)["next", "th"].numpy()).all()
+
+
+def pole():
+    return TransformedEnv(GymEnv("CartPole-v1"), StepCounter())
+
+
+def test_the_workers_of_a_parallel_environment_are_one_run(recordings):
+    with torchrl.Recording(pole, name="parallel", seed=3) as recording:
+        gc.collect()  # the environment that describes the others stays open
+        env = ParallelEnv(2, recording.train)
+        env.set_seed(3)
+        collecting = Collector(env, frames_per_batch=100, total_frames=200)
+        assert sum(data.numel() for data in collecting) == 200
+        collecting.shutdown()
+    (run,) = runner.list_runs(recordings)
+    assert (run.status, run.summary["train_steps"]) == ("finished", 200)
+    assert "reproduced" in verified(run)
