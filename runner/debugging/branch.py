@@ -37,8 +37,8 @@ from runner.replay.steps import transitions_of
 from runner.replay.trust import trusting
 from runner.runs.branches import BranchOrigin
 from runner.runs.listing import run_at
-from runner.runs.marks import marking_nothing
 from runner.runs.run import Run, recordings_folder
+from runner.runs.trust_marks import marking_nothing
 from runner.util.files import storage_errors
 from runner.util.jsonable import as_json
 from runner.util.processes import report_progress

@@ -19,7 +19,7 @@ from runner.export.minari_episodes import MinariEpisode, episodes_in
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
 from runner.replay.trust import require_listed, trusting
-from runner.runs.marks import environment_of_job
+from runner.runs.trust_marks import environment_of_job
 from runner.util.arrays import Array
 from runner.util.extras import require
 from runner.util.values import Ranges

@@ -55,9 +55,9 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.spaces import Description, parts_of
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
-from runner.runs.marks import merge_marks
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, shards_locked, shards_of
+from runner.runs.trust_marks import merge_marks
 from runner.util.arrays import Array
 from runner.util.files import storage_errors
 

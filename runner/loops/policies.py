@@ -33,8 +33,8 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import make_environment, why_not_alone, why_not_made
 from runner.replay.trust import trusting
 from runner.runs.checkpoints import Checkpoint
-from runner.runs.marks import marking_nothing
 from runner.runs.run import Run
+from runner.runs.trust_marks import marking_nothing
 from runner.util.arrays import Array
 from runner.util.processes import importing_from
 

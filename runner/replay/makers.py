@@ -39,7 +39,7 @@ from runner.replay.trust import (
     trusting,
     why_not_imported,
 )
-from runner.runs.marks import own_mark
+from runner.runs.trust_marks import own_mark
 from runner.util.processes import raise_if_out_of_memory
 
 if TYPE_CHECKING:

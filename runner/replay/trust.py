@@ -1,7 +1,7 @@
 """What may be imported and made from a recording: decided here, and nowhere else. See docs/trust.md.
 
-A recording is hostile input. One that this user recorded is known by its mark (`runner.runs.marks`); all that
-it names may be imported, as with `--trust`. Of any other one, an environment is made only if its id is
+A recording is hostile input. One that this user recorded is known by its mark (`runner.runs.trust_marks`);
+all that it names may be imported, as with `--trust`. Of any other one, an environment is made only if its id is
 registered here by one of `PACKAGES`, with the recorded entry point, numbers and listed words as arguments,
 and wrappers of `WRAPPERS`. A server (`OWN_ONLY`) makes no environment of a loop that its user did not record.
 """
@@ -27,7 +27,7 @@ from runner.environments.layers import name_of, top_package
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker
 from runner.replay.scripts import MAIN, script_of_run, why_not_defined
-from runner.runs.marks import environment_of_job, own_mark
+from runner.runs.trust_marks import environment_of_job, own_mark
 from runner.util.processes import OWN_ONLY, importing_from
 from runner.util.values import JsonView
 

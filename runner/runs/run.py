@@ -2,7 +2,7 @@
 
     recordings/k3v9m2xq/run.json         id, name, configuration, owner, status, summary
     recordings/k3v9m2xq/labels.json      another name, tags, a note
-    recordings/k3v9m2xq/trust.json       the mark of a run that this user recorded, see `runner.runs.marks`
+    recordings/k3v9m2xq/trust.json       the mark of a run that this user recorded: `runner.runs.trust_marks`
     recordings/k3v9m2xq/recording.mcap   everything else
 
 `run.json` is written before anything heavy is imported, and only ever replaced as a whole. Its status was
@@ -258,7 +258,7 @@ def create_run(
         run_id: an id from `new_run_id`; replaced if it is taken by now.
         parent: the run that the configuration is from: if it has no mark, neither has the new one.
     """
-    from runner.runs.marks import environment_of_job, mark, merge_marks
+    from runner.runs.trust_marks import environment_of_job, mark, merge_marks
 
     values = config.to_mapping()
     run = new_run(recordings, values, seed, name or config.name, run_id)

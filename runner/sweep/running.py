@@ -12,8 +12,8 @@ from typing import Final
 
 from runner.recording.labels import Labels
 from runner.runs.listing import run_in
-from runner.runs.marks import environment_of_job, mark
 from runner.runs.run import new_run
+from runner.runs.trust_marks import environment_of_job, mark
 from runner.sweep import tag_of
 from runner.sweep.local import Workers
 from runner.sweep.model import Sweep

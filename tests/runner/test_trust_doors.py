@@ -32,8 +32,8 @@ from runner.recording.rewriting import rewrite
 from runner.replay.environment import rerun
 from runner.replay.makers import make_environment, make_vector
 from runner.replay.trust import require_listed
-from runner.runs.marks import MARK_FILE
 from runner.runs.run import Run
+from runner.runs.trust_marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from tests.doors import commands, routes

@@ -18,9 +18,9 @@ from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.locking import RUN_LOCK
-from runner.runs.marks import MARK_FILE
 from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
 from runner.runs.store import Store
+from runner.runs.trust_marks import MARK_FILE
 from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 
 REMOVED: Final = ".removed-"

@@ -9,8 +9,8 @@ import sys
 import gymnasium
 import pytest
 
-from runner.runs.marks import MARK_FILE
 from runner.runs.resolve import find_run
+from runner.runs.trust_marks import MARK_FILE
 from tests.runner.loops.making import dualtaxi
 from tests.runner.replay import loops
 from tests.runner.replay.loops import record

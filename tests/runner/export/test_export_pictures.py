@@ -16,7 +16,7 @@ from runner.drawing.svg import SvgDrawing
 from runner.errors import RecordingError
 from runner.export.pictures import Pictures, PictureSource
 from runner.recording.reader import open_recording
-from runner.runs.marks import MARK_FILE
+from runner.runs.trust_marks import MARK_FILE
 from tests.runner.export.making import made_otherwise
 from tests.runner.loops.making import Rooms, make, play
 

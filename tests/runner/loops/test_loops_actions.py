@@ -30,7 +30,7 @@ from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
 from runner.replay.steps import whole_steps
-from runner.runs.marks import MARK_FILE
+from runner.runs.trust_marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from tests.runner.replay import loops as replayed

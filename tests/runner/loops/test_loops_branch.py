@@ -21,7 +21,7 @@ from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.runs.branches import origin_in
 from runner.runs.catalogue.index import look
-from runner.runs.marks import MARK_FILE
+from runner.runs.trust_marks import MARK_FILE
 from tests.runner.loops.making import Rooms, make, play
 
 # Of Box2D's and PettingZoo's own makers.

@@ -16,8 +16,8 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.recording.reader import open_recording
-from runner.runs.marks import MARK_FILE
 from runner.runs.resolve import find_run
+from runner.runs.trust_marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from tests.runner.loops.making import Rooms

@@ -19,8 +19,8 @@ from runner.archive.runs import archive_run
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
-from runner.runs.marks import KEY_FILE, MARK_FILE, Mark, _make_key, mark, mark_of, merge_marks
 from runner.runs.run import Run
+from runner.runs.trust_marks import KEY_FILE, MARK_FILE, TrustMark, _make_key, mark, mark_of, merge_marks
 
 SCRIPT = """\
 import gymnasium, runner
@@ -104,7 +104,7 @@ def test_with_the_key_of_another_user_it_is_refused_with_the_reason(own, tmp_pat
 )
 def test_a_mark_that_was_changed_states_nothing(own, values):
     altered(own, **values)
-    assert mark_of(own) == Mark()
+    assert mark_of(own) == TrustMark()
     assert "--trust" in reason(own)
 
 
@@ -186,7 +186,7 @@ def test_a_folded_run_has_the_marks_of_its_shards_and_branches_that_of_their_par
     altered(shards[1], seal="0" * 64)
     (shards[0] / MARK_FILE).unlink()
     merge_marks(shards[0], shards[1:2])
-    assert mark_of(shards[0]) == Mark()
+    assert mark_of(shards[0]) == TrustMark()
     merge_marks(shards[0], shards[1:])
     assert mark_of(shards[0]) == mark_of(recorded)
 
@@ -197,4 +197,4 @@ def test_what_is_made_of_an_own_run_is_marked_and_of_another_one_is_not(tmp_path
     copied = Path(shutil.copytree(lake.folder, tmp_path / lake.run_id))
     (copied / MARK_FILE).unlink()
     strange = runner.branch(Run(copied, lake.facts), at="0:0", action=1, recordings=tmp_path)
-    assert mark_of(strange.run.folder) == Mark()
+    assert mark_of(strange.run.folder) == TrustMark()

@@ -36,7 +36,7 @@ _marks_nothing = False
 
 
 @dataclass(frozen=True)
-class Mark:
+class TrustMark:
     """What a run's mark states."""
 
     environments: tuple[str, ...] = ()
@@ -77,7 +77,7 @@ def mark(folder: Path, environment: EnvironmentMaker | JsonView | None) -> None:
     if digest in before.environments:
         return
     folders, script = _own_places(text)
-    _write(folder, [Mark((digest,), tuple(folders), script, _digest_of(script)), before], key)
+    _write(folder, [TrustMark((digest,), tuple(folders), script, _digest_of(script)), before], key)
 
 
 def merge_marks(folder: Path, others: list[Path]) -> None:
@@ -87,7 +87,7 @@ def merge_marks(folder: Path, others: list[Path]) -> None:
         _write(folder, marks, key)
 
 
-def mark_of(folder: Path, name: str = MARK_FILE) -> Mark:
+def mark_of(folder: Path, name: str = MARK_FILE) -> TrustMark:
     """Return what the mark in a folder states; nothing if none was made there with this user's key."""
     with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
         values = read_object(folder / name, _MAX_BYTES)
@@ -95,11 +95,11 @@ def mark_of(folder: Path, name: str = MARK_FILE) -> Mark:
         key = _key(False)
         if key is not None and hmac.compare_digest(str(seal).encode(), _seal(values, key).encode()):
             lists = {name: tuple(values[name]) for name in ("environments", "folders")}
-            return Mark(**(values | lists))
-    return Mark()
+            return TrustMark(**(values | lists))
+    return TrustMark()
 
 
-def own_mark(recording: Path, environment: EnvironmentMaker | JsonView) -> Mark | None:
+def own_mark(recording: Path, environment: EnvironmentMaker | JsonView) -> TrustMark | None:
     """Return the mark next to a recording if it covers an environment; None if it does not."""
     marks = (mark_of(recording.parent, name) for name in (MARK_FILE, _restored_name(recording)))
     digest = hashlib.sha256(_canonical(environment).encode()).hexdigest()
@@ -175,9 +175,9 @@ def _seal(values: Mapping[str, object], key: bytes) -> str:
     return hashlib.blake2b(text.encode(), key=key, digest_size=32, person=b"dualtaxi.mark").hexdigest()
 
 
-def _write(folder: Path, marks: list[Mark], key: bytes) -> None:
+def _write(folder: Path, marks: list[TrustMark], key: bytes) -> None:
     """Replace a run's mark by one that states what these state; the first script among them counts."""
-    script = next((one for one in marks if one.script), Mark())
+    script = next((one for one in marks if one.script), TrustMark())
     values: dict[str, object] = {
         "environments": list(dict.fromkeys(digest for one in marks for digest in one.environments)),
         "folders": list(dict.fromkeys(path for one in marks for path in one.folders)),
