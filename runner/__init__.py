@@ -21,6 +21,7 @@ from runner.util import __version__
 if TYPE_CHECKING:
     import runner.analysis.frames as frames  # noqa: PLR0402
     import runner.integrations as integrations  # noqa: PLR0402
+    from runner.analysis.marking import mark, unmark
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.debugging.branch import branch
@@ -57,6 +58,7 @@ __all__ = [
     "integrations",
     "label",
     "list_runs",
+    "mark",
     "open_recording",
     "plot",
     "record",
@@ -70,6 +72,7 @@ __all__ = [
     "resume",
     "run",
     "run_all",
+    "unmark",
     "verify",
     "what_if",
     "when",
@@ -87,6 +90,7 @@ _HOME = {
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",
     "list_runs": "runner.runs.listing",
+    "mark": "runner.analysis.marking",
     "open_recording": "runner.recording.reader",
     "plot": "runner.export.notebook",
     "record": "runner.loops.env",
@@ -100,6 +104,7 @@ _HOME = {
     "resume": "runner.execution.resume",
     "run": "runner.api",
     "run_all": "runner.api",
+    "unmark": "runner.analysis.marking",
     "verify": "runner.execution.verify",
     "what_if": "runner.debugging.what_if",
     "when": "runner.debugging.when",

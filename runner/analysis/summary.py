@@ -113,6 +113,7 @@ class RunDetails:
             "recorded_seconds": None if self.clock is None else self.clock.duration,
             "steps_a_second": None if self.clock is None else self.clock.steps_a_second,
             "processes": [vars(shard) for shard in self.shards],
+            "marks": [mark.as_row() for mark in run.marks],
             "config": dict(self.config),
             "provenance": dict(self.provenance),
             "success_events": list(self.success_events),

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RecordingError, StorageError
-from runner.runs.marks import copy_mark
+from runner.runs.trust_marks import copy_mark
 from runner.runs.run import RUN_FILE, Run
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size

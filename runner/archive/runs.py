@@ -20,8 +20,10 @@ from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.description import recorded_facts
 from runner.recording.integrity import may_be_cut, survey
+from runner.recording.marks import read_marks
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
+from runner.runs.importing import merge_marks
 from runner.runs.locking import locked
 from runner.runs.resolve import run_of_id
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
@@ -148,6 +150,7 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
         with archive_of(current) as folder:
             restore_to(folder, fresh, current.archive.digest, report)
             _restore_contents(folder, current.folder)
+            merge_marks(current, read_marks(folder))
         fresh.replace(current.recording)
         facts = {key: value for key, value in current.facts.items() if key != "archive"}
         return Run(current.folder, facts).update()
@@ -190,10 +193,13 @@ def restore_place(place: str, recordings: Path, report: Report = lambda _: None)
         with store.reading(run_id) as archive:
             restore_to(archive, folder / RECORDING_FILE, manifest.digest, report)
             _restore_contents(archive, folder)
+            marks = read_marks(archive)
         with open_recording(folder / RECORDING_FILE) as recording:
             facts = recorded_facts(recording) | {"name": manifest.run["name"]}  # it may have been renamed
             facts["summary"] |= {"bytes": recording.file.size}
-        return Run(folder, facts).update()
+        run = Run(folder, facts).update()
+        merge_marks(run, marks)
+        return run
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise

@@ -26,11 +26,13 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.description import recorded_facts
+from runner.recording.marks import MARKS_FILE, Marks, read_marks
 from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.reader import Recording
 from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
 from runner.runs.checkpoints import read_checkpoints
+from runner.util.files import write_object
 
 ROWS_A_GROUP: Final = 1 << 18
 BYTES_A_GROUP: Final = 32 << 20
@@ -133,6 +135,7 @@ class _ArchiveWriter:
                     writer.add(batch)
                     self._report(self._batches.steps)
         self._copy_contents()
+        self._copy_marks()
         topics = self._batches.entries
         self._compare(topics)
         facts = recorded_facts(self._recording) | {"name": self._recording.name}
@@ -183,6 +186,11 @@ class _ArchiveWriter:
                 checkpoint.check()
                 path.parent.mkdir(exist_ok=True)
                 shutil.copyfile(checkpoint.path, path)
+
+    def _copy_marks(self) -> None:
+        marks = read_marks(self._recording.path.parent)
+        if marks != Marks():
+            write_object(self._folder / MARKS_FILE, marks.as_json())
 
     def _write_learning(self, table: Table, steps: TableWriter) -> None:
         """Write the steps of a job, and its snapshots, which follow from them."""

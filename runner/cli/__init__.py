@@ -63,6 +63,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     },
     "Manage": {
         "label": ("catalogue", "Change the name, note and tags of a run."),
+        "mark": ("catalogue", "Mark steps of a run, and list its marks."),
         "rm": ("remove", "Remove runs."),
         "prune": ("remove", "Remove old, unfinished or unwanted runs."),
         "du": ("catalogue", "Show what uses disk space, and what could be freed."),

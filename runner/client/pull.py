@@ -21,7 +21,7 @@ FOLDER: Final = ".pulling"
 
 
 def pull(client: Connection, name: str, recordings: Path, report: Report = lambda *_: None) -> Imported:
-    """Download a run with its labels into a recordings folder.
+    """Download a run with its labels and marks into a recordings folder.
 
     Args:
         client: a connection to the server.
@@ -56,8 +56,9 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
                 _download(client, path, tag, size, part, report)
                 summary = {key: facts.get(key) for key in ("seconds", "error", "bytes")}
                 labels = {key: facts.get(key) for key in ("name", "tags", "note")}
+                marks = {"marks": facts.get("marks"), "removed": facts.get("removed_marks")}
                 # The name of the run itself is that in its recording.
-                details = {"status": status, "summary": summary, "labels": labels}
+                details = {"status": status, "summary": summary, "labels": labels, "marks": marks}
                 imported = import_recording(part, recordings, details)
                 part.unlink()
                 _pull_contents(client, imported.run, report)

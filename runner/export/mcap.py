@@ -1,4 +1,4 @@
-"""A run as one MCAP file to share: the recording, with the run's labels in its metadata."""
+"""A run as one MCAP file to share: the recording, with the run's labels and marks in its metadata."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ def _warnings(run: Run) -> Iterator[str]:
         for key, text in _texts(recording.config, ""):
             if Path(text).is_absolute():
                 yield f"The configuration contains a path, which is part of the job and stays: {key}: {text}"
-    if run.labels != Labels():
-        yield "The labels of the run (name, tags and note) stay as they are."
+    if run.labels != Labels() or run.marks:
+        yield "The labels of the run (name, tags and note) and its marks stay as they are."
 
 
 def _texts(value: object, place: str) -> Iterator[tuple[str, str]]:

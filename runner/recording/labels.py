@@ -8,8 +8,9 @@ replaced atomically, under a lock.
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -27,7 +28,7 @@ MAX_NOTE: Final = 10_000
 MAX_TAGS: Final = 100
 LOCK_SECONDS: Final = 30.0
 
-_TAG: Final = re.compile(r"\w[\w.=+/@-]{0,63}")
+TAG_PATTERN: Final = r"\w[\w.=+/@-]{0,63}"
 TAG_EXPECTED: Final = "1 to 64 letters, digits or any of _ . - = + / @, the first a letter, digit or _"
 
 
@@ -77,20 +78,32 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
     Raises:
         StorageError: the folder cannot be written.
     """
+    with file_lock(folder / LABELS_FILE):
+        before = read_labels(folder)
+        after = change(before)
+        _check(after)
+        if after != before:
+            write_object(folder / LABELS_FILE, as_json(after))
+        return after
+
+
+@contextlib.contextmanager
+def file_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of a file that users change.
+
+    Raises:
+        StorageError: its folder cannot be written, or another process holds the lock for too long.
+    """
     from filelock import FileLock, Timeout
 
-    with storage_errors(folder / LABELS_FILE):
+    lock = path.with_suffix(".lock")
+    with storage_errors(path):
         try:
-            with FileLock(folder / LOCK_FILE, timeout=LOCK_SECONDS):
-                before = read_labels(folder)
-                after = change(before)
-                _check(after)
-                if after != before:
-                    write_object(folder / LABELS_FILE, as_json(after))
-                return after
+            with FileLock(lock, timeout=LOCK_SECONDS):
+                yield
         except Timeout as error:
             raise StorageError(
-                f"{folder / LOCK_FILE}: another process has held it for {LOCK_SECONDS:.0f} s; try again."
+                f"{lock}: another process has held it for {LOCK_SECONDS:.0f} s; try again."
             ) from error
 
 
@@ -102,7 +115,7 @@ def as_json(labels: Labels) -> dict[str, object]:
 
 def is_tag(text: object) -> bool:
     """Return whether a run can have this tag."""
-    return isinstance(text, str) and _TAG.fullmatch(text) is not None
+    return isinstance(text, str) and re.fullmatch(TAG_PATTERN, text) is not None
 
 
 def _check(labels: Labels) -> None:

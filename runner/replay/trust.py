@@ -1,8 +1,8 @@
 """What may be imported and made from a recording: decided here, and nowhere else. See docs/trust.md.
 
 A recording is hostile input. One that this user recorded is known by its mark (`runner.runs.trust_marks`);
-all that it names may be imported, as with `--trust`. Of any other one, an environment is made only if its id is
-registered here by one of `PACKAGES`, with the recorded entry point, numbers and listed words as arguments,
+all that it names may be imported, as with `--trust`. Of any other one, an environment is made only if its id
+is registered here by one of `PACKAGES`, with the recorded entry point, numbers and listed words as arguments,
 and wrappers of `WRAPPERS`. A server (`OWN_ONLY`) makes no environment of a loop that its user did not record.
 """
 

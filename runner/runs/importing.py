@@ -19,6 +19,7 @@ from typing import Final
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.description import recorded_facts
 from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
+from runner.recording.marks import MARKS_FILE, Marks, change_marks, marks_from, read_marks
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
 from runner.recording.run_file import parse_run_file
@@ -66,7 +67,9 @@ def import_record(run: Run) -> Json:
     """Return what `import_recording` needs of a run besides its recording."""
     summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
     record: Json = {"status": run.status, "name": run.file.name, "summary": summary}
-    return record | {"labels": as_json(run.labels)} | ({"proof": run.file.proof} if run.file.proof else {})
+    marks = Marks() if run.stands_alone else read_marks(run.folder)
+    record |= {"labels": as_json(run.labels)} | ({"marks": marks.as_json()} if marks != Marks() else {})
+    return record | ({"proof": run.file.proof} if run.file.proof else {})
 
 
 def import_recording(
@@ -96,7 +99,7 @@ def import_recording(
         record = exported if details is None else details
         facts = checked_facts(opened, record)
         contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
-    own_labels = record.get("labels")
+    own_labels, marks = record.get("labels"), marks_from(record.get("marks"))
     labels = labels_from(own_labels) if isinstance(own_labels, dict) else Labels()
     digest, anonymous = content_of(recording), exported.get("anonymous") is True
     if as_new:
@@ -109,17 +112,22 @@ def import_recording(
     preview = existing if existing is not None and PREVIEW in existing.facts else None
     if preview is not None:
         existing, labels = None, _merged(preview.labels, labels)
+        marks = read_marks(preview.folder).merged(marks.marks, marks.removed)
     if existing is not None and _has_content(existing, digest):
+        merge_marks(existing, marks)
         return Imported(_finish(existing, facts), digest, already=True, anonymous=anonymous)
     with _staging_folder(recordings, recording) as folder:
         _place(recording, folder / RECORDING_FILE, facts, rewritten=as_new or bool(exported))
         if existing is not None:
             occupied = Occupied(existing, recordings)
             run, already = _continue_or_keep(occupied, folder / RECORDING_FILE, facts, labels)
+            merge_marks(run, marks)
             return Imported(run, digest, already, anonymous)
         write_object(folder / RUN_FILE, facts)
         if labels != Labels():
             write_object(folder / LABELS_FILE, as_json(labels))
+        if marks != Marks():
+            write_object(folder / MARKS_FILE, marks.as_json())
         for path in (*folder.iterdir(), folder):
             sync(path)
         if preview is not None:
@@ -127,6 +135,12 @@ def import_recording(
         folder.rename(target)
         sync(recordings)
     return Imported(run_at(target), digest, already=False, anonymous=anonymous)
+
+
+def merge_marks(run: Run, marks: Marks) -> None:
+    """Add marks that somebody else set or removed to a run, if it has a folder of its own."""
+    if marks != Marks() and not run.stands_alone:
+        change_marks(run.folder, lambda own: own.merged(marks.marks, marks.removed))
 
 
 def run_facts(recording: Recording, details: JsonView) -> Json:

@@ -2,6 +2,7 @@
 
     recordings/k3v9m2xq/run.json         id, name, configuration, owner, status, summary
     recordings/k3v9m2xq/labels.json      another name, tags, a note
+    recordings/k3v9m2xq/marks.json       marks at steps
     recordings/k3v9m2xq/trust.json       the mark of a run that this user recorded: `runner.runs.trust_marks`
     recordings/k3v9m2xq/recording.mcap   everything else
 
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Final
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
 from runner.recording.liveness import is_alive, owner
+from runner.recording.marks import Mark, read_marks
 from runner.recording.run_file import ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import storage_errors, write_object
 from runner.util.values import Json, as_utf8, checked_run_name, is_utf8
@@ -115,6 +117,11 @@ class Run:
         return Labels() if self.stands_alone else read_labels(self.folder)
 
     @property
+    def marks(self) -> tuple[Mark, ...]:
+        """The marks at steps, in the order of the steps."""
+        return () if self.stands_alone else read_marks(self.folder).marks
+
+    @property
     def seed(self) -> int:
         """The seed; 0 for a loop without one."""
         return self.file.seed or 0
@@ -133,6 +140,15 @@ class Run:
     def recording(self) -> Path:
         """The MCAP file."""
         return self.restored or self.folder / Path(self.file.recording or RECORDING_FILE).name
+
+    def require_folder(self) -> None:
+        """Refuse a recording without a folder for labels and marks.
+
+        Raises:
+            RunnerError: it stands alone.
+        """
+        if self.stands_alone:
+            raise RunnerError(f"{self.recording}: stands alone; expected a run in a folder of its own.")
 
     @property
     def stands_alone(self) -> bool:
@@ -387,8 +403,7 @@ def label(
         RunnerError: the recording is not in a folder of its own, a tag is not valid, or there are too many.
         StorageError: the run's folder cannot be written.
     """
-    if run.stands_alone:
-        raise RunnerError(f"{run.recording}: stands alone; expected a run in a folder of its own.")
+    run.require_folder()
     if name:
         checked_run_name(name)
 

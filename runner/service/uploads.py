@@ -29,7 +29,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from runner.client.uploads import UploadStatus
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
-from runner.runs.importing import import_recording
+from runner.recording.marks import marks_from
+from runner.runs.importing import import_recording, merge_marks
 from runner.runs.resolve import run_of_id
 from runner.runs.run import Run
 from runner.runs.store import Store
@@ -70,7 +71,7 @@ class UploadSource(BaseModel):
     content_digest: Digest | None = None
     checkpoint_of: Text = ""
     """The run with a checkpoint of these bytes, if they are not a recording."""
-    run: dict[str, Fact | dict[str, Fact | list[str]]] = {}
+    run: dict[str, Fact | dict[str, Fact | list[str] | list[dict[str, int | Fact | list[str]]]]] = {}
     """What is known of the run besides its recording, as `import_record` returns it."""
 
 
@@ -159,6 +160,7 @@ class Uploads:
             if upload is not fresh and (run is not None or upload.is_over or is_shorter):
                 self.delete(owner, upload_id)
             if run is not None:
+                merge_marks(run, marks_from(source.run.get("marks")))
                 size = source.size or 0
                 there = replace(fresh, state="stored", offset=size, run_id=run.run_id, already=True)
                 return upload if upload.is_over else there

@@ -24,6 +24,7 @@ from runner.execution.resume import resume
 from runner.execution.session import Progress, run_job
 from runner.recording.labels import LABELS_FILE, Labels, change_labels
 from runner.recording.liveness import owner
+from runner.recording.marks import MARKS_FILE
 from runner.recording.reader import open_recording
 from runner.runs.locking import locked
 from runner.runs.resolve import find_run
@@ -115,14 +116,18 @@ def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
 
 
 def move_files(own: Path, target: Path) -> None:
-    """Replace the files of a run by those of a copy that was continued; labels stay as they are.
+    """Replace the files of a run by those of a copy that was continued; labels and marks stay.
 
     Each file is replaced atomically, `run.json` last: a run that was moved in part is as good as one whose
     process was killed.
     """
 
     def names(folder: Path) -> set[str]:
-        return {path.name for path in folder.iterdir() if path.name != LABELS_FILE and path.suffix != ".lock"}
+        return {
+            path.name
+            for path in folder.iterdir()
+            if path.name not in (LABELS_FILE, MARKS_FILE) and path.suffix != ".lock"
+        }
 
     for name in sorted(names(own), key=lambda name: name == RUN_FILE):
         with replacing(target / name) as fresh:

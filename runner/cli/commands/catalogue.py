@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import click
 
-from runner.cli.command import Command, CommandGroup, option
+from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     filter_argument,
     folders_option,
@@ -72,6 +72,43 @@ def label_command(
     print_result(as_json, values, facts(rows))
     if missing:
         say(f"Run {run.run_id} had no tag {', '.join(missing)}.")
+
+
+@click.command("mark", cls=Command)
+def mark_command(
+    run_name: str = run_argument,
+    at: str | None = argument(metavar="[STEP]", required=False),
+    text: str = argument(metavar="[TEXT]", required=False, default=""),
+    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Tag it; may be repeated."),
+    removed: tuple[str, ...] = option(
+        "--remove", multiple=True, metavar="MARK", help="Remove a mark by its id; may be repeated."
+    ),
+    recordings: Path | None = recordings_option,
+    as_json: bool = json_option,
+) -> None:
+    """Mark a STEP of RUN with a TEXT, and list the marks of the run.
+
+    A STEP is EPISODE:T, eval:N:TRIAL:T, step:N, or typical, best, worst or last. Marks are stored in
+    marks.json next to the recording, which stays as it is. Pages, Rerun, `dualtaxi show` and the view `marks`
+    of `dualtaxi sql` show them. `export mcap`, `import`, `archive`, `remote push` and `remote pull` take them
+    along, and merge them with the marks that are there.
+
+    Examples:
+      dualtaxi mark k3v9m2xq 812:57 "both stuck" --tag stuck
+      dualtaxi mark @latest worst --tag look-again
+      dualtaxi mark k3v9m2xq --remove 3f2a9c01b7de
+    """
+    from runner.analysis.marking import mark, unmark
+
+    run = find(run_name, recordings)
+    if at is not None:
+        mark(run, at, text, tags=tags)
+    if removed:
+        unmark(run, *removed)
+    rows = [(mark.id, mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
+    grid = table("mark", "step", "text", "tags", rows=rows, left=("mark", "step", "text", "tags"))
+    values = {"run_id": run.run_id, "marks": [mark.as_row() for mark in run.marks]}
+    print_result(as_json, values, grid if rows else f"Run {run.run_id} has no marks.")
 
 
 def _from_stdin() -> str:

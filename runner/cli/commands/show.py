@@ -10,9 +10,21 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import console, draw, echo, facts, on_one_line, patch_text, print_json, say, title
+from runner.cli.output import (
+    console,
+    draw,
+    echo,
+    facts,
+    grid_table,
+    on_one_line,
+    patch_text,
+    print_json,
+    say,
+    title,
+)
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
 from runner.runs.branches import Origin, origin_in
@@ -54,8 +66,9 @@ def show_command(
     exact measures, if the run takes them; `train` an object for each report of training; `loop` the last
     results of a loop: its last evaluation, the means of its last 100 training episodes and the last values it
     logged; `extras` the names of the values that it recorded with its steps; `first_resets` the seed and the
-    options of the first reset of each phase; `checkpoints` those of its agent; `processes` those that
-    recorded it together; `origin` what it was branched from; and `branches` its branches by run id.
+    options of the first reset of each phase; `checkpoints` those of its agent; `marks` the marks at its steps;
+    `processes` those that recorded it together; `origin` what it was branched from; and `branches` its
+    branches by run id.
 
     Examples:
       dualtaxi show @latest
@@ -134,6 +147,9 @@ def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[Renderab
             f"{len(details.checkpoints):,}, the last {last.reference}; `{command_for(run, 'checkpoints')}`"
         )
         parts += [title("Checkpoints"), summary]
+    if details.run.marks:
+        rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in details.run.marks]
+        parts += [title("Marks"), grid_table(Grid(("step", "text", "tags"), rows))]
     if branches:
         parts += [title("Branches"), facts({name: str(each) for name, each in branches.items()})]
     if details.optimality:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from runner.recording.labels import KEEP, LABELS_FILE, LOCK_FILE
+from runner.recording.marks import MARKS_FILE, MARKS_LOCK
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
@@ -43,10 +44,12 @@ FREED_BY: Final = {
 }
 """What could be freed, with its heading and how to do it."""
 
-_OWN: Final = frozenset((RUN_FILE, RECORDING_FILE, LABELS_FILE, MARK_FILE, LOCK_FILE, RUN_LOCK))
+_OWN: Final = frozenset(
+    (RUN_FILE, RECORDING_FILE, LABELS_FILE, MARK_FILE, LOCK_FILE, MARKS_FILE, MARKS_LOCK, RUN_LOCK)
+)
 _LEFT_OVER: Final = re.compile(
     r"recording\.(resuming|repairing|rerecording|restoring)|recording\.damaged-\d+\.mcap"
-    r"|\.[0-9a-f]{8}\.(run|labels|trust)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
+    r"|\.[0-9a-f]{8}\.(run|labels|marks|trust)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _COLUMNS: Final = ("root", "entry", "id", "name", "status", "tags", "digest")
 """The columns of the index that are needed of a run."""

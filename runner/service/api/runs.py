@@ -11,6 +11,7 @@ from pydantic import BaseModel, Field
 
 from runner.analysis.summary import describe_run
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
+from runner.recording.marks import read_marks
 from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
@@ -133,6 +134,7 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
     return facts | {
         "tags": list(run.tags),
         "note": run.note,
+        "removed_marks": [] if run.stands_alone else sorted(read_marks(run.folder).removed),
         "last_evaluation": details.evaluations[-1].as_json() if details.evaluations else None,
         "last_optimality": details.optimality[-1] if details.optimality else None,
         "error": settings.without_folders(str(error)) if error else None,

@@ -87,6 +87,30 @@ def test_a_run_is_pushed_and_pulled_with_its_labels(server, run, recordings, tmp
     assert [path.name for path in (tmp_path / "back").iterdir()] == [run.run_id]
 
 
+def test_marks_are_pushed_and_pulled_and_those_of_two_people_merge(server, recordings, tmp_path):
+    make_run(recordings, TAXIS, name="marked", seed=7)
+    mine = find_run("marked", recordings)
+    push = ("remote", "push", mine.run_id, "--server", server.url, "--recordings")
+    pull = ("remote", "pull", mine.run_id, "--server", server.url, "--recordings")
+
+    def sync(*words):
+        result = dualtaxi(*words)
+        assert result.exit_code == 0, result.output
+
+    first = runner.mark(mine, "3:1", "both stuck", tags=["stuck"])
+    sync(*push, recordings)
+    sync(*pull, tmp_path / "theirs")
+    theirs = find_run("marked", tmp_path / "theirs")
+    assert find_run("marked", server.recordings).marks == (first,)
+    assert theirs.marks == (first,)
+    second = runner.mark(theirs, "4:0", "mine")
+    runner.unmark(mine, first.id)
+    sync(*push, recordings)
+    sync(*push, tmp_path / "theirs")
+    sync(*pull, recordings)
+    assert mine.marks == find_run("marked", server.recordings).marks == (second,)
+
+
 def test_an_exported_file_is_pushed_like_its_run(server, recordings, tmp_path):
     run = find_run("second", recordings)
     change_labels(run.folder, lambda labels: replace(labels, note="seen"))

@@ -1,0 +1,86 @@
+"""Marks at steps of a run: set at a step that the run has, and removed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import UTC, datetime
+
+from runner.analysis.episodes import EpisodeRef, StepLike
+from runner.archive.places import at_hand
+from runner.errors import RecordingError, RunnerError
+from runner.recording.labels import MAX_TAGS, TAG_EXPECTED
+from runner.recording.marks import MAX_MARK_TEXT, Mark, Marks, change_marks
+from runner.recording.reader import Recording, open_recording
+from runner.runs.run import Run
+from runner.util.stored import stored_as
+from runner.util.values import is_utf8
+
+
+def mark(run: Run, at: StepLike, text: str = "", *, tags: Iterable[str] = ()) -> Mark:
+    """Mark a step of a run with a text, and return the mark.
+
+    Args:
+        run: the run, in a folder of its own.
+        at: the step, such as `"812:57"`, `"eval:3000:17:5"` or `"worst"`; the number of its steps is its end.
+        text: at most 1,000 characters.
+        tags: tags of the mark.
+
+    Raises:
+        NotInRecording: the run has no such step.
+        RunnerError: the recording is not in a folder of its own, a tag or the text is not valid, or there are
+            too many marks.
+        StorageError: the run's folder cannot be written.
+    """
+    run.require_folder()
+    with open_recording(at_hand(run).recording) as recording:
+        step, episode = _existing(recording, EpisodeRef.parse(at))
+    created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    values = {
+        "at": str(step),
+        "episode": episode,
+        "text": text.strip(),
+        "tags": sorted(set(tags)),
+        "created": created,
+    }
+    if not is_utf8(text):
+        raise RunnerError(f"text: found {text[:100]!r}, expected text in UTF-8.")
+    try:
+        made = stored_as(Mark, values, "mark")
+    except RecordingError as error:
+        raise RunnerError(
+            f"{error} A text has at most {MAX_MARK_TEXT:,} characters; a mark at most {MAX_TAGS} tags of "
+            f"{TAG_EXPECTED}."
+        ) from error
+    change_marks(run.folder, lambda marks: marks.merged([made]))
+    return made
+
+
+def unmark(run: Run, *ids: str) -> None:
+    """Remove marks of a run by their ids; merging brings none of them back.
+
+    Raises:
+        RunnerError: the run has no such mark.
+        StorageError: the run's folder cannot be written.
+    """
+    run.require_folder()
+
+    def change(marks: Marks) -> Marks:
+        known = [each.id for each in marks.marks]
+        if missing := [name for name in ids if name not in known]:
+            raise RunnerError(
+                f"run {run.run_id}: found no mark {missing[0]!r}, expected one of: "
+                f"{', '.join(known) or 'none'}."
+            )
+        return marks.merged((), ids)
+
+    change_marks(run.folder, change)
+
+
+def _existing(recording: Recording, at: EpisodeRef) -> tuple[EpisodeRef, int]:
+    """Return a reference to a step with its episode in place of a word, and the number of the episode."""
+    step = at.resolved(recording)
+    number = step.number_in(recording)
+    steps = len(recording.phase(step.phase).episode(number))
+    if step.t > steps:
+        raise step.no_step(recording, steps, step.t)
+    return step, number
