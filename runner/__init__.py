@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from runner.loops.env import record
     from runner.loops.parallel import record_aec, record_parallel
     from runner.loops.vector import record_vector
+    from runner.query.sql import sql
     from runner.recording.gym_spaces import register_space
     from runner.recording.reader import Recording, open_recording
     from runner.runs.listing import list_runs
@@ -72,6 +73,7 @@ __all__ = [
     "resume",
     "run",
     "run_all",
+    "sql",
     "unmark",
     "verify",
     "what_if",
@@ -104,6 +106,7 @@ _HOME = {
     "resume": "runner.execution.resume",
     "run": "runner.api",
     "run_all": "runner.api",
+    "sql": "runner.query.sql",
     "unmark": "runner.analysis.marking",
     "verify": "runner.execution.verify",
     "what_if": "runner.debugging.what_if",

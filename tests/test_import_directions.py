@@ -23,6 +23,7 @@ ORDER = """
     replay
     archive
     analysis
+    query
     execution
     drawing
     export

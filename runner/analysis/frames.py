@@ -73,7 +73,7 @@ def evaluations(run: Source) -> pd.DataFrame:
     with _opened(run) as recording:
         records = [_flat(record.as_json()) for record in evaluation_records(recording)]
         return _frame(
-            [{_evaluation_column(key): value for key, value in record.items()} for record in records]
+            [{evaluation_column(key): value for key, value in record.items()} for record in records]
         )
 
 
@@ -258,7 +258,7 @@ def _flat(record: Mapping[str, object]) -> dict[str, object]:
     return {key: math.nan if value is None else value for key, value in flatten(record).items()}
 
 
-def _evaluation_column(key: str) -> str:
+def evaluation_column(key: str) -> str:
     """Return the column of a value of an evaluation: events by their own names, measures by agent."""
     first, dot, rest = key.partition(".")
     names = {metric.key: metric.name for metric in METRICS}

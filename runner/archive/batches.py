@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -69,16 +69,19 @@ class Batches:
             if rest is not None:
                 heads[topic] = rest
 
-    def records(self, topic: Topic) -> Iterator[Records]:
-        """Yield the messages of a topic as records, `WHOLE` ones if they vary in size."""
-        chunks = self._chunks_of(topic)
-        if chunks is None:
+    def records(self, topic: Topic, chunks: Sequence[int] | None = None) -> Iterator[Records]:
+        """Yield the messages of a topic, or of some of its chunks, as records.
+
+        They are `WHOLE` ones if they vary in size.
+        """
+        stored = self._chunks_of(topic)
+        if stored is None:
             return
         if not self.shape.dtypes[topic].hasobject:
-            yield from chunks.stored()
+            yield from stored.stored_in(range(len(stored)) if chunks is None else chunks)
         else:
             messages, size = [], 0
-            for time, payload in chunks.messages():
+            for time, payload in stored.messages(chunks=chunks):
                 messages.append((time, message_record(topic, time, payload)))
                 size += len(payload)
                 if len(messages) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:

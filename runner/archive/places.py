@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from runner.errors import RecordingError, StorageError
 from runner.runs.trust_marks import copy_mark
@@ -20,6 +20,9 @@ from runner.runs.run import RUN_FILE, Run
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
+
+if TYPE_CHECKING:
+    from runner.archive.store import ArchiveStore
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 MAX_CACHED: Final = 8
@@ -82,6 +85,16 @@ def archive_of(run: Run) -> Iterator[Path]:
     Raises:
         RecordingError: it is at none of its places.
     """
+    with archive_store(run).reading(run.run_id) as folder:
+        yield folder
+
+
+def archive_store(run: Run) -> ArchiveStore:
+    """Return the store with the archive of a run.
+
+    Raises:
+        RecordingError: it is at none of its places.
+    """
     from runner.archive.store import ArchiveStore, split_place
 
     place = archive_place(run)
@@ -90,8 +103,7 @@ def archive_of(run: Run) -> Iterator[Path]:
             f"run {run.run_id}: found no archive at {' or '.join(_places(run))}; its recording was put into "
             f"it. Mount or copy it there, or set {ARCHIVE_VARIABLE} to the folder that has it."
         )
-    with ArchiveStore(split_place(place)[0]).reading(run.run_id) as folder:
-        yield folder
+    return ArchiveStore(split_place(place)[0])
 
 
 def archive_place(run: Run) -> str | None:

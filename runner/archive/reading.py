@@ -171,7 +171,7 @@ class Archive(RunDescription):
             # pre_buffer would keep everything that was read until the file is closed
             open_regular(path).close()  # opening a pipe would block
             with pq.ParquetFile(path, buffer_size=1 << 16, pre_buffer=False) as file:
-                self._check(file, path, columns, rows)
+                check_table(file, str(path), path.stat().st_size, columns, rows)
                 for batch in file.iter_batches(n):
                     for column, values in zip(batch.schema.names, batch.columns, strict=True):
                         if values.null_count and not layout.may_be_null(column):
@@ -182,15 +182,20 @@ class Archive(RunDescription):
         except (pa.ArrowException, OSError, OverflowError, MemoryError) as error:
             raise RecordingError(f"{path}: cannot be read as a table ({error}).") from error
 
-    def _check(self, file: pq.ParquetFile, path: Path, columns: pa.Schema, rows: int) -> None:
-        about, size = file.metadata, path.stat().st_size
-        found = file.schema_arrow.remove_metadata()
-        if not found.equals(columns):
-            raise RecordingError(f"{path}: found columns\n{found}\nexpected\n{columns}")
-        if about.num_rows != rows:
-            raise RecordingError(f"{path}: found {about.num_rows:,} rows, expected {rows:,}.")
-        groups = [about.row_group(k) for k in range(about.num_row_groups)]
-        if any(group.num_rows > MAX_ROWS_A_GROUP for group in groups):
-            raise RecordingError(f"{path}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
-        if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * MAX_UNPACKED_RATIO + _UNPACKED_ANYWAY:
-            raise RecordingError(f"{path}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")
+
+def check_table(file: pq.ParquetFile, where: str, size: int, columns: pa.Schema, rows: int) -> None:
+    """Check what a table declares, before any of it is unpacked; `size` is that of its file.
+
+    Raises:
+        RecordingError: it has other columns or rows, or is made to exhaust the disk.
+    """
+    about, found = file.metadata, file.schema_arrow.remove_metadata()
+    if not found.equals(columns):
+        raise RecordingError(f"{where}: found columns\n{found}\nexpected\n{columns}")
+    if about.num_rows != rows:
+        raise RecordingError(f"{where}: found {about.num_rows:,} rows, expected {rows:,}.")
+    groups = [about.row_group(k) for k in range(about.num_row_groups)]
+    if any(group.num_rows > MAX_ROWS_A_GROUP for group in groups):
+        raise RecordingError(f"{where}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
+    if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * MAX_UNPACKED_RATIO + _UNPACKED_ANYWAY:
+        raise RecordingError(f"{where}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")

@@ -6,7 +6,7 @@ as an object, and then its fields, in which values of varying size are objects t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -26,22 +26,25 @@ _TICK: Final = np.uint64(STEP_NANOSECONDS)
 _MAX_POSITION: Final = 2**63 // STEP_NANOSECONDS
 
 
-def batch_of(table: Table, topic: Topic, records: Records, shape: Shape) -> pa.RecordBatch:
-    """Return the columns of message records.
+def batch_of(
+    table: Table, topic: Topic, records: Records, shape: Shape, names: Sequence[str] | None = None
+) -> pa.RecordBatch:
+    """Return the columns of message records; all of them, or those of some names.
 
     Raises:
         RecordingError: a message cannot be decoded.
         ValueError: a value fits into no column.
     """
     n, phases = len(records), PHASES if topic.phase in PHASES else (topic.phase,)
-    columns = {
-        "run_id": _constant(0, n, (shape.run_id,)),
-        "phase": _constant(phases.index(topic.phase), n, phases),
-        "position": pa.array((records["log_time"] // _TICK).astype(np.int64)),
+    reads: dict[str, Callable[[Records], pa.Array]] = {
+        "run_id": lambda _: _constant(0, n, (shape.run_id,)),
+        "phase": lambda _: _constant(phases.index(topic.phase), n, phases),
+        "position": lambda records: pa.array((records["log_time"] // _TICK).astype(np.int64)),
     }
+    reads |= {column.name: column.read for column in table.messages}
     fields = _decoded(topic, records, shape) if records.dtype.hasobject else records
-    columns |= {column.name: column.read(fields) for column in table.messages}
-    return pa.record_batch([columns[name] for name in table.columns.names], schema=table.columns)
+    columns = table.columns if names is None else pa.schema(map(table.columns.field, names))
+    return pa.RecordBatch.from_arrays([reads[name](fields) for name in columns.names], schema=columns)
 
 
 def records_of(

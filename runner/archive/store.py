@@ -11,7 +11,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -127,8 +127,11 @@ class ArchiveStore:
                 partial.parent.rmdir()
 
     @contextlib.contextmanager
-    def reading(self, run_id: str) -> Iterator[Path]:
-        """Yield a local folder with a run's archive, read-only: its own folder, or a downloaded copy."""
+    def reading(self, run_id: str, without: Container[str] = ()) -> Iterator[Path]:
+        """Yield a local folder with a run's archive, read-only: its own folder, or a downloaded copy.
+
+        A copy is `without` files of these names, and their folders.
+        """
         manifest = self.manifest(run_id)
         if manifest is None:
             raise no_archive(self.place(run_id))
@@ -137,9 +140,21 @@ class ArchiveStore:
             return
         with temporary_folder() as folder:
             for name, entry in manifest.files.items():
-                self._download(run_id, name, entry, folder / name)
+                if name not in without and f"{name.partition('/')[0]}/" not in without:
+                    self._download(run_id, name, entry, folder / name)
             (folder / layout.MANIFEST).write_bytes(manifest.to_json())
             yield folder
+
+    @contextlib.contextmanager
+    def opened(self, run_id: str, name: str) -> Iterator[Any]:
+        """Yield a file of a run's archive, as pyarrow reads it."""
+        where = f"{self.place(run_id)}/{name}"
+        with self._reaching(where):
+            path = self._path(run_id, name)
+            if self._files.get_file_info(path).type != self._file_type:  # opening a pipe would block
+                raise RecordingError(f"{where}: is missing; the archive is damaged.")
+            with self._files.open_input_file(path) as file:
+                yield file
 
     def _upload(self, run_id: str, folder: Path) -> None:
         names = list(read_manifest((folder / layout.MANIFEST).read_bytes(), str(folder)).files)

@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     },
     "Inspect": {
         "ls": ("ls", "List the recorded runs."),
+        "sql": ("query", "Ask the recorded runs, and every step of them, in SQL."),
         "show": ("show", "Show a run: evaluations, tables, configuration."),
         "play": ("play", "Replay a recorded episode in the terminal."),
         "view": ("view", "Open runs in the Rerun viewer."),

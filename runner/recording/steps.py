@@ -91,14 +91,14 @@ class Steps(TopicChunks):
             yield unpacked(fields, self.row_dtype, self.environments, where)
 
     @cached_property
-    def _numbers(self) -> tuple[Ints, Ints]:
+    def chunk_numbers(self) -> tuple[Ints, Ints]:
         """The number of each chunk's first step, and the number after its last."""
         if self.are_actions:
             raise RecordingError(
                 f"{self.file.path}: has only the actions of the steps in {self.topic.name}: `rows` yields "
                 "them, `total` counts them, and `dualtaxi rerecord` brings the whole steps back."
             )
-        return super()._numbers
+        return super().chunk_numbers
 
 
 @dataclass(frozen=True, eq=False)

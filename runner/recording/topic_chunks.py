@@ -83,7 +83,7 @@ class TopicChunks:
     def count(self) -> int:
         """Return the number after that of the last message, or how many there are if they have none."""
         if self.dtype is not None:
-            _, ends = self._numbers
+            _, ends = self.chunk_numbers
             return int(ends[-1]) if len(ends) else 0
         if self.topic.message not in schema.NUMBERED_BY:
             return sum(1 for _ in self.messages())
@@ -110,7 +110,7 @@ class TopicChunks:
 
     def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[Records]:
         """Yield the messages number `start` up to `stop`, a chunk at a time; they must have one size."""
-        firsts, ends = self._numbers
+        firsts, ends = self.chunk_numbers
         stop = int(ends[-1]) if stop is None and len(ends) else (stop or 0)
         begin, end = np.searchsorted(ends, start, side="right"), np.searchsorted(firsts, stop, side="left")
         for k, rows in self._read(range(int(begin), int(end))):
@@ -167,7 +167,7 @@ class TopicChunks:
 
     def holding(self, number: int) -> ChunkSpan | None:
         """Return the chunk that holds a message of fixed width; None if there is none."""
-        firsts, ends = self._numbers
+        firsts, ends = self.chunk_numbers
         k = int(np.searchsorted(ends, number, side="right"))
         is_held = k < len(ends) and firsts[k] <= number
         return ChunkSpan(int(firsts[k]), int(ends[k]), self.entry(k)) if is_held else None
@@ -181,7 +181,7 @@ class TopicChunks:
         return range(max(bisect_left(range(len(self)), value, key=first) - 1, 0), len(self))
 
     @cached_property
-    def _numbers(self) -> tuple[Ints, Ints]:
+    def chunk_numbers(self) -> tuple[Ints, Ints]:
         """The number of each chunk's first message, and the number after its last."""
         if self.dtype is None and self:
             raise RecordingError(
@@ -212,7 +212,7 @@ class TopicChunks:
     def _read(self, chunks: Sequence[int]) -> Iterator[tuple[int, Records]]:
         """Yield the number of each of these chunks and its rows; the next ones are unpacked meanwhile."""
         if self.dtype is not None:
-            self._numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
+            self.chunk_numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
         for k, data in zip(chunks, self.file.chunks(map(self.entry, chunks)), strict=True):
             yield k, self._rows_of(k, data)
 
@@ -251,14 +251,14 @@ class TopicChunks:
 
     # --- records and messages -------------------------------------------------------------------------
 
-    def records(self) -> Iterator[bytes]:
-        """Yield the message records of each chunk, as they are in the file."""
-        return self.file.chunks(map(self.entry, range(len(self))))
+    def records(self, chunks: Sequence[int] | None = None) -> Iterator[bytes]:
+        """Yield the message records of each of these chunks, by default of all, as they are in the file."""
+        return self.file.chunks(map(self.entry, range(len(self)) if chunks is None else chunks))
 
-    def stored(self) -> Iterator[Records]:
+    def stored(self, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the messages of each chunk as they are stored: message records, which must have one size."""
-        self._numbers  # noqa: B018 - as for `_read`
-        return map(self._stored, range(len(self)), self.records())
+        self.chunk_numbers  # noqa: B018 - as for `_read`
+        return map(self._stored, range(len(self)) if chunks is None else chunks, self.records(chunks))
 
     def _stored(self, k: int, data: bytes) -> Records:
         block: Records = np.frombuffer(data, self.dtype)

@@ -1,0 +1,106 @@
+"""`dualtaxi sql`: a question about the recorded runs in SQL."""
+
+from __future__ import annotations
+
+import json
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+import click
+
+from runner.analysis.sections import Grid
+from runner.cli.command import Command, argument, option
+from runner.cli.commands.ls import MAX_PROBLEMS
+from runner.cli.options import folders_option, force_option, json_option, require_one
+from runner.cli.output import console, draw, echo, echo_csv, grid_table, json_list, say
+from runner.cli.parameter_types import COUNT, FILE
+from runner.cli.progress import stage_line
+from runner.util.humanize import UNKNOWN, size
+
+_SHOWN: Final = 1000
+"""The most rows of a table."""
+_SECONDS: Final = 600
+
+
+@click.command("sql", cls=Command)
+def sql_command(
+    query: str = argument(metavar="QUERY"),
+    runs: str = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`."),
+    as_csv: bool = option("--csv", is_flag=True, help="Print CSV."),
+    as_json: bool = json_option,
+    parquet: Path | None = option("--parquet", type=FILE, metavar="FILE", help="Write a file of Parquet."),
+    force: bool = force_option,
+    timeout: int = option(
+        "--timeout", type=COUNT, default=_SECONDS, show_default=True, metavar="SECONDS", help="Limit of time."
+    ),
+    memory: int = option(
+        "--memory", type=COUNT, default=500, show_default=True, metavar="MB", help="Limit of memory."
+    ),
+    recordings: tuple[Path, ...] = folders_option,
+) -> None:
+    """Ask the recorded runs, and every step of them, by one SELECT in the SQL of DuckDB.
+
+    The views, in each of which `run` is the id of a run:
+      runs         a row for each run, as `dualtaxi ls` lists it; `settings` is its configuration as JSON
+      evaluations  a row for each evaluation: mean_return, success_percent, mean_length, ...
+      episodes     a row for each episode that ended: phase, episode, length, return, n_EVENT, ...
+      steps        a row for each step: phase, step, episode, t, state, action, reward, observation_0, ...
+      scalars      a row for each value that a loop logged: phase, step, episode, name, value
+      marks        a row for each mark: ref, phase, episode, t, text, tags
+
+    `DESCRIBE steps` lists columns; a run without a column has NULL there. Steps are read where they are
+    stored, in recordings and archives: conditions on run, phase, episode, step and position keep a query
+    from reading the rest, and --runs from opening other runs. A query reads no files and writes nothing.
+
+    Examples:
+      dualtaxi sql 'SELECT config, seed, avg(mean_return) FROM runs GROUP BY ALL'
+      dualtaxi sql 'SELECT run, max(length) FROM episodes GROUP BY run' --runs 'age < "7d"'
+      dualtaxi sql 'SELECT state, action, count(*) FROM steps GROUP BY ALL' --parquet visits.parquet
+    """
+    require_one("as_csv", "as_json", "parquet")
+    from runner.export.places import new_file, require_new
+    from runner.query.sql import query_runs
+
+    if parquet is not None:
+        require_new(parquet, force)
+    try:
+        with stage_line("reading") as report:
+            result = query_runs(query, recordings, runs, timeout, memory, report)
+            if parquet is not None:
+                with new_file(parquet, force) as temporary:
+                    rows = result.write_parquet(temporary)
+            elif not as_csv and not as_json:
+                shown = list(islice(result.rows(), _SHOWN + 1))
+        if parquet is not None:
+            echo(f"{parquet}  {size(parquet.stat().st_size)}, {rows:,} rows")
+        elif as_csv:
+            echo_csv(result.columns.names, ([_as_text(value) for value in row] for row in result.rows()))
+        elif as_json:
+            named = (dict(zip(result.columns.names, row, strict=True)) for row in result.rows())
+            for line in json_list("rows", named):
+                echo(line, nl=False)
+        else:
+            cells = [tuple(map(_cell, row)) for row in shown[:_SHOWN]]
+            draw(grid_table(Grid(tuple(result.columns.names), cells), shrinking=console().is_terminal))
+            if len(shown) > _SHOWN:
+                say(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
+    except KeyboardInterrupt as interrupt:
+        say("\n".join(getattr(interrupt, "__notes__", [])))
+        raise
+    left_out = result.left_out
+    for sentence in left_out[:MAX_PROBLEMS]:
+        say(sentence)
+    if len(left_out) > MAX_PROBLEMS:
+        say(f"{len(left_out) - MAX_PROBLEMS:,} more runs are left out.")
+
+
+def _as_text(value: object) -> object:
+    """Return a value as a cell of CSV."""
+    return json.dumps(value) if isinstance(value, list | dict) else value
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return UNKNOWN
+    return f"{value:.6g}" if isinstance(value, float) else str(_as_text(value))

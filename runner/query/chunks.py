@@ -1,0 +1,228 @@
+"""The tables of a run in batches of columns; a condition reads the chunks alone that may satisfy it.
+
+A recording has chunks of messages, an archive groups of rows. What is known of each without reading it, such
+as the numbers of its steps, is compared with the condition first.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial, reduce
+from operator import and_
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from pyarrow.fs import LocalFileSystem
+
+from runner.archive import layout
+from runner.archive.batches import Batches
+from runner.archive.columns import Shape, Table
+from runner.archive.places import archive_store
+from runner.archive.reading import Archive, check_table
+from runner.archive.rows import batch_of
+from runner.archive.store import ArchiveStore
+from runner.errors import RecordingError
+from runner.recording import schema
+from runner.recording.reader import Phase, Recording, open_recording
+from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.topic_chunks import TopicChunks
+from runner.runs.run import Run
+
+Known = Mapping[str, tuple[Any, Any]]
+"""The least and the greatest value of columns of a chunk that was not read."""
+
+_COMPARED: Final = ("phase", "position", "step", "episode")
+"""The columns of which an archive knows the least and the greatest value in a group of rows."""
+_ROWS: Final = 1 << 14
+_BUFFER: Final = 1 << 16
+_NOT_NEEDED: Final = frozenset(layout.TOPICS) - {layout.EXTRA_COLUMNS} | {layout.Q_TABLES, layout.CONTENTS}
+"""Files of an archive that its tables are read without."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What the rows of a table must satisfy that a query needs."""
+
+    expression: Any
+    """An expression of Arrow; None for all rows."""
+    columns: pa.Schema
+    """The columns of the table."""
+
+    def mentions(self, column: str) -> bool:
+        """Return whether the condition may be about a column."""
+        return self.expression is not None and column in str(self.expression)
+
+    def may_hold(self, chunks: Sequence[Known]) -> list[int]:
+        """Return the numbers of the chunks that may have rows which satisfy the condition."""
+        if self.expression is None:
+            return list(range(len(chunks)))
+        form, files = ds.ParquetFileFormat(), LocalFileSystem()  # Arrow compares; no file is opened
+        parts = [form.make_fragment(str(k), files, _ranges(known)) for k, known in enumerate(chunks)]
+        kept = ds.FileSystemDataset(parts, self.columns, form, files).get_fragments(self.expression)
+        return [int(part.path) for part in kept]
+
+
+def _ranges(known: Known) -> Any:
+    """Return what is known of a chunk as an expression."""
+    ranges = [
+        (pc.field(name) >= low) & (pc.field(name) <= high) if low != high else pc.field(name) == low
+        for name, (low, high) in known.items()
+    ]
+    return reduce(and_, ranges)
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """Chunks of a table that have one reader."""
+
+    known: Sequence[Known]
+    read: Callable[[Sequence[int], Sequence[str]], Iterator[pa.RecordBatch]]
+    """Yields the columns of these names in the chunks of these numbers."""
+
+
+@dataclass(frozen=True)
+class RunTables:
+    """The tables of one run."""
+
+    shape: Shape
+    count: Callable[[Table], int]
+    """Returns the number of chunks of a table, or of its rows."""
+    chunks: Callable[[Table, Condition], Iterator[Chunks]]
+    """Yields the chunks of a table."""
+
+
+@contextlib.contextmanager
+def opened_tables(run: Run) -> Iterator[RunTables]:
+    """Open the recording of a run, or its archive where it is.
+
+    Raises:
+        RecordingError: it is damaged, or missing.
+        StorageError: it cannot be reached.
+    """
+    if run.status != "archived":
+        with open_recording(run.recording) as recording:
+            batches = Batches(recording)
+            yield RunTables(
+                batches.shape,
+                partial(_count_chunks, recording),
+                partial(_chunks_of_recording, recording, batches),
+            )
+        return
+    store = archive_store(run)
+    with store.reading(run.run_id, _NOT_NEEDED) as folder:
+        archive = Archive(folder)
+        if archive.manifest.digest != run.archive.digest:
+            raise RecordingError(
+                f"{store.place(run.run_id)}: found an archive of digest {archive.manifest.digest}, expected "
+                f"{run.archive.digest}."
+            )
+        chunks = partial(_chunks_of_archive, archive, store)
+        yield RunTables(archive.shape, lambda table: archive.count(*table.topics), chunks)
+
+
+# --- recordings -------------------------------------------------------------------------------------------
+
+
+def _count_chunks(recording: Recording, table: Table) -> int:
+    return sum(len(recording.table(topic)) for topic in table.topics)
+
+
+def _chunks_of_recording(
+    recording: Recording, batches: Batches, table: Table, condition: Condition
+) -> Iterator[Chunks]:
+    for topic in table.topics:
+        known = _known_of(recording, recording.table(topic), condition)
+        yield Chunks(known, partial(_read_records, batches, table, topic))
+
+
+def _read_records(
+    batches: Batches, table: Table, topic: Topic, chunks: Sequence[int], names: Sequence[str]
+) -> Iterator[pa.RecordBatch]:
+    for records in batches.records(topic, chunks):
+        yield batch_of(table, topic, records, batches.shape, names)
+
+
+def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -> list[Known]:
+    """Return what is known of the chunks of a topic."""
+    starts, ends = _times_of(chunks)
+    ranges = {"position": (starts // STEP_NANOSECONDS, ends // STEP_NANOSECONDS)}
+    topic, same = chunks.topic, {"run": (recording.run_id, recording.run_id)}
+    if topic.phase in schema.PHASES:
+        same["phase"] = (topic.phase, topic.phase)
+    if topic.message in schema.NUMBERED_BY and chunks.dtype is not None:
+        first, stop = chunks.chunk_numbers
+        ranges[schema.NUMBERED_BY[topic.message]] = first, stop - 1
+    if topic.message is schema.STEP and condition.mentions("episode"):
+        ranges |= _episodes_of_steps(recording.phase(topic.phase), starts, ends)
+    columns = {name: zip(*map(np.ndarray.tolist, pair), strict=True) for name, pair in ranges.items()}
+    rows = zip(*columns.values(), strict=True)
+    return [same | dict(zip(columns, row, strict=True)) for row in rows]
+
+
+def _times_of(chunks: TopicChunks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the times of the first and the last message of each chunk."""
+    spans = chunks.file.index.chunks.columns[chunks.places]
+    return spans["start_time"].astype(np.int64), spans["end_time"].astype(np.int64)
+
+
+def _episodes_of_steps(
+    phase: Phase, starts: NDArray[np.int64], ends: NDArray[np.int64]
+) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Return the first and the last episode of chunks of steps, as an episode has the time of its last step.
+
+    Nothing is known where a repair lost episodes, or environments take turns: each counts its own episodes.
+    """
+    if phase.steps.have_turns or phase.episodes.lost:
+        return {}
+    ended = [(block["episode"], block["log_time"].astype(np.int64)) for block in phase.episodes.rows()]
+    numbers, times = (
+        np.concatenate([[first], *columns]) for first, *columns in zip((-1, 0), *ended, strict=True)
+    )
+    before = np.searchsorted(times, starts) - 1
+    after = np.append(numbers, numbers[-1] + 1)[np.searchsorted(times, ends)]
+    return {"episode": (numbers[before] + 1, after)}
+
+
+# --- archives ---------------------------------------------------------------------------------------------
+
+
+def _chunks_of_archive(
+    archive: Archive, store: ArchiveStore, table: Table, condition: Condition
+) -> Iterator[Chunks]:
+    del condition  # what is known of groups of rows stands in the file
+    rows = archive.count(*table.topics)
+    if not rows:
+        return
+    run_id, where = archive.run_id, f"{store.place(archive.run_id)}/{table.name}"
+    try:
+        with (
+            store.opened(run_id, table.name) as source,
+            pq.ParquetFile(source, buffer_size=_BUFFER, pre_buffer=False) as file,
+        ):
+            check_table(file, where, source.size(), table.columns, rows)
+            about = file.metadata
+            places = {name: k for k, name in enumerate(table.columns.names) if name in _COMPARED}
+            known = []
+            for group in map(about.row_group, range(about.num_row_groups)):
+                facts = {name: group.column(k).statistics for name, k in places.items()}
+                known.append(
+                    {"run": (run_id, run_id)}
+                    | {name: (s.min, s.max) for name, s in facts.items() if s is not None and s.has_min_max}
+                )
+            yield Chunks(known, partial(_read_groups, file))
+    except (pa.ArrowException, OverflowError) as error:
+        raise RecordingError(f"{where}: cannot be read as a table ({error}).") from error
+
+
+def _read_groups(
+    file: pq.ParquetFile, groups: Sequence[int], names: Sequence[str]
+) -> Iterator[pa.RecordBatch]:
+    for batch in file.iter_batches(_ROWS, row_groups=list(groups), columns=list(names)):
+        yield batch.select(names)

@@ -1,0 +1,199 @@
+"""SQL over the recorded runs, by DuckDB: a query reads the views of some runs, and nothing else.
+
+    runner.sql("SELECT config, seed, avg(mean_return) FROM runs GROUP BY ALL").pandas()
+
+It cannot read files, reach the network, load extensions or write anything, and has limits of time and memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from runner.errors import RunnerError
+from runner.query.views import VIEWS, SelectedRuns
+from runner.runs.catalogue.filters import parse
+from runner.runs.run import recordings_folder
+from runner.util.extras import require
+from runner.util.values import finite
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import polars as pl
+
+MEMORY_MB: Final = 500
+MAX_QUERY: Final = 100_000
+_ROWS: Final = 1 << 14
+_SETTINGS: Final = {
+    "enable_external_access": "false",
+    "autoload_known_extensions": "false",
+    "autoinstall_known_extensions": "false",
+    "allow_community_extensions": "false",
+    "python_enable_replacements": "false",
+    "temp_directory": "",
+    "preserve_insertion_order": "false",
+}
+_WHOLE: Final = pa.decimal128(38, 0)
+"""The type in which DuckDB returns sums of whole numbers."""
+
+
+class QueryResult:
+    """The rows of a query, which are read once: as batches, a table, or a frame."""
+
+    def __init__(self, query: str, runs: SelectedRuns, seconds: float | None, memory: int) -> None:
+        duckdb = require("duckdb", extra="sql", purpose="SQL")
+        self._errors = (duckdb.Error, pa.ArrowException, RuntimeError)
+        self._runs, self._seconds, self._memory = runs, seconds, memory
+        self._deadline = time.monotonic() + (seconds or threading.TIMEOUT_MAX)
+        self._connection = duckdb.connect(":memory:", config=_SETTINGS | {"memory_limit": f"{memory}MB"})
+        self._thread = ThreadPoolExecutor(1, "sql")  # as nothing interrupts a call of DuckDB in this one
+        try:
+            self._reader = self._call(self._begin, query)
+        except BaseException:
+            self.close()
+            raise
+        columns = [
+            (column.name, pa.int64() if column.type == _WHOLE else column.type)
+            for column in self._reader.schema
+        ]
+        self.columns = pa.schema(columns)
+
+    def _begin(self, query: str) -> pa.RecordBatchReader:
+        kinds = [statement.type.name for statement in self._connection.extract_statements(query)]
+        if kinds != ["SELECT"]:
+            raise RunnerError(f"sql: found {', '.join(kinds) or 'nothing'}, expected one SELECT.")
+        for name in VIEWS:
+            is_named = name in query.casefold()
+            view = self._runs.view(name) if is_named else pa.table({"run": pa.array([], pa.string())})
+            self._connection.register(name, view)
+        self._connection.execute("SET lock_configuration = true")
+        return self._connection.sql(query).to_arrow_reader(_ROWS)
+
+    @property
+    def left_out(self) -> list[str]:
+        """Sentences on the runs that are left out, as far as the query has read."""
+        return list(self._runs.left_out.values())
+
+    def batches(self) -> Iterator[pa.RecordBatch]:
+        """Yield the rows, thousands at a time.
+
+        Raises:
+            RunnerError: the query fails, or exceeds its time or memory.
+        """
+        with contextlib.closing(self):
+            while (batch := self._call(next, self._reader, None)) is not None:
+                yield self._call(batch.cast, self.columns)
+
+    def rows(self) -> Iterator[list[object]]:
+        """Yield the rows one by one, their values as JSON can hold them; errors as for `batches`."""
+        for batch in self.batches():
+            columns = [[_as_json(value) for value in column.to_pylist()] for column in batch.columns]
+            yield from map(list, zip(*columns, strict=True))
+
+    def write_parquet(self, path: Path) -> int:
+        """Write the rows into a file of Parquet; return their number."""
+        count = 0
+        with pq.ParquetWriter(path, self.columns, compression="zstd") as writer:
+            for batch in self.batches():
+                writer.write_batch(batch)
+                count += batch.num_rows
+        return count
+
+    def arrow(self) -> pa.Table:
+        """Return the rows as a table of Arrow."""
+        return pa.Table.from_batches(self.batches(), self.columns)
+
+    def pandas(self) -> pd.DataFrame:
+        """Return the rows as a frame of pandas."""
+        require("pandas", extra="frames", purpose="a frame")
+        frame: pd.DataFrame = self.arrow().to_pandas()
+        return frame
+
+    def polars(self) -> pl.DataFrame:
+        """Return the rows as a frame of Polars."""
+        frame: pl.DataFrame = require("polars", extra="polars", purpose="a frame").DataFrame(self.arrow())
+        return frame
+
+    def close(self) -> None:
+        """End the query."""
+        self._connection.interrupt()
+        self._thread.shutdown()
+        self._connection.close()
+
+    def _call(self, function: Callable[..., Any], *args: object) -> Any:
+        """Return what a function returns, within the limits."""
+        future = self._thread.submit(function, *args)
+        try:
+            return future.result(max(self._deadline - time.monotonic(), 0))
+        except KeyboardInterrupt as interrupt:
+            interrupt.add_note(f"Interrupted; {self._runs}.")
+            raise
+        except TimeoutError:
+            raise RunnerError(f"sql: stopped after {self._seconds:g} s; {self._runs}.") from None
+        except self._errors as error:
+            message = str(error).removeprefix("Error: ").strip()
+            if "Out of Memory" in message:
+                message = f"needs more than {self._memory:,} MB of memory, and was stopped; {self._runs}."
+            raise RunnerError(f"sql: {message}") from error
+
+
+def _as_json(value: Any) -> Any:
+    """Return a value of Arrow as JSON can hold it: bytes in hexadecimal, times and other types as text."""
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, dict):
+        return {key: _as_json(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return list(map(_as_json, value))
+    return finite(value) if value is None or isinstance(value, int | float) else str(value)
+
+
+def sql(
+    query: str,
+    *,
+    recordings: str | os.PathLike[str] | None = None,
+    runs: str = "",
+    timeout: float | None = None,
+    memory: int = MEMORY_MB,
+    report: Callable[[str], None] = lambda _: None,
+) -> QueryResult:
+    """Ask the recorded runs in SQL; return the rows, which are read as they are asked for.
+
+    The views are `runs`, `episodes`, `evaluations`, `scalars`, `steps` and `marks`; each has a column `run`.
+
+    Args:
+        query: one SELECT in the SQL of DuckDB.
+        recordings: the folder of runs: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        runs: a filter as of `dualtaxi ls`; the views have the runs that match it.
+        timeout: the seconds after which the query is stopped.
+        memory: the megabytes that DuckDB may use.
+        report: called with how far the query has read, a few times a second.
+
+    Raises:
+        RunnerError: the query is wrong, or exceeds its time or memory.
+        MissingExtra: DuckDB is not installed.
+    """
+    return query_runs(query, [recordings_folder(recordings)], runs, timeout, memory, report)
+
+
+def query_runs(
+    query: str,
+    roots: Sequence[Path],
+    runs: str,
+    timeout: float | None = None,
+    memory: int = MEMORY_MB,
+    report: Callable[[str], None] = lambda _: None,
+) -> QueryResult:
+    """Return the rows of a query over several folders of runs; arguments and errors as for `sql`."""
+    if len(query) > MAX_QUERY:
+        raise RunnerError(f"sql: found {len(query):,} characters, expected at most {MAX_QUERY:,}.")
+    return QueryResult(query, SelectedRuns(roots, parse(runs), report), timeout, memory)

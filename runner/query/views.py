@@ -1,0 +1,239 @@
+"""The views of a query: the tables of the selected runs as one, with a column for the run.
+
+Steps, episodes and scalars are read while the query runs, in the columns and chunks that it needs. A column
+that a run does not have is null in its rows. The other views are small.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+
+from runner.analysis.evaluations import evaluation_records
+from runner.analysis.frames import evaluation_column
+from runner.archive import layout
+from runner.archive.places import at_hand
+from runner.errors import NotInRecording, RunnerError
+from runner.query.chunks import Condition, RunTables, opened_tables
+from runner.recording.marks import read_marks
+from runner.recording.reader import open_recording
+from runner.runs.catalogue.columns import COLUMNS, IndexRow
+from runner.runs.catalogue.filters import Filter
+from runner.runs.catalogue.index import look
+from runner.runs.listing import listed_run
+from runner.runs.run import Run
+from runner.util.values import flatten
+
+TABLES: Final = {"steps": layout.STEPS, "episodes": layout.EPISODES, "scalars": layout.SCALARS}
+"""The views of tables, which may be long."""
+VIEWS: Final = ("runs", "evaluations", "marks", *TABLES)
+_MOMENT: Final = pa.timestamp("ms", tz="UTC")
+_TEXTS: Final = pa.list_(pa.string())
+_TYPES: Final = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+_MARKS: Final = {
+    **dict.fromkeys(("run", "mark", "ref", "phase", "text", "created"), pa.string()),
+    **dict.fromkeys(("episode", "t"), pa.int64()),
+    "tags": _TEXTS,
+}
+_REPORT_SECONDS: Final = 0.2
+
+
+class Relation(ds.Dataset):  # type: ignore[misc]
+    """A view that DuckDB asks for columns, and for the rows that satisfy a condition."""
+
+    def __init__(
+        self, columns: pa.Schema, read: Callable[[pa.Schema, Condition], Iterator[pa.RecordBatch]]
+    ) -> None:
+        self._columns, self._read = columns, read
+
+    @property
+    def schema(self) -> pa.Schema:
+        """The columns."""
+        return self._columns
+
+    def scanner(self, columns: Sequence[str] | None = None, filter: Any = None, **_: object) -> Any:  # noqa: A002
+        """Return what DuckDB uses of a scanner, which would read ahead in threads of its own."""
+        names, condition = columns or self._columns.names, Condition(filter, self._columns)
+        shown = _selected(self._columns, lambda name: name in names)
+        read = _selected(self._columns, lambda name: name in names or condition.mentions(name))
+        batches = self._read(read, condition)
+        rows = batches if filter is None else (batch.filter(filter) for batch in batches)
+        return SimpleNamespace(
+            projected_schema=shown,
+            to_reader=lambda: pa.RecordBatchReader.from_batches(
+                shown, (batch.select(shown.names) for batch in rows)
+            ),
+        )
+
+
+def _selected(columns: pa.Schema, is_selected: Callable[[str], bool]) -> pa.Schema:
+    return pa.schema([column for column in columns if is_selected(column.name)])
+
+
+class SelectedRuns:
+    """The runs that a query is about, and how far it has read them.
+
+    Args:
+        chosen: the filter that they match.
+        report: called with how far it has read, a few times a second.
+    """
+
+    def __init__(self, roots: Sequence[Path], chosen: Filter, report: Callable[[str], None]) -> None:
+        self._rows = look(roots, lambda index: index.select(chosen))
+        self._report, self._reported = report, time.monotonic()
+        self._read_runs: set[str] = set()
+        self._read_rows = 0
+        self.left_out: dict[str, str] = {}
+        """Why runs are left out, or the rest of them, by their id and the view."""
+
+    def __str__(self) -> str:
+        """Return how far the query has read."""
+        return f"{self._read_rows:,} rows of {len(self._read_runs):,} of {len(self._rows):,} runs were read"
+
+    def view(self, name: str) -> pa.Table | Relation:
+        """Return a view."""
+        if name in TABLES:
+            return self._relation(name)
+        return {"runs": self._runs, "evaluations": self._evaluations, "marks": self._marks}[name]()
+
+    @contextlib.contextmanager
+    def _reading(self, name: str, row: IndexRow) -> Iterator[Run]:
+        """Yield a run; leave it out of a view if the block raises an error."""
+        try:
+            yield listed_run(Path(row["root"], row["entry"]), row["id"])
+        except RunnerError as error:
+            self.left_out[f"{row['id']} {name}"] = f"run {row['id']} is left out of {name}: {error}"
+
+    def _count(self, row: IndexRow, rows: int) -> None:
+        self._read_runs.add(row["id"])
+        self._read_rows += rows
+        if time.monotonic() - self._reported > _REPORT_SECONDS:
+            self._reported = time.monotonic()
+            self._report(str(self))
+
+    def _runs(self) -> pa.Table:
+        """Return the columns of `dualtaxi ls`, and each configuration as JSON."""
+        kinds = {"run": pa.string(), "settings": pa.string(), "tags": _TEXTS}
+        kinds |= {name: _TYPES[column.type] for name, column in COLUMNS.items() if column.type}
+        del kinds["id"]
+        kinds |= {"seed": pa.uint64(), "created": _MOMENT}
+        rows = [row | {"run": row["id"], "tags": (row["tags"] or "").split()} for row in self._rows]
+        return _table(rows, kinds)
+
+    def _evaluations(self) -> pa.Table:
+        """Return the columns of `runner.frames.evaluations`, with _ for dots, and the sums over agents."""
+        rows: list[dict[str, object]] = []
+        for row in self._rows:
+            with (
+                self._reading("evaluations", row) as run,
+                open_recording(at_hand(run).recording) as recording,
+            ):
+                for record in evaluation_records(recording):
+                    values = flatten(record.as_json())
+                    named = {evaluation_column(key).replace(".", "_"): values[key] for key in values}
+                    rows.append({"run": row["id"], "mean_return": record.value("mean_return")} | named)
+                self._count(row, 0)
+        return _table(rows, {"run": pa.string()} | dict.fromkeys(name for row in rows for name in row))
+
+    def _marks(self) -> pa.Table:
+        marks = [
+            {"run": row["id"], "ref": mark.at} | mark.as_row()
+            for row in self._rows
+            for mark in read_marks(Path(row["root"], row["entry"])).marks
+        ]
+        return _table(marks, _MARKS)
+
+    def _relation(self, name: str) -> Relation:
+        """Return the view of a table, with the columns of all runs."""
+        kinds, rows = {"run": pa.string()}, []
+        for row in self._rows:
+            with self._reading(name, row) as run, opened_tables(run) as tables:
+                table = tables.shape.tables.get(TABLES[name])
+                if table is None or not tables.count(table):
+                    raise NotInRecording(f"it has no {name}.")
+                for column in table.columns:
+                    kinds[column.name] = _wider(kinds.get(column.name), column.type)
+                rows.append(row)
+                self._count(row, 0)
+        self._read_runs.clear()
+        for left_out in ("run_id", "taken"):
+            kinds.pop(left_out, None)
+        own_names: dict[str, str] = {}
+        for own in kinds:  # DuckDB ignores case
+            shown = own
+            while shown.casefold() in map(str.casefold, own_names):
+                shown += "_"
+            own_names[shown] = own
+        columns = pa.schema([(shown, kinds[own]) for shown, own in own_names.items()])
+        return Relation(columns, partial(self._batches, name, rows, own_names))
+
+    def _batches(
+        self,
+        name: str,
+        rows: Sequence[IndexRow],
+        own_names: Mapping[str, str],
+        needed: pa.Schema,
+        condition: Condition,
+    ) -> Iterator[pa.RecordBatch]:
+        """Yield some columns of a table; some of the rows may not satisfy the condition."""
+        for k in condition.may_hold([{"run": (row["id"], row["id"])} for row in rows]):
+            with self._reading(name, rows[k]) as run, opened_tables(run) as tables:
+                for batch in _batches_of(tables, TABLES[name], own_names, needed, condition):
+                    self._count(rows[k], batch.num_rows)
+                    yield batch
+
+
+def _batches_of(
+    tables: RunTables, file: str, own_names: Mapping[str, str], needed: pa.Schema, condition: Condition
+) -> Iterator[pa.RecordBatch]:
+    table = tables.shape.tables[file]
+    own = [name for name in map(own_names.__getitem__, needed.names) if name in table.columns.names]
+    is_turn = ["taken"] if "taken" in table.columns.names else []  # else it is no step of its environment
+    for chunks in tables.chunks(table, condition):
+        for batch in chunks.read(condition.may_hold(chunks.known), own + is_turn):
+            rows = batch.filter(batch["taken"]) if is_turn else batch
+            values = [
+                _cast(rows[own_names[column.name]], column.type)
+                if own_names[column.name] in own
+                else pa.nulls(rows.num_rows, column.type)
+                for column in needed
+                if column.name != "run"
+            ]
+            if "run" in needed.names:
+                run = pa.repeat(pa.scalar(tables.shape.run_id), rows.num_rows)
+                values.insert(needed.get_field_index("run"), run)
+            yield pa.RecordBatch.from_arrays(values, schema=needed)
+
+
+def _table(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, pa.DataType | None]) -> pa.Table:
+    """Return rows as a table; a type that is None follows from the values."""
+    return pa.table({name: pa.array([row.get(name) for row in rows], kind) for name, kind in kinds.items()})
+
+
+def _wider(one: pa.DataType | None, other: pa.DataType) -> pa.DataType:
+    """Return the type of a column in a query that has these types in runs; text if they are unlike."""
+    if pa.types.is_dictionary(other):
+        other = pa.string()
+    elif pa.types.is_fixed_size_binary(other):
+        other = pa.binary()
+    if one is None or one == other:
+        return other
+    try:
+        pair = [pa.schema([("", kind)]) for kind in (one, other)]
+        return pa.unify_schemas(pair, promote_options="permissive").types[0]
+    except pa.ArrowException:
+        return pa.string()
+
+
+def _cast(values: pa.Array, kind: pa.DataType) -> pa.Array:
+    if pa.types.is_nested(values.type) and kind == pa.string():
+        return pa.array([None if value is None else str(value) for value in values.to_pylist()], kind)
+    return values.cast(kind)
