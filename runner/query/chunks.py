@@ -42,7 +42,10 @@ _COMPARED: Final = ("phase", "position", "step", "episode")
 """The columns of which an archive knows the least and the greatest value in a group of rows."""
 _ROWS: Final = 1 << 14
 _BUFFER: Final = 1 << 16
-_NOT_NEEDED: Final = frozenset(layout.TOPICS) - {layout.EXTRA_COLUMNS} | {layout.Q_TABLES, layout.CONTENTS}
+_NOT_NEEDED: Final = frozenset(layout.TOPICS) - {layout.EXTRA_COLUMNS} | {
+    *(layout.Q_TABLES, layout.CONTENTS, layout.RUN),
+    *(layout.TRANSITIONS, layout.STATES, layout.ACTIONS),
+}
 """Files of an archive that its tables are read without."""
 
 

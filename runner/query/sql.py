@@ -11,7 +11,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -93,7 +93,7 @@ class QueryResult:
             while (batch := self._call(next, self._reader, None)) is not None:
                 yield self._call(batch.cast, self.columns)
 
-    def rows(self) -> Iterator[list[object]]:
+    def rows(self) -> Generator[list[object], None, None]:
         """Yield the rows one by one, their values as JSON can hold them; errors as for `batches`."""
         for batch in self.batches():
             columns = [[_as_json(value) for value in column.to_pylist()] for column in batch.columns]

@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from starlette.routing import BaseRoute
 
 from runner.errors import RunnerError
-from runner.service import login, pages, views
+from runner.service import login, pages, queries, views
 from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, Computation, SettingsOf
@@ -115,8 +115,9 @@ def _routes() -> list[BaseRoute]:
     )
     for part in (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads):
         whole.include_router(part.router, prefix=API, responses=general)
-    whole.include_router(views.api, prefix=API, responses=general)
-    for router in (health, login.router, views.pages, pages.router):
+    for router in (views.api, queries.api):
+        whole.include_router(router, prefix=API, responses=general)
+    for router in (health, login.router, views.pages, queries.pages, pages.router):
         whole.include_router(router)
     return whole.routes
 

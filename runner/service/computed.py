@@ -11,6 +11,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from http import HTTPStatus
+from itertools import islice
 from pathlib import Path
 from typing import Final, Literal
 
@@ -53,6 +54,8 @@ from runner.views.view import Answer, FileAnswer, Given
 
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
+MAX_ROWS: Final = 1000
+"""The most rows of a query."""
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
 RecordKind = Literal["evaluations", "training", "optimality"]
@@ -324,6 +327,24 @@ def replay(runs: Sequence[Run], request: Request) -> bytes:
     """Return the path of an export for the Rerun viewer, from the user's cache or new."""
     require_rerun("a replay")
     return os.fsencode(cached_export(runs, request)[0])
+
+
+def query(roots: Sequence[Path], text: str, runs: str) -> bytes:
+    """Return the first rows of a query in SQL, as JSON."""
+    require("pyarrow", extra="sql", purpose="SQL")
+    from runner.query.sql import query_runs
+
+    result = query_runs(text, roots, runs)
+    with contextlib.closing(result.rows()) as rows:
+        first = list(islice(rows, MAX_ROWS + 1))
+    return as_json(
+        {
+            "columns": result.columns.names,
+            "rows": first[:MAX_ROWS],
+            "more": len(first) > MAX_ROWS,
+            "left_out": result.left_out,
+        }
+    )
 
 
 def as_json(value: object) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import islice
 from pathlib import Path
 from typing import Final
@@ -16,7 +15,9 @@ from runner.cli.options import folders_option, force_option, json_option, requir
 from runner.cli.output import console, draw, echo, echo_csv, grid_table, json_list, say
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
-from runner.util.humanize import UNKNOWN, size
+from runner.query.text import cell_of, csv_value
+from runner.util.extras import require
+from runner.util.humanize import size
 
 _SHOWN: Final = 1000
 """The most rows of a table."""
@@ -59,6 +60,7 @@ def sql_command(
       dualtaxi sql 'SELECT state, action, count(*) FROM steps GROUP BY ALL' --parquet visits.parquet
     """
     require_one("as_csv", "as_json", "parquet")
+    require("pyarrow", extra="sql", purpose="SQL")
     from runner.export.places import new_file, require_new
     from runner.query.sql import query_runs
 
@@ -75,13 +77,13 @@ def sql_command(
         if parquet is not None:
             echo(f"{parquet}  {size(parquet.stat().st_size)}, {rows:,} rows")
         elif as_csv:
-            echo_csv(result.columns.names, ([_as_text(value) for value in row] for row in result.rows()))
+            echo_csv(result.columns.names, ([csv_value(value) for value in row] for row in result.rows()))
         elif as_json:
             named = (dict(zip(result.columns.names, row, strict=True)) for row in result.rows())
             for line in json_list("rows", named):
                 echo(line, nl=False)
         else:
-            cells = [tuple(map(_cell, row)) for row in shown[:_SHOWN]]
+            cells = [tuple(map(cell_of, row)) for row in shown[:_SHOWN]]
             draw(grid_table(Grid(tuple(result.columns.names), cells), shrinking=console().is_terminal))
             if len(shown) > _SHOWN:
                 say(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
@@ -93,14 +95,3 @@ def sql_command(
         say(sentence)
     if len(left_out) > MAX_PROBLEMS:
         say(f"{len(left_out) - MAX_PROBLEMS:,} more runs are left out.")
-
-
-def _as_text(value: object) -> object:
-    """Return a value as a cell of CSV."""
-    return json.dumps(value) if isinstance(value, list | dict) else value
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return UNKNOWN
-    return f"{value:.6g}" if isinstance(value, float) else str(_as_text(value))

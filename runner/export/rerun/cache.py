@@ -45,6 +45,6 @@ def _cache_key(runs: Sequence[Run], request: Request) -> str:
     parts = [__version__, repr(request)]
     for run in runs:
         stat = run.recording.stat()
-        parts += [str(run.recording.absolute()), str(stat.st_size), str(stat.st_mtime_ns)]
+        parts += [str(run.recording.absolute()), str(stat.st_size), str(stat.st_mtime_ns), repr(run.marks)]
     parts += [str(file.stat().st_mtime_ns) for file in sorted(Path(__file__).parent.glob("*.py"))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import contextlib
 import itertools
 from collections.abc import Iterator, Sequence
 from typing import Final
@@ -13,6 +14,7 @@ import rerun.blueprint as rrb
 
 from runner.drawing import palette
 from runner.environments.naming import spoken
+from runner.errors import RecordingError
 from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.tracks import Colour, Floats, Times, Track, TrackSource, TrackView, scalars, times_of
 from runner.recording import schema
@@ -68,6 +70,19 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
         ]
         log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
         yield Track(f"{source.root}/eval/events", _times(evaluations), log, view=EVENTS)
+
+
+def mark_tracks(source: TrackSource) -> Iterator[Track]:
+    """Yield the marks of a run at their steps; those at steps that it does not have are left out."""
+    lines, times = [], []
+    for mark in source.marks:
+        with contextlib.suppress(RecordingError):
+            steps = source.recording.phase(mark.phase).episode(mark.episode)
+            times.append(steps.one(min(mark.t, len(steps) - 1))["log_time"])
+            lines.append(" ".join(["mark", mark.at, mark.text, *map("[{}]".format, mark.tags)]))
+    if lines:
+        log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
+        yield Track(f"{source.root}/marks", times_of(times), log, view=EVENTS)
 
 
 def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iterator[Lines]:

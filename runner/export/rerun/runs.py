@@ -12,7 +12,7 @@ import rerun as rr
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.loops import LoopTracks
-from runner.export.rerun.metrics import EVENTS, metric_tracks, phase_colours, series_lines
+from runner.export.rerun.metrics import EVENTS, mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
 from runner.export.rerun.selection import Selection, episodes_of
@@ -64,6 +64,7 @@ class RunReader:
         """Yield everything but steps, and what never changes of them."""
         root = self._root
         yield from self._loop.overview() if self._loop else metric_tracks(self._source)
+        yield from mark_tracks(self._source)
         if not self._steps:
             return
         yield self._labels.track(root)

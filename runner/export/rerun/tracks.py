@@ -13,6 +13,7 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from runner.drawing import palette
+from runner.recording.marks import Mark
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.util.arrays import Array, Ints, Scalar
@@ -72,6 +73,8 @@ class TrackSource:
     """Entity path of everything of the run; empty for the root."""
     tint: str | None = None
     """Base colour of its metrics, where runs are compared."""
+    marks: Sequence[Mark] = ()
+    """The marks at its steps."""
 
 
 @dataclass(eq=False)

@@ -59,7 +59,7 @@ def export_runs(
     colours = itertools.cycle(palette.COMPARED)
     sources = []
     for run, recording in zip(runs, recordings, strict=True):
-        source = TrackSource(recording, f"{run.title} ({run.run_id})")
+        source = TrackSource(recording, f"{run.title} ({run.run_id})", marks=run.marks)
         if len(runs) > 1:
             source = dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
         sources.append(source)

@@ -7,11 +7,13 @@ from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi import Path as InPath
 from pydantic import BaseModel, Field
 
+from runner.analysis.marking import mark, unmark
 from runner.analysis.summary import describe_run
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
-from runner.recording.marks import read_marks
+from runner.recording.marks import MAX_MARK_TEXT, read_marks
 from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
 from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
@@ -19,7 +21,7 @@ from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.run import Run, label
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
-from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, SettingsOf
+from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, RecordedRun, SettingsOf
 from runner.service.errors import Refused
 from runner.service.problems import error_docs
 from runner.service.settings import ServiceSettings
@@ -151,6 +153,50 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
 def label_run(run: FoundRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
     """Change the labels of a run as `dualtaxi label` does, and return them."""
     return relabelled(run, labels, catalogue)
+
+
+class MarkSent(BaseModel):
+    """A mark to set."""
+
+    at: Annotated[str, Field(max_length=60, description="The step, such as `812:57`.")]
+    text: Annotated[str, Field(max_length=MAX_MARK_TEXT)] = ""
+    tags: Annotated[list[str], Field(max_length=MAX_TAGS)] = []
+
+
+class MarksResponse(BaseModel):
+    """The marks of a run."""
+
+    run_id: str
+    marks: list[Json]
+
+
+@router.post(
+    "/runs/{run}/marks",
+    response_model=MarksResponse,
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    summary="Mark a step.",
+)
+def mark_step(run: RecordedRun, sent: MarkSent) -> dict[str, object]:
+    """Mark a step of a run as `dualtaxi mark` does, and return all marks of the run."""
+    mark(run, sent.at, sent.text, tags=sent.tags)
+    return marks_of(run)
+
+
+@router.delete(
+    "/runs/{run}/marks/{name}",
+    response_model=MarksResponse,
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    summary="Remove a mark.",
+)
+def remove_mark(run: FoundRun, name: Annotated[str, InPath(max_length=40)]) -> dict[str, object]:
+    """Remove a mark by its id, and return the others."""
+    unmark(run, name)
+    return marks_of(run)
+
+
+def marks_of(run: Run) -> dict[str, object]:
+    """Return the marks of a run."""
+    return {"run_id": run.run_id, "marks": [each.as_row() for each in run.marks]}
 
 
 class StopResponse(BaseModel):

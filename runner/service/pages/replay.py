@@ -16,6 +16,7 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
+from runner.analysis.marking import mark, unmark
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.encoded import picture_note
@@ -36,7 +37,7 @@ from runner.service.dependencies import (
     RecordedRun,
 )
 from runner.service.pages.frame import run_page
-from runner.service.pages.rendering import message_of, page
+from runner.service.pages.rendering import Form, message_of, page
 from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
@@ -201,6 +202,18 @@ for _path, _episode in EPISODES.items():
     _add_route(_path, _episode)
 
 
+@router.post("/mark")
+def mark_step(run: RecordedRun, form: Form) -> Response:
+    """Mark the step of a replay, or remove a mark, and show the replay again."""
+    step = EpisodeRef.parse(form.get("at", ""))
+    if removed := form.get("remove"):
+        unmark(run, removed)
+    else:
+        mark(run, step, form.get("text", ""), tags=form.get("tags", "").split())
+    address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
+    return RedirectResponse(f"{address}#marks", HTTPStatus.SEE_OTHER)
+
+
 def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link]:
     """Return links to the comparisons of a run with its parent, if it is a branch, and with its branches."""
 
@@ -245,6 +258,7 @@ def _values(
         "environments": environments,
         "what_if": f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
         "branches": branches,
+        "marks": [mark for mark in run.marks if EpisodeRef.parse(mark.at).episode_path == at.episode_path],
     }
 
 

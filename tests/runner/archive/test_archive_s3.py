@@ -9,10 +9,13 @@ import pytest
 from click.testing import CliRunner
 from moto.server import ThreadedMotoServer
 from pyarrow import fs
+from pyarrow import parquet as pq
 
+import runner
 from runner.archive import layout
 from runner.archive.manifest import Manifest, entries_of
 from runner.archive.restoring import restore
+from runner.archive.runs import archive_run
 from runner.archive.store import ArchiveStore
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError, StorageError
@@ -104,6 +107,35 @@ def test_a_run_goes_there_and_comes_back(run, bucket, tmp_path):
     shutil.rmtree(recordings)
     command("restore", f"{URL}/{run.run_id}")
     command("verify", run.run_id)
+
+
+def test_sql_reads_groups_of_rows_there(run, bucket, tmp_path, monkeypatch):
+    recordings = shutil.copytree(run.folder.parent, tmp_path / "recordings")
+    query = "SELECT * FROM steps WHERE phase = 'train' AND episode = 7 ORDER BY step"
+    expected = runner.sql(query, recordings=recordings).arrow()
+    monkeypatch.setattr("runner.archive.writing.ROWS_A_GROUP", 500)
+    archive_run(find_run(run.run_id, recordings), URL, remove=True)
+    groups, downloaded = [], []
+    read, download = pq.ParquetFile.iter_batches, ArchiveStore._download
+
+    def counted(file, *args, row_groups, **options):
+        groups.append((len(row_groups), file.num_row_groups))
+        return read(file, *args, row_groups=row_groups, **options)
+
+    def named(store, run_id, name, *more):
+        downloaded.append(name)
+        return download(store, run_id, name, *more)
+
+    monkeypatch.setattr(pq.ParquetFile, "iter_batches", counted)
+    monkeypatch.setattr(ArchiveStore, "_download", named)
+    assert runner.sql(query, recordings=recordings).arrow() == expected
+    ((wanted, total),) = groups
+    assert wanted < total
+    assert not [name for name in downloaded if name.endswith(".parquet")]
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    result = runner.sql("SELECT count(*) AS n FROM steps", recordings=recordings)
+    assert result.arrow().to_pylist() == [{"n": 0}]
+    assert "cannot be accessed" in result.left_out[0]
 
 
 @pytest.mark.parametrize("fail_at", [1, 3, -1], ids=["first file", "third file", "manifest"])

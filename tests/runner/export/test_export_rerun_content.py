@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+import runner
 from runner.drawing.palette import COMPARED
 from runner.environments.mdp import events_of
 from runner.export.rerun.labels import GridLabels
@@ -17,10 +19,11 @@ from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Request
 from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.viewer import viewer_program
-from runner.export.rerun.writing import export
+from runner.export.rerun.writing import export, export_runs
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at
+from runner.runs.resolve import find_run
 from tests.runner.export.rerun_views import views_of
 
 TOPICS = {"train": schema.TRAIN_STEP, "eval": schema.EVAL_STEP}
@@ -315,3 +318,19 @@ def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
         export(sources, Request(), tmp_path / "both.rrd")
     views = [[f"/{run}/{path}" for run in "ab" for path in paths] for _, paths in PLOTS]
     check_lines(tmp_path / "both.rrd", views)
+
+
+def test_marks_are_in_the_log_at_their_steps(pictured, tmp_path):
+    run = pictured("lake")
+    folder = shutil.copytree(run.folder, tmp_path / run.run_id)
+    copied = find_run(run.run_id, folder.parent)
+    runner.mark(copied, "3:1", "both stuck", tags=["stuck"])
+    with open_recording(copied.recording) as recording:
+        step = recording.train.episode(3).one(1)
+        request = Request(everything=True)
+        export_runs([copied], [recording], request, tmp_path / "run.rrd")
+    store = RrdReader(str(tmp_path / "run.rrd")).store()
+    (chunk,) = [c for c in store.stream().filter(content="/marks").to_chunks() if not c.is_static]
+    (row,) = chunk.to_record_batch().to_pylist()
+    assert row["TextLog:text"] == ["mark 3:1 both stuck [stuck]"]
+    assert row["step"] == int(step["log_time"]) // schema.STEP_NANOSECONDS

@@ -4,7 +4,7 @@ import { picturesOf } from "./pictures.js";
 
 const root = document.querySelector("[data-part]"),
   source = root.dataset.part;
-const [toRerun, toWhatIf, toBranch] = ["rerun", "what-if", "branch"].map((name) =>
+const [toRerun, toWhatIf, toBranch, toMark] = ["rerun", "what-if", "branch", "mark"].map((name) =>
   root.querySelector(`[data-to-${name}]`),
 );
 let writing = null;
@@ -14,6 +14,7 @@ function moved(k) {
   if (toRerun) toRerun.href = `${root.dataset.rerun}:${Math.max(0, k - 1)}`;
   if (toWhatIf) toWhatIf.href = `${root.dataset.whatIf}:${Math.min(k, replay.length - 1)}`;
   if (toBranch) toBranch.href = toBranch.href.replace(/[0-9]+$/, Math.min(k, replay.length - 1));
+  if (toMark) toMark.value = toMark.value.replace(/[0-9]+$/, k);
   clearTimeout(writing);
   writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
 }
@@ -33,3 +34,26 @@ onKeys(
     replay.show(Math.min(replay.length, Math.max(0, replay.k + by)));
   },
 );
+
+// Marks: a tick at the slider and a link for each; the key M leads to the text of another.
+const ticks = document.createElement("datalist");
+ticks.id = "mark-ticks";
+for (const link of root.querySelectorAll("[data-mark]")) {
+  const tick = ticks.appendChild(document.createElement("option"));
+  tick.value = link.dataset.mark;
+  tick.label = link.parentElement.textContent.trim();
+  link.addEventListener("click", (event) => {
+    event.preventDefault();
+    replay.pause();
+    replay.show(Number(link.dataset.mark));
+  });
+}
+replay.slider.after(ticks);
+replay.slider.setAttribute("list", ticks.id);
+document.addEventListener("keydown", (event) => {
+  if (event.key.toLowerCase() !== "m" || event.ctrlKey || event.metaKey || event.altKey || !toMark) return;
+  if (event.target.matches("input:not([type=range]), textarea, select")) return;
+  event.preventDefault();
+  replay.pause();
+  toMark.form.elements.text.focus();
+});

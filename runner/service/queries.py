@@ -1,0 +1,72 @@
+"""SQL over the runs of a server: an API route, and a page with a form."""
+
+from __future__ import annotations
+
+import json
+from http import HTTPStatus
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel
+from starlette.concurrency import run_in_threadpool
+
+from runner.analysis.sections import Grid
+from runner.errors import RunnerError
+from runner.query.text import cell_of
+from runner.service import computed
+from runner.service.dependencies import ProcessesOf, SettingsOf, json_response
+from runner.service.pages.rendering import message_of, page
+from runner.service.problems import error_docs
+from runner.service.processes import ProcessPool
+from runner.service.settings import ServiceSettings
+
+api = APIRouter(tags=["runs"])
+pages = APIRouter(include_in_schema=False)
+
+Sql = Annotated[str, Query(max_length=10_000, description="One SELECT, as for `dualtaxi sql`.")]
+Runs = Annotated[str, Query(max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")]
+
+
+class QueryResponse(BaseModel):
+    """The first 1,000 rows of a query."""
+
+    columns: list[str]
+    rows: list[list[object]]
+    more: bool
+    """Whether there are more rows."""
+    left_out: list[str]
+    """Sentences on the runs that were left out."""
+
+
+@api.get(
+    "/sql",
+    response_model=QueryResponse,
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.SERVICE_UNAVAILABLE),
+    summary="Ask the runs, and every step of them, in SQL.",
+)
+async def sql(processes: ProcessesOf, settings: SettingsOf, query: Sql, runs: Runs = "") -> Response:
+    """Return the first rows that `dualtaxi sql` returns."""
+    return json_response(await _answer(processes, settings, query, runs))
+
+
+@pages.get("/sql")
+async def sql_page(
+    request: Request, processes: ProcessesOf, settings: SettingsOf, query: Sql = "", runs: Runs = ""
+) -> Response:
+    """Show the form, and the answer to a query."""
+    shown: dict[str, object] = {"query": query, "runs": runs, "problem": "", "left_out": [], "grid": None}
+    try:
+        if query.strip():
+            answer = json.loads(await _answer(processes, settings, query, runs))
+            rows = [tuple(map(cell_of, row)) for row in answer["rows"]]
+            shown |= answer | {"grid": Grid(tuple(answer["columns"]), rows)}
+    except RunnerError as error:
+        shown["problem"] = message_of(error, request)
+    status = HTTPStatus.BAD_REQUEST if shown["problem"] else HTTPStatus.OK
+    return await run_in_threadpool(page, request, "sql.html", shown, status)
+
+
+async def _answer(processes: ProcessPool, settings: ServiceSettings, query: str, runs: str) -> bytes:
+    """Return the answer to a query, which is computed in a process with limits."""
+    answer = await processes(computed.query, settings.recordings, query, runs)
+    return settings.without_folders(answer.decode()).encode()

@@ -1,0 +1,95 @@
+"""SQL and marks over HTTP: routes of the API, and pages."""
+
+from __future__ import annotations
+
+import pytest
+from selenium.webdriver.common.by import By
+from served import Served, wait
+
+import runner
+from runner.runs.resolve import find_run
+
+
+def test_the_route_answers_a_query(client, recordings):
+    query = "SELECT name, seed FROM runs ORDER BY seed"
+    answer = client.get("/api/v1/sql", params={"query": query}).json()
+    assert answer == {
+        "columns": ["name", "seed"],
+        "rows": [["first", 0], ["second", 1]],
+        "more": False,
+        "left_out": [],
+    }
+    answer = client.get("/api/v1/sql", params={"query": "FROM steps", "runs": 'name == "first"'}).json()
+    assert (len(answer["rows"]), answer["more"]) == (1000, True)
+    find_run("second", recordings).recording.write_bytes(b"nothing")
+    answer = client.get("/api/v1/sql", params={"query": "SELECT count(*) FROM episodes"}).json()
+    assert len(answer["left_out"]) == 1
+    assert str(recordings) not in answer["left_out"][0]
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("SELECT rewrd FROM steps", "reward"),
+        ("COPY runs TO 'x'", "expected one SELECT"),
+        ("SELECT * FROM '/etc/passwd'", "does not exist"),
+    ],
+)
+def test_a_wrong_query_is_refused_in_both_forms(client, query, message):
+    response = client.get("/api/v1/sql", params={"query": query})
+    assert response.status_code == 400
+    assert message in response.json()["error"]["message"]
+    response = client.get("/sql", params={"query": query})
+    assert response.status_code == 400
+    assert message in response.text
+
+
+def test_the_page_shows_what_it_is_asked(client):
+    assert "placeholder" in client.get("/sql").text
+    text = client.get("/sql", params={"query": "SELECT name, '<b>' AS tag FROM runs"}).text
+    assert "2 rows" in text
+    assert "&lt;b&gt;" in text
+    assert "<b>" not in text
+
+
+def test_marks_are_set_listed_and_removed(client, recordings):
+    run = find_run("first", recordings)
+    path = f"/api/v1/runs/{run.run_id}/marks"
+    (mark,) = client.post(path, json={"at": "3:1", "text": "<i>", "tags": ["stuck"]}).json()["marks"]
+    assert client.get(f"/api/v1/runs/{run.run_id}").json()["marks"] == [mark]
+    page = client.get("/runs/first/replay/train/3").text
+    assert "&lt;i&gt;" in page
+    assert "&lt;i&gt;" not in client.get("/runs/first/replay/train/4").text
+    assert client.post(path, json={"at": "3:99999"}).status_code == 404
+    assert client.post(path, json={"at": "x"}).status_code == 400
+    assert client.delete(f"{path}/{mark['mark']}").json()["marks"] == []
+    assert client.delete(f"{path}/{mark['mark']}").status_code == 400
+
+
+def test_only_a_writer_marks(connect, settings):
+    client = connect(settings, Origin="http://elsewhere.example")
+    assert client.post("/api/v1/runs/first/marks", json={"at": "3:1"}).status_code == 403
+    assert client.post("/runs/first/replay/mark", data={"at": "3:1"}).status_code == 403
+
+
+@pytest.fixture
+def served(recordings):
+    with Served(recordings) as server:
+        yield server.url
+
+
+def test_a_step_is_marked_by_a_key(page, recordings):
+    run = find_run("first", recordings)
+    runner.mark(run, "3:2", "earlier")
+    browser = page("/runs/first/replay/train/3?t=1")
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#mark-ticks option[value='2']"))
+    browser.find_element(By.CSS_SELECTOR, ".step").send_keys("m")
+    field = browser.switch_to.active_element
+    assert field.get_attribute("name") == "text"
+    field.send_keys("both stuck\n")
+    wait(browser, lambda: "both stuck" in browser.find_element(By.ID, "marks").text)
+    assert [(mark.at, mark.text) for mark in run.marks] == [("3:1", "both stuck"), ("3:2", "earlier")]
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#mark-ticks option[value='1']"))
+    link = browser.find_element(By.CSS_SELECTOR, "[data-mark='2']")
+    browser.execute_script("arguments[0].click()", link)
+    wait(browser, lambda: browser.find_element(By.CSS_SELECTOR, ".count").text.startswith("step 2 of"))
