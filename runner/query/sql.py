@@ -11,7 +11,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     import polars as pl
 
 MEMORY_MB: Final = 500
-MAX_QUERY: Final = 100_000
 _ROWS: Final = 1 << 14
 _SETTINGS: Final = {
     "enable_external_access": "false",
@@ -160,7 +159,7 @@ def _as_json(value: Any) -> Any:
 def sql(
     query: str,
     *,
-    recordings: str | os.PathLike[str] | None = None,
+    recordings: str | os.PathLike[str] | list[Path] | tuple[Path, ...] | None = None,
     runs: str = "",
     timeout: float | None = None,
     memory: int = MEMORY_MB,
@@ -172,7 +171,7 @@ def sql(
 
     Args:
         query: one SELECT in the SQL of DuckDB.
-        recordings: the folder of runs: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        recordings: the folder of runs, or several: $DUALTAXI_RECORDINGS, or ./recordings, by default.
         runs: a filter as of `dualtaxi ls`; the views have the runs that match it.
         timeout: the seconds after which the query is stopped.
         memory: the megabytes that DuckDB may use.
@@ -182,18 +181,5 @@ def sql(
         RunnerError: the query is wrong, or exceeds its time or memory.
         MissingExtra: DuckDB is not installed.
     """
-    return query_runs(query, [recordings_folder(recordings)], runs, timeout, memory, report)
-
-
-def query_runs(
-    query: str,
-    roots: Sequence[Path],
-    runs: str,
-    timeout: float | None = None,
-    memory: int = MEMORY_MB,
-    report: Callable[[str], None] = lambda _: None,
-) -> QueryResult:
-    """Return the rows of a query over several folders of runs; arguments and errors as for `sql`."""
-    if len(query) > MAX_QUERY:
-        raise RunnerError(f"sql: found {len(query):,} characters, expected at most {MAX_QUERY:,}.")
-    return QueryResult(query, SelectedRuns(roots, parse(runs), report), timeout, memory)
+    folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
+    return QueryResult(query, SelectedRuns(folders, parse(runs), report), timeout, memory)

@@ -87,7 +87,8 @@ class SelectedRuns:
     """
 
     def __init__(self, roots: Sequence[Path], chosen: Filter, report: Callable[[str], None]) -> None:
-        self._rows = look(roots, lambda index: index.select(chosen))
+        self._roots, self._chosen = roots, chosen
+        self._rows = look(roots, lambda index: index.select(chosen, columns=("root", "entry", "id")))
         self._report, self._reported = report, time.monotonic()
         self._read_runs: set[str] = set()
         self._read_rows = 0
@@ -119,14 +120,21 @@ class SelectedRuns:
             self._reported = time.monotonic()
             self._report(str(self))
 
-    def _runs(self) -> pa.Table:
+    def _runs(self) -> Relation:
         """Return the columns of `dualtaxi ls`, and each configuration as JSON."""
-        kinds = {"run": pa.string(), "settings": pa.string(), "tags": _TEXTS}
+        kinds = {"run": pa.string()}
         kinds |= {name: _TYPES[column.type] for name, column in COLUMNS.items() if column.type}
+        kinds |= {"seed": pa.uint64(), "created": _MOMENT, "tags": _TEXTS, "settings": pa.string()}
         del kinds["id"]
-        kinds |= {"seed": pa.uint64(), "created": _MOMENT}
-        rows = [row | {"run": row["id"], "tags": (row["tags"] or "").split()} for row in self._rows]
-        return _table(rows, kinds)
+        return Relation(pa.schema(kinds), self._batches_of_runs)
+
+    def _batches_of_runs(self, needed: pa.Schema, condition: Condition) -> Iterator[pa.RecordBatch]:
+        """Yield some columns of the runs, without a condition."""
+        del condition
+        stored = ["id AS run", *(name for name in needed.names if name != "run")]
+        rows = look(self._roots, lambda index: index.select(self._chosen, columns=stored), cached=True)
+        rows = [row | {"tags": (row.get("tags") or "").split()} for row in rows]
+        yield from _table(rows, dict(zip(needed.names, needed.types, strict=True))).to_batches()
 
     def _evaluations(self) -> pa.Table:
         """Return the columns of `runner.frames.evaluations`, with _ for dots, and the sums over agents."""
@@ -201,7 +209,7 @@ def _batches_of(
         for batch in chunks.read(condition.may_hold(chunks.known), own + is_turn):
             rows = batch.filter(batch["taken"]) if is_turn else batch
             values = [
-                _cast(rows[own_names[column.name]], column.type)
+                rows[own_names[column.name]].cast(column.type)
                 if own_names[column.name] in own
                 else pa.nulls(rows.num_rows, column.type)
                 for column in needed
@@ -231,9 +239,3 @@ def _wider(one: pa.DataType | None, other: pa.DataType) -> pa.DataType:
         return pa.unify_schemas(pair, promote_options="permissive").types[0]
     except pa.ArrowException:
         return pa.string()
-
-
-def _cast(values: pa.Array, kind: pa.DataType) -> pa.Array:
-    if pa.types.is_nested(values.type) and kind == pa.string():
-        return pa.array([None if value is None else str(value) for value in values.to_pylist()], kind)
-    return values.cast(kind)

@@ -329,12 +329,12 @@ def replay(runs: Sequence[Run], request: Request) -> bytes:
     return os.fsencode(cached_export(runs, request)[0])
 
 
-def query(roots: Sequence[Path], text: str, runs: str) -> bytes:
+def query(roots: tuple[Path, ...], text: str, runs: str) -> bytes:
     """Return the first rows of a query in SQL, as JSON."""
     require("pyarrow", extra="sql", purpose="SQL")
-    from runner.query.sql import query_runs
+    from runner.query.sql import sql
 
-    result = query_runs(text, roots, runs)
+    result = sql(text, recordings=roots, runs=runs)
     with contextlib.closing(result.rows()) as rows:
         first = list(islice(rows, MAX_ROWS + 1))
     return as_json(

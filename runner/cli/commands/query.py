@@ -62,13 +62,15 @@ def sql_command(
     require_one("as_csv", "as_json", "parquet")
     require("pyarrow", extra="sql", purpose="SQL")
     from runner.export.places import new_file, require_new
-    from runner.query.sql import query_runs
+    from runner.query.sql import sql
 
     if parquet is not None:
         require_new(parquet, force)
     try:
         with stage_line("reading") as report:
-            result = query_runs(query, recordings, runs, timeout, memory, report)
+            result = sql(
+                query, recordings=recordings, runs=runs, timeout=timeout, memory=memory, report=report
+            )
             if parquet is not None:
                 with new_file(parquet, force) as temporary:
                     rows = result.write_parquet(temporary)
