@@ -27,13 +27,13 @@ from typing import TYPE_CHECKING, Final
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
 from runner.recording.liveness import is_alive, owner
-from runner.recording.marks import Mark, read_marks
 from runner.recording.run_file import ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import storage_errors, write_object
 from runner.util.values import Json, as_utf8, checked_run_name, is_utf8
 
 if TYPE_CHECKING:  # listing runs must be quick
     from runner.config import ExperimentConfig
+    from runner.recording.marks import Mark
     from runner.runs.checkpoints import Checkpoint
 
 RUN_FILE: Final = "run.json"
@@ -119,6 +119,8 @@ class Run:
     @property
     def marks(self) -> tuple[Mark, ...]:
         """The marks at steps, in the order of the steps."""
+        from runner.recording.marks import read_marks
+
         return () if self.stands_alone else read_marks(self.folder).marks
 
     @property

@@ -239,6 +239,7 @@ COMMANDS = {
     "export tensorboard": ["RUN", "-o", "OUT"],
     "import": ["RECORDING"],
     "ls": [],
+    "mark": ["RUN", "0:1"],
     "play": ["RUN", "--episode", "0"],
     "plot": ["RUN", "-o", "OUT.svg"],
     "qtable": ["RUN"],
@@ -247,6 +248,7 @@ COMMANDS = {
     "rerecord": ["RUN"],
     "resume": ["RUN", "--accept-changes"],
     "show": ["RUN"],
+    "sql": ["SELECT * FROM steps"],
     "values": ["RUN", "--episode", "0", "--checkpoint", "policy@40", "--policy", "policy_of_doors:policy"],
     "verify": ["RUN", "--rerun"],
     "view": ["RUN", "--episode", "0"],
@@ -378,6 +380,9 @@ FILLED = {
 BODIES = {
     "POST /runs/{run}/branch": {"at": "0:1", "action": "0"},
     "POST /runs/{run}/labels": {},
+    "POST /runs/{run}/marks": {"at": "0:1"},
+    "DELETE /runs/{run}/marks/{name}": {},
+    "POST /runs/{run}/replay/mark": {},
     "POST /runs/{run}/stop": {},
     "PATCH /runs/{run}": {"note": "x"},
 }

@@ -79,9 +79,9 @@ def mark_command(
     run_name: str = run_argument,
     at: str | None = argument(metavar="[STEP]", required=False),
     text: str = argument(metavar="[TEXT]", required=False, default=""),
-    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Tag it; may be repeated."),
+    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated."),
     removed: tuple[str, ...] = option(
-        "--remove", multiple=True, metavar="MARK", help="Remove a mark by its id; may be repeated."
+        "--unmark", multiple=True, metavar="MARK", help="Remove a mark by its id; may be repeated."
     ),
     recordings: Path | None = recordings_option,
     as_json: bool = json_option,
@@ -96,7 +96,7 @@ def mark_command(
     Examples:
       dualtaxi mark k3v9m2xq 812:57 "both stuck" --tag stuck
       dualtaxi mark @latest worst --tag look-again
-      dualtaxi mark k3v9m2xq --remove 3f2a9c01b7de
+      dualtaxi mark k3v9m2xq --unmark 3f2a9c01b7de
     """
     from runner.analysis.marking import mark, unmark
 

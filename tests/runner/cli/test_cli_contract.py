@@ -80,6 +80,8 @@ WORDS = {
     "why": "{run} --at 0:1 --agent taxi_1",
     "explain": "{tiny} {patient} --seeds 2",
     "label": "@latest --tag good",
+    "mark": "{run} 0:1",
+    "sql": "VALUES(1)",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",
     "repair": "@latest",
@@ -119,6 +121,8 @@ def made_hostile(folder):
     facts["summary"] |= {"error": HOSTILE, "logged": {HOSTILE: 1.0}}
     (folder / "run.json").write_text(json.dumps(facts))
     (folder / "labels.json").write_text(json.dumps({"note": HOSTILE, "tags": ["good"]}))
+    mark = {"at": "0:1", "episode": 0, "text": HOSTILE, "tags": [], "created": "2026-11-27T08:00:00.123Z"}
+    (folder / "marks.json").write_text(json.dumps({"marks": [mark]}))
 
 
 def controls(text):

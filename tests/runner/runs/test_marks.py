@@ -125,7 +125,7 @@ def test_the_command_marks_lists_and_removes(run):
     assert "both stuck" in command("mark", "lake")
     assert "both stuck" in command("show", "lake")
     assert json.loads(command("show", "lake", "--json"))["marks"] == listed["marks"]
-    assert json.loads(command("mark", "lake", "--remove", run.marks[0].id, "--json"))["marks"] == []
+    assert json.loads(command("mark", "lake", "--unmark", run.marks[0].id, "--json"))["marks"] == []
     command("rm", "lake", "--yes")
     assert not run.folder.exists()
 
