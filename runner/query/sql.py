@@ -124,6 +124,7 @@ class QueryResult:
 
     def close(self) -> None:
         """End the query."""
+        self._runs.is_stopped = True
         self._connection.interrupt()
         self._thread.shutdown()
         self._connection.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,6 +95,8 @@ class SelectedRuns:
         self._read_rows = 0
         self.left_out: dict[str, str] = {}
         """Why runs are left out, or the rest of them, by their id and the view."""
+        self.is_stopped = False
+        """Set to make the query end before it reads another chunk or run."""
 
     def __str__(self) -> str:
         """Return how far the query has read."""
@@ -114,6 +117,8 @@ class SelectedRuns:
             self.left_out[f"{row['id']} {name}"] = f"run {row['id']} is left out of {name}: {error}"
 
     def _count(self, row: IndexRow, rows: int) -> None:
+        if self.is_stopped:
+            raise CancelledError
         self._read_runs.add(row["id"])
         self._read_rows += rows
         if time.monotonic() - self._reported > _REPORT_SECONDS:

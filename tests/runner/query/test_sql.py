@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import signal
@@ -20,6 +21,7 @@ from runner.archive.runs import archive_run
 from runner.archive.store import ArchiveStore
 from runner.cli import cli
 from runner.errors import RunnerError
+from runner.query.chunks import opened_tables
 from runner.recording.reader import open_recording
 from runner.recording.record_store import RecordStore
 from runner.runs.resolve import find_run
@@ -210,6 +212,22 @@ def test_limits_say_how_far_a_query_came(folder):
         rows(folder, "SELECT count(*) FROM range(100000000000) WHERE hash(range) = 3", timeout=0.5)
     with pytest.raises(RunnerError, match=r"needs more than 50 MB of memory, .* runs were read"):
         rows(folder, "SELECT range FROM range(100000000) ORDER BY hash(range)", memory=50)
+
+
+def test_a_query_is_stopped_while_runs_are_opened(folder, monkeypatch):
+    opened = []
+
+    @contextlib.contextmanager
+    def slowly(run):
+        opened.append(run)
+        time.sleep(0.5)
+        with opened_tables(run) as tables:
+            yield tables
+
+    monkeypatch.setattr("runner.query.views.opened_tables", slowly)
+    with pytest.raises(RunnerError, match=r"stopped after 0\.2 s"):
+        rows(folder, "SELECT count(*) FROM steps", timeout=0.2)
+    assert len(opened) < 3
 
 
 def test_an_interrupted_query_says_how_far_it_came(folder):
