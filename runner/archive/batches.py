@@ -78,7 +78,7 @@ class Batches:
         if stored is None:
             return
         if not self.shape.dtypes[topic].hasobject:
-            yield from stored.stored_in(range(len(stored)) if chunks is None else chunks)
+            yield from stored.stored(chunks)
         else:
             messages, size = [], 0
             for time, payload in stored.messages(chunks=chunks):

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import RecordingError, StorageError
-from runner.runs.trust_marks import copy_mark
 from runner.runs.run import RUN_FILE, Run
+from runner.runs.trust_marks import copy_mark
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
