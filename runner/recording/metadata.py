@@ -210,7 +210,7 @@ def json_object(text: str | bytes | None, what: str) -> dict[str, object]:
 
 
 def unpacked(data: bytes, max_bytes: int) -> bytes:
-    """Return at most so many bytes of a text that zstd packed.
+    """Return a text that zstd packed, or its first `max_bytes` bytes.
 
     Raises:
         zstandard.ZstdError: it is damaged.
