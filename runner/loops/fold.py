@@ -64,7 +64,7 @@ from runner.util.files import storage_errors
 _OWN_METADATA: Final = frozenset({"run", "result", "repair"})
 """The metadata that is not copied from the process that began the run."""
 _OWN_TOPICS: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
-"""Topics of one process alone, or recorded again; episodes are recorded again, too, as they follow from the steps."""
+"""Topics of one process alone, or recorded again, as are episodes, which follow from the steps."""
 _NEW_FIELDS: Final = frozenset(
     {"step", "episode", "t", "environment", "taken", "reset", "log_time", "publish_time"}
 )
