@@ -42,7 +42,9 @@ def sql_command(
 ) -> None:
     """Ask the recorded runs, and every step of them, by one SELECT in the SQL of DuckDB.
 
-    The views, in each of which `run` is the id of a run:
+    Each view has a column `run`, the id of the run.
+
+    Views:
       runs         a row for each run, as `dualtaxi ls` lists it; `settings` is its configuration as JSON
       evaluations  a row for each evaluation: mean_return, success_percent, mean_length, ...
       episodes     a row for each episode that ended: phase, episode, length, return, n_EVENT, ...
