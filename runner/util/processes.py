@@ -54,6 +54,8 @@ class ProcessDied(CallFailed):
     """The process died during a call."""
 
 
+_RESTART_SECONDS: Final = 0.1
+"""Time in which the system learns that a fork server was killed."""
 _pipe_to_parent: Any = None
 _starting: Final = threading.Lock()
 
@@ -153,7 +155,11 @@ def start_process(context: Any, target: Callable[..., None], *args: object, **ke
         target=_with_variables, args=(variables, target, *args), **keywords
     )
     with starting_processes():
-        started.start()
+        try:
+            started.start()
+        except (EOFError, ConnectionError):  # the fork server was killed; the next start makes another
+            time.sleep(_RESTART_SECONDS)
+            started.start()
     return started
 
 

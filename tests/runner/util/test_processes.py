@@ -71,6 +71,25 @@ def test_a_script_need_not_guard_its_statements(tmp_path):
     assert (done.stdout, done.stderr) == ("3\n", "")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no fork server on Windows")
+def test_a_fork_server_that_is_killed_while_a_process_starts_is_replaced():
+    program = (
+        "import os, signal, threading\n"
+        "from multiprocessing import forkserver\n"
+        "from runner.util.processes import process_context, start_process\n"
+        "if __name__ == '__main__':\n"
+        "    start_process(process_context(), print, 'first').join()\n"
+        "    server = forkserver._forkserver._forkserver_pid\n"
+        "    os.kill(server, signal.SIGSTOP)  # so that the next process waits for it\n"
+        "    threading.Timer(0.5, os.kill, (server, signal.SIGKILL)).start()\n"
+        "    start_process(process_context(), print, 'second').join()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.stdout, done.stderr) == ("first\nsecond\n", "")
+
+
 def test_a_process_that_cannot_be_started_is_an_error_of_the_system():
     def start():
         raise EOFError
