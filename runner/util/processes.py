@@ -54,6 +54,8 @@ class ProcessDied(CallFailed):
     """The process died during a call."""
 
 
+_RESTARTS: Final = 3
+"""How often a fork server that was killed is replaced as a process starts."""
 _RESTART_SECONDS: Final = 0.1
 """Time in which the system learns that a fork server was killed."""
 _pipe_to_parent: Any = None
@@ -155,12 +157,14 @@ def start_process(context: Any, target: Callable[..., None], *args: object, **ke
         target=_with_variables, args=(variables, target, *args), **keywords
     )
     with starting_processes():
-        try:
-            started.start()
-        except (EOFError, ConnectionError):  # the fork server was killed; the next start makes another
-            time.sleep(_RESTART_SECONDS)
-            started.start()
-    return started
+        for _ in range(_RESTARTS):
+            try:
+                started.start()
+                return started
+            except (EOFError, ConnectionError):  # the fork server was killed; the next start makes another
+                time.sleep(_RESTART_SECONDS)
+        started.start()
+        return started
 
 
 def _with_variables(variables: Mapping[str, str], target: Callable[..., None], *args: object) -> None:
