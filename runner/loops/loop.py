@@ -249,7 +249,7 @@ class Loop:
                     f"{type(error).__name__}: {error}"
                 )
             self.close("failed", self._failure)
-            self.disown()
+            self.is_foreign = True
         self.warn_once(f"run {self.run.run_id}: {self._failure}")
 
     # --- the end --------------------------------------------------------------------------------------

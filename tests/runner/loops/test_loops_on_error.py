@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import resource
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
@@ -96,6 +97,18 @@ def test_a_value_of_another_shape_ends_the_recording_only(tmp_path):
         assert counts["train_steps"] + counts["eval_steps"] == 10
     shown = dualtaxi(tmp_path, "show", run.run_id).output
     assert "recording stopped at step 10" in shown
+
+
+def test_a_recording_that_fails_while_its_flush_waits_stops_that_flush_only(tmp_path):
+    rec = runner.record(Odd(until=1), tmp_path, on_error="warn")
+    rec.reset(seed=0)
+    rec.step(0)
+    with ThreadPoolExecutor() as pool:
+        with rec._loop.lock:
+            flushed = pool.submit(rec._loop.flush)  # it waits for the lock
+            with pytest.warns(RuntimeWarning, match="recording stopped"):
+                rec.step(0)
+        flushed.result()
 
 
 @contextlib.contextmanager

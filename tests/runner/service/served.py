@@ -13,6 +13,7 @@ from typing import Any, Self
 
 import httpx2
 import psutil
+from selenium.common.exceptions import NoSuchElementException, StaleElementReferenceException
 from selenium.webdriver.remote.webdriver import WebDriver
 from selenium.webdriver.support.ui import WebDriverWait
 
@@ -28,8 +29,9 @@ def free_port() -> int:
 
 
 def wait(browser: WebDriver, is_so: Callable[[], Any], seconds: float = 60) -> Any:
-    """Wait until a page is so, and return what was found."""
-    return WebDriverWait(browser, seconds, poll_frequency=0.05).until(lambda _: is_so())
+    """Wait until a page is so, and return what was found; parts of it may be replaced meanwhile."""
+    ignored = [NoSuchElementException, StaleElementReferenceException]
+    return WebDriverWait(browser, seconds, 0.05, ignored).until(lambda _: is_so())
 
 
 class Served:
