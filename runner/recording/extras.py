@@ -139,32 +139,36 @@ def united(first: Description, second: Description) -> Description | None:
     return lengthened(column) if is_alike else None
 
 
-def read_layouts(columns: Iterable[tuple[int, Message]], where: str) -> list[ExtraLayout]:
-    """Return the layouts of a recording; after a repair, numbers may be missing.
+def read_layout(time: int, fields: Message, last: ExtraLayout | None, where: str) -> ExtraLayout:
+    """Return the layout that follows the last one of a recording; after a repair, numbers may be missing.
 
     Args:
-        columns: log time and fields of each `ExtraColumns`, in order.
+        time: log time of its `ExtraColumns`, in nanoseconds.
+        fields: the fields of that message.
+        last: None for the first layout.
 
     Raises:
-        RecordingError: they are not what a recorder writes.
+        RecordingError: it is not what a recorder writes.
     """
+    what = f"{where}: the names of extras at {time} ns"
+    layout = ExtraLayout(fields["layout"], time, _columns_of(json_object(fields["json"], what), what))
+    if not is_whole(layout.number, 0, schema.MAX_LAYOUTS - 1):
+        raise RecordingError(f"{what}: found layout {layout.number}, expected {schema.MAX_LAYOUTS} at most.")
+    if last is not None:
+        same = list(layout.columns)[: len(last.columns)] == list(last.columns) and all(
+            column == united(before, column) and column.get("dtype") == before.get("dtype")
+            for before, column in zip(last.columns.values(), layout.columns.values(), strict=False)
+        )
+        if not same or layout.number <= last.number or time <= last.start_time:
+            raise RecordingError(f"{what} do not continue those before them.")
+    return layout
+
+
+def read_layouts(columns: Iterable[tuple[int, Message]], where: str) -> list[ExtraLayout]:
+    """Return the layouts of a recording, from the log time and the fields of each, as `read_layout` does."""
     layouts: list[ExtraLayout] = []
     for time, fields in columns:
-        what = f"{where}: the names of extras at {time} ns"
-        layout = ExtraLayout(fields["layout"], time, _columns_of(json_object(fields["json"], what), what))
-        if not is_whole(layout.number, 0, schema.MAX_LAYOUTS - 1):
-            raise RecordingError(
-                f"{what}: found layout {layout.number}, expected {schema.MAX_LAYOUTS} at most."
-            )
-        if layouts:
-            last = layouts[-1]
-            same = list(layout.columns)[: len(last.columns)] == list(last.columns) and all(
-                column == united(before, column) and column.get("dtype") == before.get("dtype")
-                for before, column in zip(last.columns.values(), layout.columns.values(), strict=False)
-            )
-            if not same or layout.number <= last.number or time <= last.start_time:
-                raise RecordingError(f"{what} do not continue those before them.")
-        layouts.append(layout)
+        layouts.append(read_layout(time, fields, layouts[-1] if layouts else None, where))
     return layouts
 
 
@@ -189,7 +193,7 @@ class ExtraNames:
 
     def __init__(self, where: str) -> None:
         self._where = where
-        self._columns: list[tuple[int, Message]] = []
+        self._last: ExtraLayout | None = None
         self.layouts: dict[int, ExtraLayout] = {}
         """Those named so far, by number."""
 
@@ -200,8 +204,9 @@ class ExtraNames:
             RecordingError: they are not what a recorder writes.
         """
         for time, record in zip(chunk.times.tolist(), chunk.messages, strict=True):
-            self._columns.append((time, decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:])))
-        self.layouts = {layout.number: layout for layout in read_layouts(self._columns, self._where)}
+            fields = decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:])
+            self._last = read_layout(time, fields, self._last, self._where)
+            self.layouts[self._last.number] = self._last
 
     def of(self, chunk: ReadChunk) -> ExtraLayout | None:
         """Return the layout of a chunk of extras; None if its names are lost."""
