@@ -1,14 +1,19 @@
-"""Time until a browser shows the first page, with ten thousand runs; and the first picture of an episode."""
+"""Time until a browser shows a page, whole, and the first picture of an episode; memory of the service."""
 
 from __future__ import annotations
 
 import contextlib
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
+
+import httpx2
+import yaml
 
 from benchmarks.bench_catalogue import LISTED, many, one_run
 from benchmarks.figures import Figure, figure
@@ -19,10 +24,20 @@ from runner.util.files import CACHE_VARIABLE
 COLD: Final = (1000, 300)
 """Targets in milliseconds: at least, and aim."""
 RUN_PAGE: Final = (50, 20)
+WHOLE_RUN: Final = (1000, 500)
+WHOLE_SWEEP: Final = (3000, 1000)
+GROWTH: Final = (10, 5)
+"""Targets in percent: at least, and aim."""
+PAGES: Final = 1000
 CARTPOLE: Final = (1000, 400)
 PONG: Final = (2000, 1000)
 MEMORY: Final = (500, 300)
 """Targets in MB: at least, and aim."""
+LAST_PART: Final = """
+const last = Math.max(...performance.getEntries().map((entry) => entry.responseEnd || 0));
+return performance.now() - last > 1000 && last;
+"""
+"""When the last answer came, in milliseconds since the page was requested, once none came for a second."""
 LOADED: Final = "return performance.getEntriesByType('navigation')[0].loadEventEnd"
 PICTURED: Final = """
 document.addEventListener("load", ({ target }) => {
@@ -52,14 +67,51 @@ def _pages_of_runs(
 ) -> list[Figure]:
     """Return the milliseconds until a client has the page of a run, of a job and of a loop."""
     _record(recordings, "loop", _cartpole, 60)
+    trials = 10 if seconds < 2 else 100
+    _sweep(recordings, trials)
     with serving(recordings, environment=environment) as service:
-        times = response_times(service, [f"/runs/{run}" for run in runs], clients=1, seconds=seconds)
-    milliseconds = [1000 * taken for taken in times]
+        pages = [f"/runs/{run}" for run in runs]
+        milliseconds = [1000 * taken for taken in response_times(service, pages, clients=1, seconds=seconds)]
+        whole = [_last_part(f"{service.url}{page}") for page in pages for _ in range(3)]
+        study = [_last_part(f"{service.url}/sweeps/sweep") for _ in range(3)]
+        before = memory_of(service.process)
+        with httpx2.Client(base_url=service.url) as client:
+            for k in range(PAGES):
+                client.get(pages[k % len(pages)]).raise_for_status()
+        growth = 100 * (memory_of(service.process) / before - 1)
     detail = "a job and a loop in turn, one client"
     return [
         figure("page of a run", milliseconds, "ms", RUN_PAGE, higher_is_better=False, detail=detail),
         figure("  99th percentile", [percentile(milliseconds, 99)], "ms", RUN_PAGE, higher_is_better=False),
+        figure("  its last part", whole, "ms", WHOLE_RUN, higher_is_better=False, detail="in Chromium"),
+        figure(
+            f"page of a sweep of {5 * trials} runs, its last part",
+            study,
+            "ms",
+            WHOLE_SWEEP,
+            higher_is_better=False,
+        ),
+        figure(
+            f"growth of the server's memory by {PAGES:,} pages", [growth], "%", GROWTH, higher_is_better=False
+        ),
     ]
+
+
+def _sweep(recordings: Path, trials: int) -> None:
+    """Run a sweep of short runs, five of each trial."""
+    evaluation = {"every": 50, "trials": 10}
+    values = {
+        "name": "sweep",
+        "base": {"env": {"id": "FrozenLake-v1"}, "episodes": 100, "evaluation": evaluation},
+        "strategy": "random",
+        "trials": trials,
+        "parameters": {"step_size": {"low": 0.01, "high": 1.0}, "discount": {"low": 0.9, "high": 0.999}},
+        "seeds": {"count": 5},
+    }
+    file = recordings.with_name("sweep.yaml")
+    file.write_text(yaml.safe_dump(values), encoding="utf-8")
+    words = ["sweep", "run", str(file), "--workers", "2", "--recordings", str(recordings)]
+    subprocess.run([sys.executable, "-m", "runner", *words], capture_output=True, check=True)
 
 
 def _pictures(recordings: Path, environment: dict[str, str], repetitions: range) -> list[Figure]:
@@ -114,6 +166,12 @@ def _loaded(address: str) -> float:
     with _browser() as driver:
         driver.get(address)
         return _waited(driver, LOADED)
+
+
+def _last_part(address: str) -> float:
+    with _browser() as driver:
+        driver.get(address)
+        return _waited(driver, LAST_PART)
 
 
 def _pictured(address: str) -> float:
