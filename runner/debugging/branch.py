@@ -21,11 +21,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.analysis.episodes import STEP, EpisodeRef, StepLike
+from runner.environments.games import is_game
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import TrainingBranch, branch_training
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action
-from runner.loops.env import record
-from runner.loops.parallel import record_parallel
+from runner.loops.parallel import record_alone
 from runner.loops.policies import Policy, from_policy, policy_named
 from runner.recording.reader import Recording, open_recording
 from runner.recording.spaces import Value
@@ -213,11 +213,6 @@ def _record_branch(path: Path, folder: Path, task: _Task) -> None:
     """Record a branch; report the steps taken, then what `branch` returns."""
     os.chdir(task.user_folder)
     with open_recording(path) as recording:
-        if recording.can_train_again:
-            raise RunnerError(
-                f"run {recording.run_id} was trained here; only episodes of loops are branched: runs whose "
-                "environment runner.record wrapped."
-            )
         if reason := why_not_rerun(recording, task.trust):
             raise CannotRedo(reason)
         player = _Player(recording, folder, task)
@@ -240,7 +235,6 @@ class _Player:
         self._at = task.at.resolved(recording)
         self.phase, self.episode = self._at.phase, self._at.number_in(recording)
         self._function: Policy | None = policy_named(task.policy) if ":" in task.policy else None
-        self._is_game = False
         self._actions: Iterator[Value] = iter(())
 
     def begin(self, stepper: Stepper, actions: Iterator[Value]) -> None:
@@ -248,12 +242,12 @@ class _Player:
         env, task, recording = stepper.env, self._task, self._recording
         maker = recording.phase(self.phase).maker_of()
         assert maker is not None  # or `why_not_rerun` gave a reason
-        self._is_game, self._actions = maker.kind == "pettingzoo", actions
+        self._stepper, self._actions = stepper, actions
         self._space = copy.deepcopy(stepper.action_space)
         self._space.seed(task.seed)
-        names: Names = recording.phase(self.phase).action_names() or action_names(env, self._space)
-        if self._is_game:
-            names = {agent: recording.phase(self.phase).action_names(agent) for agent in recording.agents}
+        names: Names = {agent: recording.phase(self.phase).action_names(agent) for agent in recording.agents}
+        if not is_game(env):
+            names = recording.phase(self.phase).action_names() or action_names(env, self._space)
         recorded = next(actions)
         self._action = parsed_action(self._space, task.action, recorded, names)
         self.is_recorded_action = _text(self._action) == _text(recorded)
@@ -269,9 +263,8 @@ class _Player:
             action_in_words(self._space, self._action, names),
         )
         settings = recording.config.get("config")
-        wrap: Callable[..., Any] = record_parallel if self._is_game else record
         with trusting(recording.path, maker, task.trust) as is_trusted, marking_nothing(not is_trusted):
-            stepper.env = wrap(
+            stepper.env = record_alone(
                 env,
                 self._folder,
                 name=task.name or f"{recording.name[:90]}.branch",
@@ -295,7 +288,7 @@ class _Player:
                     f"The environment failed at t {task.at.t + count - 1:,} of the branch, with the action "
                     f"{_text(action)}: {type(error).__name__}: {error}"
                 ) from error
-            if not self.rec.agents if self._is_game else terminated or truncated:
+            if self.rec.is_over(terminated, truncated):
                 return ""
             action = self._next(observation)
             if action is None:
@@ -314,10 +307,7 @@ class _Player:
             action = next(self._actions, None)
         else:
             action = self._space.sample() if self._task.policy == "random" else self._action
-        if not self._is_game or action is None:
-            return action
-        agents = self.rec.agents
-        return {agent: action[agent] for agent in agents} if all(map(action.__contains__, agents)) else None
+        return None if action is None else self._stepper.applicable(action)
 
 
 def _text(action: object) -> str:

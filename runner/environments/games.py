@@ -33,6 +33,13 @@ def is_in_turns(env: object) -> bool:
     return all(hasattr(env, part) for part in ("agent_iter", "last", "observe"))
 
 
+def is_game(env: object) -> bool:
+    """Return whether an environment steps several agents, and not one as Gymnasium's do."""
+    import gymnasium  # slow to import
+
+    return is_multi_agent(env) or not isinstance(env, gymnasium.Env)  # RLlib's games are both
+
+
 def game_spaces(env: Any) -> tuple[spaces.Dict, spaces.Dict]:
     """Return the spaces of the observations and actions of all agents of a game."""
     from gymnasium import spaces  # slow to import

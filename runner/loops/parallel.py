@@ -7,11 +7,19 @@ from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, Unpack
 
-from runner.environments.games import ByAgent, GameStepResult, Turns, game_spaces, is_in_turns
+from runner.environments.games import (
+    ByAgent,
+    GameStepResult,
+    Turns,
+    game_spaces,
+    is_game,
+    is_in_turns,
+)
 from runner.environments.gym_types import Info, ResetOptions
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described
+from runner.loops.env import record
 from runner.loops.generators import GeneratorWatch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, game_maker_of
@@ -66,6 +74,10 @@ class RecordedParallel(RecordedAlone):
         except Exception as error:
             self._loop.fail(error)
         return result  # type: ignore[no-any-return]
+
+    def is_over(self, terminated: object, truncated: object) -> bool:  # noqa: ARG002 - agents may leave
+        """Return whether no agent is left."""
+        return not self.env.agents
 
     def _extras_by_name(self, values: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the values of agents as `agent/name`."""
@@ -196,6 +208,12 @@ def record_aec(env: object, recordings: str | os.PathLike[str] | None = None, **
     recorded = record_parallel(Turns(env, removes=False), recordings, **options)
     assert isinstance(recorded, RecordedAec)
     return recorded
+
+
+def record_alone(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> Any:
+    """Return one environment of Gymnasium, or one game of PettingZoo, with everything recorded."""
+    begin: Any = record_parallel if is_game(env) else record
+    return begin(env, recordings, **options)
 
 
 def described_game(env: Any) -> Described:

@@ -21,11 +21,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.games import game_spaces
+from runner.environments.games import game_spaces, is_game
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari_episodes import episodes_in
-from runner.loops.env import record
-from runner.loops.parallel import record_parallel
+from runner.loops.parallel import record_alone
 from runner.loops.values import as_array
 from runner.recording.gym_spaces import restore_space
 from runner.recording.gym_values import element_of
@@ -95,35 +94,33 @@ def play_checkpoint(
             raise CannotRedo(reason)
         make, weights = policy_named(policy), checkpoint.load(trust)
         env = make_environment(maker, is_trusted)
-    is_game = maker.kind == "pettingzoo"
     origin = {"run": run.run_id, "checkpoint": checkpoint.name, "step": checkpoint.step}
     settings = {"origin": origin | {"digest": checkpoint.digest}, "policy": policy}
-    env_spaces = game_spaces(env) if is_game else (env.observation_space, env.action_space)
+    env_spaces = game_spaces(env) if is_game(env) else (env.observation_space, env.action_space)
     try:
         with from_policy(policy):
             act = make(weights, *env_spaces)
     except BaseException:
         env.close()
         raise
-    begin: Any = record_parallel if is_game else record
     name = f"{run.name[:90]}.evaluated"
     with marking_nothing(not is_trusted):
-        recorded = begin(env, recordings, name=name, seed=seed, config=settings)
+        recorded = record_alone(env, recordings, name=name, seed=seed, config=settings)
     with recorded as rec, rec.phase("eval"):
         for number in range(episodes):
-            _play(rec, act, seed + number, policy, is_game)
+            _play(rec, act, seed + number, policy)
             report(number + 1)
     played: Run = rec.run
     return played
 
 
-def _play(rec: Any, act: Policy, seed: int, name: str, is_game: bool) -> None:
+def _play(rec: Any, act: Policy, seed: int, name: str) -> None:
     observation, over = rec.reset(seed=seed)[0], False
     while not over:
         with from_policy(name):
             action = act(observation)
         observation, _, terminated, truncated, _ = rec.step(action)
-        over = not rec.agents if is_game else terminated or truncated
+        over = rec.is_over(terminated, truncated)
 
 
 @dataclass(frozen=True)

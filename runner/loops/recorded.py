@@ -300,6 +300,10 @@ class RecordedAlone(Recorded):
         super()._enter(phase)
         self._watch.begin_phase()
 
+    def is_over(self, terminated: object, truncated: object) -> bool:
+        """Return whether a step ended the episode, from what it returned."""
+        return bool(terminated or truncated)
+
     def _record_frame(self, is_over: bool) -> None:
         """Record a picture of the last step, if it is due."""
         self._until_frame -= 1

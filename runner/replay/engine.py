@@ -12,7 +12,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.games import as_parallel
+from runner.environments.games import as_parallel, is_game
 from runner.errors import CannotRedo, shortened
 from runner.recording import schema
 from runner.recording.actions import EpisodeDigests, after_step
@@ -286,7 +286,7 @@ class Replay:
             vector = None if maker is None else maker.vector
             if environment == ALL and vector is not None:
                 stepper: Stepper = VectorStepper(env, self._recording, vector.autoreset, self.drawn)
-            elif maker is not None and maker.kind == "pettingzoo":
+            elif is_game(env):
                 stepper = GameStepper(as_parallel(env), self._recording)
             else:
                 stepper = Stepper(env, self._recording)

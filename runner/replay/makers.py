@@ -11,7 +11,7 @@ import inspect
 import itertools
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.environments.games import as_parallel
@@ -85,11 +85,9 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
     with _making("environment", maker, trust, render):
         if maker.make and trust:
             env = _made_by_function(maker.make, render)
-        elif maker.kind == "pettingzoo":
-            env = _made_game(maker, trust, render)
         else:
-            env = _made(maker, trust, render)
-        return as_parallel(env) if maker.kind == "pettingzoo" else env
+            env = _MADE[maker.kind](maker, trust, render)
+        return as_parallel(env)
 
 
 @contextlib.contextmanager
@@ -255,6 +253,14 @@ def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     if spec.wrappers and names != maker.wrappers:
         raise CannotRedo(f"The environment has the wrappers {names} here, recorded {maker.wrappers}.")
     return game
+
+
+_MADE: Final[Mapping[str, Callable[[EnvironmentMaker, bool, bool], Any]]] = {
+    "gymnasium": _made,
+    "vector": _made,
+    "pettingzoo": _made_game,
+}
+"""Kind of an environment, of which a vector has several -> the function that makes it."""
 
 
 def _made_by_function(name: str, render: bool) -> Any:

@@ -80,6 +80,8 @@ class Stepper:
 
     n = 1
     """How many environments step at once."""
+    is_game = False
+    """Whether several agents act in it."""
 
     def __init__(self, env: Any, recording: Recording) -> None:
         self.env = env
@@ -92,8 +94,9 @@ class Stepper:
         self._recording, self._has_states = recording, recording.has_states
         self.observation_space, self.action_space = self._spaces()
         self._check_spaces()
-        leaf, is_game = StateLeaf if self._has_states else Leaf, recording.layout.kind == "game"
-        self._observation = SpaceValues(self.observation_space, "observation", leaf=leaf, is_game=is_game)
+        leaf = StateLeaf if self._has_states else Leaf
+        space = self.observation_space
+        self._observation = SpaceValues(space, "observation", leaf=leaf, is_game=self.is_game)
         self._after = "next_state" if self._has_states else "next_observation"
         topics, agents = recording.train.topics, recording.agents
         steps, resets = map(recording.layout.rows, (topics.steps, topics.resets))
@@ -213,6 +216,10 @@ class Stepper:
             return column.tolist()  # type: ignore[no-any-return]
         return values_in(self.action_space, np.array(column))
 
+    def applicable(self, action: Any) -> Value | None:
+        """Return an action as the environment takes it now; None if it takes none of that kind now."""
+        return action
+
     def _decoded(self, actions: Array) -> Iterator[Value]:
         """Yield actions of varying size."""
         description, where = self._recording.spaces["action"], f"{self._recording.path}: an action"
@@ -270,6 +277,8 @@ class Stepper:
 class GameStepper(Stepper):
     """A PettingZoo parallel environment."""
 
+    is_game = True
+
     def _spaces(self) -> tuple[Space, Space]:
         agents = self.env.possible_agents
         if tuple(map(str, agents)) != self._recording.agents:
@@ -293,6 +302,11 @@ class GameStepper(Stepper):
                 mask[row] = sum(bool(flag.get(agent)) << i for i, agent in enumerate(agents))
 
         return fill
+
+    def applicable(self, action: Any) -> Value | None:
+        """Return the actions of the agents that are left; None if one of them has none."""
+        agents = self.env.agents
+        return {agent: action[agent] for agent in agents} if all(map(action.__contains__, agents)) else None
 
     def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
