@@ -35,10 +35,8 @@ def shortcomings(recording: Recording) -> list[str]:
     sentences, status = [], recording.status
     if status != "finished":
         recorded = "its loop is recorded up to its last step"
-        if recording.can_train_again:
-            planned = recording.config.get("episodes")
-            of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
-            recorded = f"there are {recording.train.episodes.count():,}{of} training episodes"
+        if is_whole(planned := recording.config.get("episodes"), 0, 2**63):
+            recorded = f"there are {recording.train.episodes.count():,} of {planned:,} training episodes"
         problem = "is still running" if status == "running" else f"did not finish ({status})"
         sentence = f"Run {recording.run_id} {problem}: {recorded}."
         if (error := recording.result.error or "").startswith(RECORDING_STOPPED):

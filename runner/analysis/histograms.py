@@ -188,7 +188,7 @@ def _steps(recording: Recording, moments: Positions, notes: list[str]) -> Iterat
 
 def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, Array]:
     """Return the numbers of actions by part: an agent, a field or an index; empty for a single number."""
-    if recording.can_train_again:
+    if recording.tabular:
         numbers = recording.mdp.own_actions[actions]
         return {agent: numbers[:, i] for i, agent in enumerate(lines_of(recording.mdp.agents))}
     if actions.dtype.hasobject:  # as observations or actions vary in size
@@ -213,11 +213,11 @@ def _numbers(actions: Array) -> Iterator[tuple[str, Array]]:
 def _action_names(recording: Recording, part: str) -> dict[float, str]:
     """Return the names of the discrete actions of a part, by number."""
     start = 0
-    if recording.can_train_again:
+    if recording.tabular:
         agents = recording.mdp.agents
         names = tuple(numbered_actions(recording.mdp)[agents.index(part) if part else 0])
     else:
         agent = part if part in recording.agents else ""
         names = recording.train.action_names(agent) if agent or not part else ()
-        start = 0 if recording.has_states else int(recording.spaces["action"].get("start", 0))
+        start = int(recording.spaces["action"].get("start", 0))
     return {float(start + i): spoken(name) for i, name in enumerate(names)}

@@ -149,7 +149,7 @@ def tables_of(
         raise ConfigError("found step and episode, which exclude each other: choose one.")
     if episode is not None:
         step = step_of_episode(recording, episode)
-    if not recording.can_train_again:
+    if not recording.has_tables:
         return _recorded(recording, step, state)
     step = last_step(recording) if step is None else step
     number = None if state is None else state_of(recording.mdp, state)  # before the tables are replayed

@@ -83,7 +83,7 @@ class Shape:
             topic: SpaceColumns(names.varying, "varying", where) for topic, names in self._extras
         }
         """The names of extras with values of varying size, by the topic of each layout."""
-        if not run.can_train_again:
+        if run.layout.spaces:
             for name in ("action", "next_observation", "observation"):
                 self.spaces[name] = SpaceColumns(run.spaces[name.removeprefix("next_")], name, where)
         self.messages = {topic: run.layout.message(topic) for topic in run.topics}

@@ -125,9 +125,8 @@ class Archive(RunDescription):
 
     def _extra_layouts(self) -> list[ExtraLayout]:
         count = self.count(schema.EXTRA_COLUMNS_TOPIC)
-        if not count or self.can_train_again:
+        if not count or (table := Shape(self).tables.get(layout.EXTRA_COLUMNS)) is None:
             return []
-        table = Shape(self).tables[layout.EXTRA_COLUMNS]
         columns = [
             (row["position"] * STEP_NANOSECONDS, row)
             for batch in self.batches(table.name, table.columns, count, MAX_LAYOUTS)

@@ -184,7 +184,7 @@ class _Restorer:
             if not topic.digested:
                 self._undigested[topic].update(message)
             self._batches.add(topic, [time], [message])
-            if topic.message is schema.IMAGE or self._archive.can_train_again:
+            if topic.message is schema.IMAGE:
                 self._batches.flush()
 
     def _send_chunk(

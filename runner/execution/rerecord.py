@@ -98,13 +98,12 @@ def rerecord(
             )
         if holds_steps(current):
             return current
-        if is_loop:
-            _require_actions(current, trust)
         fresh, started = current.recording.with_suffix(".rerecording"), time.monotonic()
         try:
             with storage_errors(fresh):
                 fresh.unlink(missing_ok=True)
                 if is_loop:
+                    _require_actions(current, trust)
                     for done in stream_from_child(_rerecord_loop, current.recording, fresh, trust):
                         count(done)
                 else:

@@ -166,7 +166,7 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
     environments = {
         (
             group.label,
-            run.config.get("env", {}).get("id", "") if run.can_train_again else run.environment,
+            run.environment,
         ): None
         for group in groups
         for run in group.runs

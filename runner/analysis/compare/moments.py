@@ -109,8 +109,7 @@ def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment
     windows: dict[str, list[str]] = {}
     for group in groups:
         run, window = group.runs[0], ""
-        if run.can_train_again:
-            log = run.config["log"]
+        if log := run.config.get("log"):
             window = f"the last {log['episodes']:,} episodes (lengths) or {log['window']:,} steps (rewards)"
         elif run.training:
             ends = [0.0, *sorted(at for at, _ in run.training)]
@@ -129,9 +128,11 @@ def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
     if not few:
         return []
     listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
-    loops = all(not run.can_train_again for group in few for run in group.runs)
+    has_setting = any("seeds" in run.config for group in few for run in group.runs)
     more = (
-        "record more, each with a seed of its own" if loops else "the setting `seeds: {count: 10}` runs ten"
+        "the setting `seeds: {count: 10}` runs ten"
+        if has_setting
+        else "record more, each with a seed of its own"
     )
     return [
         f"fewer than {FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "

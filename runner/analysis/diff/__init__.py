@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
+from runner.analysis.contents import why_no_steps
 from runner.analysis.diff.causes import Cause, branch_relation, find_cause, find_kind, with_branch
 from runner.analysis.diff.code import FileChange, code_changes
 from runner.analysis.diff.divergence import (
@@ -216,12 +217,10 @@ def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:
 
 def _left_out(name: str, recording: Recording) -> str:
     """Return what a recording left out of its steps, and what is compared instead."""
-    again = f"`dualtaxi rerecord {recording.run_id}` records them"
     if recording.has_actions:
-        return f"{name} holds the actions of its steps alone, which are compared; {again} whole"
-    if recording.can_train_again:
-        return f"{name} holds no steps, so none are compared; {again}"
-    return f"{name} holds neither steps nor actions, so none are compared"
+        again = f"`dualtaxi rerecord {recording.run_id}` records them whole"
+        return f"{name} holds the actions of its steps alone, which are compared; {again}"
+    return f"{name} holds no steps, so none are compared: {why_no_steps(recording)}"
 
 
 def with_seconds(difference: RunDiff, a: Run, b: Run) -> RunDiff:

@@ -25,9 +25,13 @@ FINISH = [("success_percent", "")]
 def run(seed, curve, *, name="a", finished=True, metric="success_percent", line="", **config):
     """Return a run whose metric takes the values of a curve, every 100 episodes."""
     evaluation = [(100 * k, {metric: {line: float(value)}}) for k, value in enumerate(curve)]
-    config = {"episodes": 100 * (len(curve) - 1), "name": name, "seeds": [seed]} | config
+    config = {"episodes": 100 * (len(curve) - 1), "name": name} | config
+    if "made_by" not in config:
+        config = {"seeds": [seed]} | config
     status = "finished" if finished else "interrupted"
-    return RunSeries(f"{name}{seed}{'' if finished else 'x'}", name, seed, status, config, evaluation, [])
+    environment = config.get("env", {}).get("id", "")
+    run_id = f"{name}{seed}{'' if finished else 'x'}"
+    return RunSeries(run_id, name, seed, status, config, evaluation, [], environment=environment)
 
 
 def two_groups(left, right, **kwargs):

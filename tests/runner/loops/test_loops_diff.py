@@ -211,7 +211,7 @@ def test_loops_recorded_by_their_actions_diverge_where_these_do(tmp_path):
         assert (reply.exit_code, "the same, to the last byte" in reply.stdout) == (0, True)
         assert "Note" not in reply.stdout
     reply = dualtaxi(tmp_path, "diff", "none", "b").stdout
-    assert "A holds neither steps nor actions, so none are compared." in reply
+    assert "A holds no steps, so none are compared: they were left out (steps: none), and without" in reply
     assert "diverge" not in reply
     assert "all actions are the same" not in reply
 
