@@ -201,7 +201,7 @@ def random_policy_sentence(recording: Recording) -> str:
     """
     from runner.planning.baseline import random_baseline
 
-    if not recording.has_tables or recording.config["algorithm"] == "random":
+    if recording.config.get("algorithm", "random") == "random":
         return ""
     baseline = random_baseline(recording.mdp)
     return baseline.sentence if baseline else ""
