@@ -282,10 +282,11 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
     return bytes(sink.getvalue())
 
 
-def plot(path: Path, axis: str, style: CurveStyle) -> bytes:
-    """Return every metric of a run over an axis in one figure, as SVG."""
-    groups = groups_of(series_of([path], axis_of(axis)))
-    return svg_file(curves_sheet(groups, panels_of(groups), style))
+def plot(paths: Sequence[Path], axis: str, style: CurveStyle, metrics: Sequence[str] = ()) -> bytes:
+    """Return metrics of runs over an axis in one figure, as SVG; all of them if none are named."""
+    groups = groups_of(series_of(paths, axis_of(axis), metrics))
+    panels = [panel for panel in panels_of(groups) if not metrics or panel.metric in metrics]
+    return svg_file(curves_sheet(groups, panels, style))
 
 
 def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:

@@ -31,8 +31,8 @@ from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if_in
 from runner.drawing import svg
-from runner.environments.naming import actions_in_words, joint_action
-from runner.errors import RecordingError
+from runner.environments.naming import actions_in_words, joint_action, state_of
+from runner.errors import ConfigError, RecordingError
 from runner.export.encoded import picture_note
 from runner.export.plots.curves import Plot
 from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
@@ -40,7 +40,7 @@ from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.plots.tasks import task_charts
 from runner.export.reports.compare import tasks_legend
 from runner.export.reports.diff import ShownDivergence, difference_view
-from runner.export.reports.maps import maps_of, stages_of
+from runner.export.reports.maps import maps_of, situations, stages_of
 from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.location import locate
@@ -180,15 +180,25 @@ def latest_episode(path: Path) -> bytes:
         return EpisodeRef(ended - 1).episode_path.encode() if has_one else b""
 
 
-def maps(path: Path) -> bytes:
-    """Return the maps of policy and values at stages of learning, as HTML."""
+def maps(path: Path, state: Sequence[str] = ()) -> bytes:
+    """Return the maps of policy and values at stages of learning, as HTML.
+
+    They are of the situation of a state, given by the parts of its name; of a typical one by default.
+    """
+    shown = partials()
     with open_recording(path) as recording:
-        rows = []
         drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
-        if recording.tabular:
-            rows = maps_of(recording.mdp, recording.agents, stages_of(recording), _typical_start(recording))
-        broad = drawing is not None and drawing.width > svg.BROAD
-        return f"<h2>What was learned</h2>{partials().maps(rows, broad)}".encode()
+        if drawing is None:
+            return f"<h2>What was learned</h2>{shown.maps([], broad=False)}".encode()
+        mdp, problem, number = recording.mdp, "", _typical_start(recording)
+        try:
+            number = state_of(mdp, ", ".join(state)) if state else number
+        except ConfigError:
+            problem = f"There is no state with {', '.join(state)}."
+        rows = maps_of(mdp, recording.agents, stages_of(recording), number)
+        form = shown.situation(situations(mdp, number) if rows else [], problem)
+        maps = shown.maps(rows, drawing.width > svg.BROAD)
+        return f"<h2>What was learned</h2>{form}{maps}".encode()
 
 
 def distributions(path: Path, axis: str) -> bytes:

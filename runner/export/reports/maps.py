@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,15 @@ class MapRow:
     """(stage, svg)."""
     low: float
     high: float
+
+
+class Choice(NamedTuple):
+    """A part of the name of a state."""
+
+    label: str
+    texts: list[str]
+    """All that it may be."""
+    chosen: str
 
 
 def stages_of(recording: Recording) -> list[MapStage]:
@@ -106,6 +115,14 @@ def situation(mdp: Mdp, state: int, free: Sequence[int]) -> NDArray[np.bool_]:
     fixed = [i for i in range(mdp.scene_cells.shape[1]) if i not in free and carriers[state, i] < 0]
     same_cells = (mdp.scene_cells[:, fixed] == mdp.scene_cells[state, fixed]).all(axis=1)
     return np.asarray(same_carriers & same_cells)
+
+
+def situations(mdp: Mdp, state: int) -> list[Choice]:
+    """Return what may be chosen of a state with a scene, as in this one."""
+    assert mdp.scene is not None
+    names = [str(name).split(", ") for name in states_in_words(mdp)]
+    parts = zip(mdp.scene["things"], zip(*names, strict=True), names[state], strict=True)
+    return [Choice(thing["label"], list(dict.fromkeys(texts)), chosen) for thing, texts, chosen in parts]
 
 
 def situation_in_words(mdp: Mdp, state: int, free: Sequence[int]) -> str:

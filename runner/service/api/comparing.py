@@ -12,13 +12,24 @@ from runner.analysis.axes import EPISODES
 from runner.debugging.explanation import Explanation
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.errors import RunNotFound
+from runner.export.plots.style import CurveStyle
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.reading import AxisName, FirstPosition, LastPosition, Metrics, Points, Smooth
+from runner.service.api.reading import (
+    SVG,
+    AxisName,
+    FirstPosition,
+    LastPosition,
+    LogX,
+    LogY,
+    Metrics,
+    Points,
+    Smooth,
+)
 from runner.service.catalogue import Catalogue
 from runner.service.computed import Curves
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
-from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
+from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
 from runner.service.settings import ServiceSettings
 from runner.util.values import finite
 
@@ -96,6 +107,28 @@ async def curves(
     paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, run)]
     options = (axis, metric or [], start, stop, points, lines, smooth)
     return await compute.json(computed.curves, paths, *options)
+
+
+@router.get(
+    "/curves.svg",
+    response_class=Response,
+    responses=media_docs(SVG),
+    summary="The curves of several runs in one figure.",
+)
+async def curves_picture(
+    catalogue: CatalogueOf,
+    compute: ComputationOf,
+    run: Runs,
+    metric: Metrics = None,
+    axis: AxisName = EPISODES.name,
+    smooth: Smooth = 0,
+    log_x: LogX = False,
+    log_y: LogY = False,
+) -> Response:
+    """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
+    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, run)]
+    style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
+    return Response(await compute(computed.plot, paths, axis, style, metric or []), media_type=SVG)
 
 
 @router.get(

@@ -73,6 +73,9 @@ Smooth = Annotated[
     ),
 ]
 
+LogX = Annotated[bool, Query(description="A logarithmic horizontal axis.")]
+LogY = Annotated[bool, Query(description="Logarithmic vertical axes.")]
+
 
 class Histograms(BaseModel):
     """The histograms of a run's training."""
@@ -235,12 +238,12 @@ async def plot(
     compute: ComputationOf,
     axis: AxisName = EPISODES.name,
     smooth: Smooth = 0,
-    log_x: Annotated[bool, Query(description="A logarithmic horizontal axis.")] = False,
-    log_y: Annotated[bool, Query(description="Logarithmic vertical axes.")] = False,
+    log_x: LogX = False,
+    log_y: LogY = False,
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws."""
     style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
-    return Response(await compute(computed.plot, run.recording, axis, style), media_type=SVG)
+    return Response(await compute(computed.plot, [run.recording], axis, style), media_type=SVG)
 
 
 def _stop(start: int, stop: int | None, total: int, limit: int) -> int:

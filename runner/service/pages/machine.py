@@ -22,6 +22,9 @@ router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 Sought = Annotated[str, Query(alias="q", max_length=200)]
 Stream = Literal["", "stdout", "stderr"]
 Status = Annotated[str, Query(max_length=20)]
+StateParts = Annotated[
+    list[str] | None, Query(max_length=20, description="The parts of the name of a state.")
+]
 
 
 def _add_page(tab: str, body_of: Callable[[Path], bytes], is_live: bool = False) -> None:
@@ -45,7 +48,17 @@ def _add_page(tab: str, body_of: Callable[[Path], bytes], is_live: bool = False)
 
 _add_page("system", fragments.system, is_live=True)
 _add_page("pictures", fragments.pictures)
-_add_page("learned", fragments.maps)
+
+
+@router.get("/learned")
+async def learned(
+    request: Request, run: RecordedRun, compute: ComputationOf, state: StateParts = None
+) -> Response:
+    """Show the maps of what was learned, in the situation of a state."""
+    body = (await compute(fragments.maps, run.recording, tuple(state or ()))).decode()
+    return await run_in_threadpool(
+        run_page, request, run, "learned", "run_body.html", {"body": body, "live": ""}
+    )
 
 
 @router.get("/console")

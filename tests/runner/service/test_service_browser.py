@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import shutil
 import urllib.request
@@ -11,6 +12,7 @@ import pytest
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select
 from served import Served, wait
 
 import runner
@@ -97,6 +99,55 @@ def test_metrics_are_drawn_and_zoomed_and_the_address_follows(page):
     wait(browser, lambda: "from=10&to=40" in browser.current_url)
     browser.refresh()
     assert browser.find_element(By.NAME, "to").get_attribute("value") == "40"
+
+
+def test_charts_are_pinned_hidden_and_downloaded(page, tmp_path):
+    browser = page("/runs/first")
+    browser.execute_cdp_cmd(
+        "Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)}
+    )
+
+    def titles():
+        return [title.text for title in browser.find_elements(By.CSS_SELECTOR, ".plots figcaption b")]
+
+    def click(name):
+        offered = browser.find_element(By.CSS_SELECTOR, f"[aria-label='{name}']")
+        browser.execute_script("arguments[0].click()", offered)
+
+    try:
+        wait(browser, lambda: len(titles()) > 3)
+        all_titles = titles()
+        click(f"Pin {all_titles[2]}")
+        wait(browser, lambda: titles()[0] == all_titles[2])
+        click(f"Hide {all_titles[0]}")
+        wait(browser, lambda: all_titles[0] not in titles())
+        browser.refresh()
+        wait(browser, lambda: len(titles()) == len(all_titles) - 1)
+        assert titles()[0] == all_titles[2]
+        browser.find_element(By.CSS_SELECTOR, "[data-hidden] button").click()
+        wait(browser, lambda: all_titles[0] in titles())
+        click(f"{all_titles[0]} as CSV")
+        click(f"{all_titles[0]} as SVG")
+        table = wait(browser, lambda: [*tmp_path.glob("*.csv")])[0].read_text()
+        head, *rows = csv.reader(table.splitlines())
+        assert (head[0], len(rows)) == ("episodes", len({row[0] for row in rows}))
+        assert all(float(row[1]) >= 0 for row in rows)
+        assert wait(browser, lambda: [*tmp_path.glob("*.svg")])[0].read_text().count("<svg") == 1
+    finally:
+        browser.execute_script("localStorage.clear()")
+
+
+def test_what_was_learned_is_shown_in_a_situation_that_is_chosen(page):
+    browser = page("/runs/first/learned")
+    fields = browser.find_elements(By.NAME, "state")
+    assert "passenger at Y" not in text_of(browser, ".maps ~ p")
+    for field, text in zip(
+        fields, ("taxi 1 (0,0)", "taxi 2 (3,3)", "passenger at Y", "destination G"), strict=True
+    ):
+        Select(field).select_by_visible_text(text)
+    browser.find_element(By.XPATH, "//button[text()='Show this situation']").click()
+    wait(browser, lambda: "taxi 2 (3,3), passenger at Y, destination G" in text_of(browser, "main"))
+    assert Select(browser.find_elements(By.NAME, "state")[2]).first_selected_option.text == "passenger at Y"
 
 
 def test_the_legend_of_a_plot_distinguishes_lines_and_shows_values(page):

@@ -6,13 +6,16 @@ import { request } from "./api.js";
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
 const plots = box.querySelector("[data-plots]"),
-  message = box.querySelector("[data-message]");
+  message = box.querySelector("[data-message]"),
+  restore = box.querySelector("[data-hidden]");
 const form = box.querySelector("form"),
   fields = form.elements;
 const COLOURS = 7; // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
 const MAX_AXES = 100; // logged values among the axes to choose from
 const SHARES = "training.reward";
+const HIDDEN = "charts hidden",
+  PINNED = "charts pinned"; // names of metrics, which this browser keeps
 const shown = new Map();
 let requests = 0,
   last = null;
@@ -53,7 +56,25 @@ function change(changes, keep = true) {
   fill(chosen());
 }
 
+const kept = (which) => new Set(JSON.parse(localStorage.getItem(which) ?? "[]"));
+
+function keep(which, metric, is) {
+  const metrics = kept(which);
+  if (is) metrics.add(metric);
+  else metrics.delete(metric);
+  localStorage.setItem(which, JSON.stringify([...metrics]));
+  show();
+}
+
 // --- data -----------------------------------------------------------------------------------------------
+
+function selection() {
+  const { axis, smooth, log_x, log_y } = chosen();
+  const query = new URLSearchParams({ axis });
+  for (const run of runs) query.append("run", run.id);
+  for (const [name, value] of Object.entries({ smooth, log_x, log_y })) if (value) query.set(name, value);
+  return query;
+}
 
 async function draw() {
   const mine = ++requests,
@@ -101,10 +122,23 @@ function show() {
     panel.curves.push(curve);
     metrics.set(curve.metric, panel);
   }
-  const ranked = [...metrics].sort(([one], [other]) => rank(one) - rank(other));
-  for (const [metric, panel] of ranked) plot(metric, panel);
+  const hidden = kept(HIDDEN),
+    pinned = kept(PINNED),
+    first = (metric) => (pinned.has(metric) ? -1 : rank(metric));
+  const ranked = [...metrics]
+    .filter(([metric]) => !hidden.has(metric))
+    .sort(([one], [other]) => first(one) - first(other));
+  for (const [metric, panel] of ranked) plot(metric, panel, pinned.has(metric));
+  const order = ranked.map(([metric]) => shown.get(metric).figure);
+  if (order.some((figure, i) => plots.children[i] !== figure)) plots.append(...order);
+  const left = [...metrics].filter(([metric]) => hidden.has(metric));
+  restore.hidden = !left.length;
+  restore.replaceChildren(
+    "Hidden, click to show: ",
+    ...left.map(([metric, { title }]) => button(title, () => keep(HIDDEN, metric, false))),
+  );
   for (const [metric, one] of shown)
-    if (!metrics.has(metric)) {
+    if (!metrics.has(metric) || hidden.has(metric)) {
       one.chart?.destroy();
       one.figure.remove();
       shown.delete(metric);
@@ -211,7 +245,62 @@ const colour = (i) =>
     .trim();
 const spoken = (name) => name.replaceAll("_", " ");
 
-function plot(metric, panel) {
+function button(text, act, attributes = {}) {
+  const made = document.createElement("button");
+  made.type = "button";
+  made.textContent = text;
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.addEventListener("click", act);
+  return made;
+}
+
+// What a chart offers: to be pinned above the others, hidden, and downloaded, with every recorded point.
+function tools(metric, { title }, isPinned) {
+  const query = selection();
+  query.set("metric", metric);
+  const picture = document.createElement("a");
+  picture.href = `/api/v1/curves.svg?${query}`;
+  picture.download = `${metric}.svg`;
+  picture.textContent = "SVG";
+  picture.setAttribute("aria-label", `${title} as SVG`);
+  return [
+    button("Pin", () => keep(PINNED, metric, !isPinned), {
+      "aria-pressed": isPinned,
+      "aria-label": `Pin ${title}`,
+    }),
+    button("Hide", () => keep(HIDDEN, metric, true), { "aria-label": `Hide ${title}` }),
+    picture,
+    button("CSV", () => download(metric), { "aria-label": `${title} as CSV` }),
+  ];
+}
+
+async function download(metric) {
+  const query = selection();
+  query.set("metric", metric);
+  for (const name of ["smooth", "log_x", "log_y"]) query.delete(name); // the values as they were recorded
+  const { axis, curves } = await request(`/api/v1/curves?${query}`);
+  const lines = [...new Set(curves.map((curve) => curve.line))];
+  const columns = curves.flatMap((curve) => {
+    const label = labelOf(curve, lines);
+    const values = { [label]: curve.values, [`${label}, low`]: curve.low, [`${label}, high`]: curve.high };
+    return Object.entries(values).flatMap(([heading, of]) =>
+      of ? [[heading, new Map(curve.positions.map((at, i) => [at, of[i]]))]] : [],
+    );
+  });
+  const positions = [...new Set(curves.flatMap((curve) => curve.positions))].sort((one, other) => one - other);
+  const cell = (value) => (value === null || value === undefined ? "" : `"${String(value).replaceAll('"', '""')}"`);
+  const rows = [[axis, ...columns.map(([heading]) => heading)]];
+  for (const at of positions) rows.push([at, ...columns.map(([, values]) => values.get(at))]);
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(
+    new Blob([rows.map((row) => `${row.map(cell).join(",")}\n`).join("")], { type: "text/csv" }),
+  );
+  link.download = `${metric}.csv`;
+  link.click();
+  URL.revokeObjectURL(link.href);
+}
+
+function plot(metric, panel, isPinned) {
   const state = chosen(),
     { series, left, logy } = seriesOf(panel, state);
   const data = uPlot.join(series.map(({ positions, values }) => [positions, values]));
@@ -230,12 +319,20 @@ function plot(metric, panel) {
   if (!one) {
     one = { figure: document.createElement("figure") };
     one.figure.className = metric === SHARES ? "wide" : "";
-    one.figure.append(...["figcaption", "div", "div"].map((name) => document.createElement(name)));
+    one.figure.append(...["figcaption", "div", "div", "p"].map((name) => document.createElement(name)));
     one.figure.children[2].className = "key";
+    one.figure.children[3].className = "tools";
     shown.set(metric, one);
     plots.append(one.figure);
   }
-  const [caption, place, key] = one.figure.children;
+  const [caption, place, key, offered] = one.figure.children,
+    offer = JSON.stringify([metric, selection().toString(), isPinned]);
+  if (offered.dataset.offer !== offer) {
+    const focused = [...offered.children].indexOf(document.activeElement);
+    offered.dataset.offer = offer;
+    offered.replaceChildren(...tools(metric, panel, isPinned));
+    offered.children[focused]?.focus();
+  }
   const [title, unit] = [document.createElement("b"), document.createElement("span")];
   title.textContent = panel.title;
   unit.textContent = [
@@ -386,7 +483,7 @@ function options(panel, series, state, logy, place, key) {
 
 function bounds(low, high, percent, positive) {
   if (percent && high <= 100 && low >= 0) return [0, 100];
-  if (low === null) return [0, 1];
+  if (low === null || (low === 0 && high === 0)) return [0, 1];
   const from = positive ? 0 : low - 0.05 * (high - low || 1);
   return [from, high + 0.05 * (high - from || 1)];
 }
