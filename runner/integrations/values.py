@@ -29,13 +29,13 @@ class ValueRows:
 
     def __init__(self) -> None:
         self.progress = (0, 0)
-        self.filled = 0
+        self.pending = 0
         """The largest step so far, which orders the messages in time."""
 
     def move(self, step: int) -> None:
         """Let the next values have this step."""
         self.progress = (step, 0)
-        self.filled = max(self.filled, min(step, _MAX_POSITION))
+        self.pending = max(self.pending, min(step, _MAX_POSITION))
 
     def open(self) -> None:
         """Do nothing: there are no steps."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +50,8 @@ class _OtherValues(KeyError):
     """A value that does not fit into its column."""
 
 
-class _Column(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Column:
     """The values of one name that the recorder does not have yet."""
 
     dtype: np.dtype[np.generic] | None
@@ -110,20 +112,22 @@ class PendingExtras:
         def take(values: Mapping[str, Value]) -> None:
             if not values:
                 return
-            row, name = len(steps), ""
+            row = len(steps)
             try:
                 for name, value in values.items():
-                    dtype, shape, scalars, cells, fit = columns[name]
-                    is_fitting = value.__class__ in scalars or (
-                        value.__class__ is array and value.dtype is dtype and value.shape == shape
-                    )
-                    cells[row] = value if is_fitting else fit(row, value)
+                    column = columns[name]
+                    is_fitting = (
+                        value.__class__ is array
+                        and value.dtype is column.dtype
+                        and value.shape == column.shape
+                    ) or value.__class__ in column.scalars
+                    column.values[row] = value if is_fitting else column.fit(row, value)
             except (AttributeError, KeyError):  # no mapping, a new name, or values of another length
                 take(self._grow(row, values))
                 return
             except (OverflowError, ConfigError) as error:
                 self._leave_out(
-                    ConfigError(f"extras: found {value} for {name!r}, which {dtype} cannot hold")
+                    ConfigError(f"extras: found {value} for {name!r}, which {column.dtype} cannot hold")
                     if isinstance(error, OverflowError)
                     else error
                 )
@@ -131,7 +135,7 @@ class PendingExtras:
                 return
             if not row:
                 self._phase = phase
-            steps.append(taken[phase] + rows.filled - n)
+            steps.append(taken[phase] + (rows.filled - 1) * n)
             if len(values) != len(columns):
                 self._partial[row] = set(values)
             if row >= self._max_rows:
@@ -145,7 +149,7 @@ class PendingExtras:
         Raises:
             RunnerError: there is no such step, or it cannot be extended any more.
         """
-        step = self._taken[phase] + rows.filled - self._n
+        step = self._taken[phase] + rows.pending - self._n
         if step <= self._final[phase]:
             raise RunnerError(
                 "note_step: found no step that can be extended, expected one of this phase that was taken "
@@ -201,7 +205,7 @@ class PendingExtras:
         self._write(len(self._steps))
         self._phase = phase
         count = len(next(iter(values.values())))
-        first = self._taken[phase] + rows.filled - count
+        first = self._taken[phase] + rows.pending - count
         columns = {
             name: values.get(name, blank_extras(column, count)) for name, column in self._described.items()
         }

@@ -332,7 +332,7 @@ class _Fold:
                 active = buffer
             unit["new_reset"] = buffer.resets
             unit["new_step"] = buffer.progress[0]
-            unit["new_position"] = recorder.position + buffer.filled
+            unit["new_position"] = recorder.position + buffer.pending
             reset, read = source.reset(phase, unit), self._read[source.number]
             environment = source.environment + int(unit["environment"])
             buffer.copy_reset(reset, environment)
@@ -341,7 +341,7 @@ class _Fold:
             unit["new_episode"] = begun[phase]
             for steps, numbers in source.steps(phase, unit):
                 self.content.take(topics.steps, steps)
-                position = recorder.position + buffer.filled
+                position = recorder.position + buffer.pending
                 read[topics.extras.name] += extras.copy(source, phase, numbers, buffer.progress[0], position)
                 buffer.copy(steps, environment)
                 begun[phase] += int(np.count_nonzero(steps["t"] == 0))

@@ -165,15 +165,12 @@ class Loop:
         """
         if self.closed:
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
-        return self._recorder.position + (self.active.filled if self.active else 0)
+        return self._recorder.position + (self.active.pending if self.active else 0)
 
     def moment(self, rows: StepBuffer) -> tuple[int, int, int]:
         """Return `position`, and the steps and the episode of a phase."""
         step, episode = rows.progress
-        if (active := self.active) is None:
-            return self.position, step, episode
-        counts = self._recorder.steps
-        return counts["train"] + counts["eval"] + counts["elsewhere"] + active.filled, step, episode
+        return self.position, step, episode
 
     def at_step(self, steps: int) -> None:
         """State how many training steps the whole run had when what is recorded from now on happened.
@@ -199,7 +196,7 @@ class Loop:
                 )
             if "placed" not in self.run.facts:
                 self._loop_run.run = self.run.update(placed=True)
-            taken["elsewhere"] = steps
+            self._recorder.advance("elsewhere", steps - before)
 
     def records(self) -> bool:
         """Return whether this process records, and warn if it was forked from the recording process."""

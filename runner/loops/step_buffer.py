@@ -63,7 +63,7 @@ class StepBuffer:
         mode: AutoresetMode | None = None,
     ) -> None:
         self._recorder, self._first_action, self._mode = recorder, first_action, mode
-        self._topics = schema.topics_of(phase)
+        self._phase, self._topics = phase, schema.topics_of(phase)
         self._mdp, self._n = described.mdp, described.environments
         self._batch = () if mode is None else (self._n,)
         self._is_game, self._has_turns = described.layout.kind == "game", described.layout.has_turns
@@ -75,7 +75,7 @@ class StepBuffer:
         """Whether values vary in size."""
         self.off_table = 0
         """Committed steps whose reward the environment's table excludes; 0 without a table."""
-        self._filled, self._room, self._full_at, self._held = 0, 0, 0, 0
+        self.filled, self._room, self._full_at, self._held = 0, 0, 0, 0
         """Rows of the block that are in use, how many it has, with how many it is full now, and bytes of
         varying size in them."""
         self.resets = 0
@@ -128,13 +128,9 @@ class StepBuffer:
         return filler(values, column if self._batch else column[:, 0], self._batch)
 
     @property
-    def _phase(self) -> str:
-        return self._topics.steps.phase
-
-    @property
-    def filled(self) -> int:
+    def pending(self) -> int:
         """Rows of single environments that the recorder does not have yet, with rows that only reset."""
-        return self._filled * self._n
+        return self.filled * self._n
 
     @property
     def progress(self) -> tuple[int, int]:
@@ -142,20 +138,20 @@ class StepBuffer:
 
         Of one environment alone, the episode of the last step; else the next episode to end.
         """
-        if self._batch and self._counted < self._filled:
-            self._ended += int(np.count_nonzero(self._ends[self._counted : self._filled].any(axis=1)))
-            self._counted = self._filled
+        if self._batch and self._counted < self.filled:
+            self._ended += int(np.count_nonzero(self._ends[self._counted : self.filled].any(axis=1)))
+            self._counted = self.filled
         episode = self._log.ended + self._ended
-        if not self._batch and not self._is_game and self._idle_at == self._filled:
+        if not self._batch and not self._is_game and self._idle_at == self.filled:
             episode = max(episode - 1, 0)
-        return self._recorder.steps[self._phase] + self.filled, episode
+        return self._recorder.steps[self._phase] + self.filled * self._n, episode
 
     @property
     def is_any_over(self) -> bool:
         """Whether `over` may be true of an environment; this takes less time."""
-        if not self._filled:
+        if not self.filled:
             return bool(self._over.any())
-        return _TRUE in self._ends[self._filled - 1].tobytes()
+        return _TRUE in self._ends[self.filled - 1].tobytes()
 
     @property
     def over(self) -> Flags:
@@ -163,10 +159,10 @@ class StepBuffer:
 
         With `is_reset_twice` also those that were.
         """
-        over: Flags = self._ends[self._filled - 1].any(axis=0) if self._filled else self._over.copy()
+        over: Flags = self._ends[self.filled - 1].any(axis=0) if self.filled else self._over.copy()
         resets = self._resets[: self._waiting]
         if not self.is_reset_twice:
-            over[resets["environment"][resets["row"] == self._filled] % self._n] = False
+            over[resets["environment"][resets["row"] == self.filled] % self._n] = False
         return over
 
     @over.setter
@@ -187,9 +183,9 @@ class StepBuffer:
         """Put down a step of one environment alone; the action is as `keep` returned it."""
         if not self._room:
             self._begin(action)
-        row = self._filled
+        row = self.filled
         self._put(row, action, observation, reward, terminated, truncated)
-        self._filled = row = row + 1
+        self.filled = row = row + 1
         if terminated or truncated:
             self._ended += 1
             self._idle_at = row
@@ -211,12 +207,12 @@ class StepBuffer:
         agents = self._action.agents
         paid = [float(rewards.get(agent, 0.0)) for agent in agents]
         ended = [over and any(ends.values()) for ends in (terminated, truncated)]
-        row = self._filled
+        row = self.filled
         self._put_parts(row, actions, observations, paid, *ended)
         flags = dict.fromkeys(actions, True), terminated, truncated
         masks = [sum(bool(ends.get(agent)) << i for i, agent in enumerate(agents)) for ends in flags]
         self._marks[row] = (*masks, 0, over, False)
-        self._filled = row = row + 1
+        self.filled = row = row + 1
         if over:
             self._ended += 1
             self._idle_at = row
@@ -244,7 +240,7 @@ class StepBuffer:
         """
         if not self._room:
             self._begin(actions)
-        row = self._filled
+        row = self.filled
         if rewards.__class__ is not np.ndarray or rewards.shape != self._batch:
             rewards = np.asarray(rewards, np.float64).reshape(self._batch)
         self._hold(self._put_action(row, actions) + self._put_observation(row, observations))
@@ -259,7 +255,7 @@ class StepBuffer:
             self._add_resets(row + 1, environments, firsts)
         if states:
             self._autoreset_states[row] = states
-        self._filled = row = row + 1
+        self.filled = row = row + 1
         if row >= self._full_at:
             self._commit_full()
 
@@ -329,7 +325,7 @@ class StepBuffer:
         """
         steps, done = len(arrays[0]), 0
         while done < steps:
-            row, count = self._filled, min(self._room - self._filled, steps - done)
+            row, count = self.filled, min(self._room - self.filled, steps - done)
             rows, part = slice(row, row + count), slice(done, done + count)
             for column, values in zip(self._block, arrays, strict=False):
                 column[rows] = values[part]
@@ -339,8 +335,8 @@ class StepBuffer:
             if self._are_bytes:
                 self._hold(sum(map(len, (*self._actions[rows].flat, *self._observations[rows].flat))))
             done += count
-            self._filled = rows.stop
-            if self._filled >= self._full_at:
+            self.filled = rows.stop
+            if self.filled >= self._full_at:
                 self._commit_full()
 
     def continues_with(self, observations: object) -> bool:
@@ -378,11 +374,11 @@ class StepBuffer:
             self._put_seen(0, observations)
         seen = self._seen[0] if len(environments) == self._n else self._seen[0, environments]
         must_commit = bool(self._batch) and not self.over[environments].all()
-        self._ended += not self._batch and self._idle_at != self._filled
-        self._idle_at = self._filled
+        self._ended += not self._batch and self._idle_at != self.filled
+        self._idle_at = self.filled
         if len(seeds):
             seeds = [seeds[i] for i in environments]
-        self._add_resets(self._filled, environments, seen, seeds, options, states)
+        self._add_resets(self.filled, environments, seen, seeds, options, states)
         if must_commit or self._is_full_of_resets:
             self.commit()
 
@@ -390,7 +386,7 @@ class StepBuffer:
         """Put down a recorded reset, as one of this environment."""
         self._seen[0] = reset["observation"]
         seed = int(reset["seed"]) if reset["seeded"] else None
-        self._add_resets(self._filled, [environment], self._seen[0], [seed])
+        self._add_resets(self.filled, [environment], self._seen[0], [seed])
         if self._is_full_of_resets:
             self.commit()
 
@@ -520,8 +516,8 @@ class StepBuffer:
 
     def commit(self) -> None:
         """Make the records of what was put down and hand them to the recorder."""
-        rows, n, before = self._filled, self._n, self._recorder.position
-        first, over, is_idle = self._recorder.steps[self._phase], self.over, self._idle_at == self._filled
+        rows, n, before = self.filled, self._n, self._recorder.position
+        first, over, is_idle = self._recorder.steps[self._phase], self.over, self._idle_at == self.filled
         if self._batch:
             self._last_position = before
         if not (rows or self._waiting):
@@ -561,11 +557,11 @@ class StepBuffer:
             self._put_ends(ended, first, before)
             self._put_resets(np.vstack([number, self._log.episode]), first, before)
             resets["seed"], resets["seeded"] = 0, False
-        self._recorder.steps[self._phase] += rows * n
+        self._recorder.advance(self._phase, rows * n)
         if rows:
             self._last_position = before + rows * n
         self._over, self._idle_at, self._autoreset_states = over, 0 if is_idle else -1, {}
-        self._filled = self._waiting = self._held = self._ended = self._counted = 0
+        self.filled = self._waiting = self._held = self._ended = self._counted = 0
         self._full_at = self._room
 
     def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
@@ -577,7 +573,7 @@ class StepBuffer:
         if not self._batch:
             marks = self._marks[: len(was_reset), np.newaxis]
             return was_reset | marks["begins"], False, marks["over"]
-        over = np.vstack([self._over, self._ends[: self._filled - 1].any(axis=1)])
+        over = np.vstack([self._over, self._ends[: self.filled - 1].any(axis=1)])
         waits = over if self.is_reset_twice else over & ~was_reset
         only_reset: Flags = waits & (self._mode == AutoresetMode.NEXT_STEP)
         # They come after the resets that the user's loop called before the step.
@@ -624,7 +620,7 @@ class StepBuffer:
         """Return the events and penalties of each step, and count the rewards that the table excludes."""
         names = ("state", "action", "next_state")
         transitions = (columns[name].ravel().astype(np.int64, copy=False) for name in names)
-        counts, excluded = step_counts(mdp, self._rewards[: self._filled, 0], *transitions)
+        counts, excluded = step_counts(mdp, self._rewards[: self.filled, 0], *transitions)
         self.off_table += int(np.count_nonzero(excluded))
         return counts[:, np.newaxis]
 

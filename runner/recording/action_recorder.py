@@ -33,6 +33,7 @@ class ActionRecorder:
         if topic.phase != self._phase:
             self.commit()
             self._phase = topic.phase
+        records = self._recorder.rows(topic, records)
         rows = np.zeros(len(records), kept_dtype(records.dtype))
         for name in rows.dtype.names or ():
             if name != "digest":

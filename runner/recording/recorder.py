@@ -76,7 +76,8 @@ class Recorder:
         reference: what the recording already holds.
         beat: called about once a second while the recorder is in use, by the thread that writes.
         threads: False packs and writes in the thread that records.
-        watch: called with the records of a block as they are committed; the block is used again.
+        watch: called with the records of a block as they are committed; the block is used again. `rows`
+            returns them as rows.
         before: called once, before the first message is written. With it, threads are started and messages
             written only when some have gathered, or by `release`, so that a short recording costs little.
         observer: what it sees of the time, the machine and the output is recorded.
@@ -114,6 +115,8 @@ class Recorder:
         }
         self.steps = {"train": 0, "eval": 0, "elsewhere": 0}
         """Steps committed so far, by phase; and training steps of other processes, where they are stated."""
+        self.position = 0
+        """The sum of these steps."""
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, by topic."""
         self._last_flush = time.monotonic()
@@ -153,10 +156,10 @@ class Recorder:
         if self._file is not None:
             self._file.declare(beginning_of_extras(number, message))
 
-    @property
-    def position(self) -> int:
-        """The number of steps executed so far."""
-        return sum(self.steps.values())
+    def advance(self, phase: str, steps: int) -> None:
+        """Count further steps of a phase."""
+        self.steps[phase] += steps
+        self.position += steps
 
     def release(self) -> None:
         """Write what was held back, and hold nothing back from now on."""
@@ -169,6 +172,10 @@ class Recorder:
     def dtype(self, topic: Topic) -> RecordDType:
         """Return the dtype of the rows of a topic."""
         return row_dtype(self._lanes[topic].message)
+
+    def rows(self, topic: Topic, records: Records) -> Records:
+        """Return records of a topic, as the block has them, as its rows."""
+        return rows_of(self._lanes[topic].message, records)
 
     def block(self, topic: Topic) -> Records:
         """Return the free records of the topic's open block, to be filled from the first on."""
@@ -217,7 +224,7 @@ class Recorder:
         if steps:
             first = self.position + 1
             self.take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
-            self.steps[phase] += steps
+            self.advance(phase, steps)
         if episodes:
             last_steps = self._filled(episode_topic, episodes)["last_step"]
             self.take(episode_topic, last_steps.astype(np.uint64) + np.uint64(other + 1))
@@ -340,7 +347,7 @@ class Recorder:
             self._reference.check_new(topic, fresh)
         lane.filled += len(positions)
         self.counts[topic.name] += len(positions)
-        self._watch(topic, rows_of(lane.message, fresh))
+        self._watch(topic, fresh)
         if has_reference:
             self._send_block(lane, write=False)
         elif (lane.open is not None and lane.filled == len(lane.open)) or (

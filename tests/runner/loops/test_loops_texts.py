@@ -200,7 +200,7 @@ def test_long_texts_are_written_before_the_block_is_full(tmp_path):
         for t in range(6):
             seen = tuple(f"{t}{i}{long}" for i in range(ENVIRONMENTS))
             envs.record_step(("",) * ENVIRONMENTS, (seen, np.zeros(ENVIRONMENTS), none, none, {}))
-            assert envs._rows.filled <= 2 * ENVIRONMENTS
+            assert envs._rows.pending <= 2 * ENVIRONMENTS
     with open_recording(envs.run.recording) as recording:
         found = texts(recording, "observation", "next_observation")
     assert found == [f"{t}{i}{long}" for t in range(6) for i in range(ENVIRONMENTS)]
@@ -214,7 +214,7 @@ def test_long_texts_in_batches_are_written_before_the_block_is_full(field, tmp_p
         for _ in range(8):
             seen, done = (long if field == name else [["b"] * ENVIRONMENTS] for name in TEXTS)
             rec.batch(seen, done, none, none)
-            assert rec._rows.filled <= 3 * ENVIRONMENTS
+            assert rec._rows.pending <= 3 * ENVIRONMENTS
     with open_recording(rec.run.recording) as recording:
         (found,) = set(texts(recording, field, field.replace("obs", "next_obs")))
     assert found == long[0][0]
