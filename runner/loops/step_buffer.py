@@ -243,16 +243,18 @@ class StepBuffer:
         row = self.filled
         if rewards.__class__ is not np.ndarray or rewards.shape != self._batch:
             rewards = np.asarray(rewards, np.float64).reshape(self._batch)
-        self._hold(self._put_action(row, actions) + self._put_observation(row, observations))
+        held = self._put_action(row, actions) + self._put_observation(row, observations)
         self._rewards[row] = rewards
         ends = self._ends[row]
         ends[0], ends[1] = terminated, truncated
         if infos is not None and _TRUE in ends.tobytes() and (final := final_observations(infos)) is not None:
-            environments = ends.any(axis=0).nonzero()[0]
+            environments = (ends[0] | ends[1]).nonzero()[0]  # `any` takes five times as long
             firsts = self._observations[row, environments]
             for i in environments.tolist():
-                self._hold(self._put_last(row * self._n + i, element_of(final, i)))
+                held += self._put_last(row * self._n + i, element_of(final, i))
             self._add_resets(row + 1, environments, firsts)
+        if held:
+            self._hold(held)
         if states:
             self._autoreset_states[row] = states
         self.filled = row = row + 1

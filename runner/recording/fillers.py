@@ -12,7 +12,6 @@ import math
 import struct
 from collections.abc import Callable
 from functools import lru_cache, partial
-from types import CodeType
 from typing import Any, Final
 
 import numpy as np
@@ -100,14 +99,23 @@ class _Source:
         return packed
 
     def function(self, parameters: str, *lines: str) -> Any:
-        """Return the function with these lines."""
-        exec(_compiled("\n ".join([f"def function({parameters}):", *lines])), self._scope)
-        return self._scope["function"]
+        """Return the function with these lines.
+
+        It has the objects in its closure: functions of one source share what Python has found out about it,
+        which would have to be found out again and again if they had other globals.
+        """
+        source = "\n  ".join([f" def function({parameters}):", *lines])
+        return _maker(f"def make({', '.join(self._scope)}):\n{source}\n return function")(
+            *self._scope.values()
+        )
 
 
 @lru_cache(256)
-def _compiled(text: str) -> CodeType:
-    return compile(text, f"{__file__}, compiled", "exec")
+def _maker(text: str) -> Any:
+    """Return the function of this source that makes a function."""
+    scope: dict[str, Any] = {}
+    exec(compile(text, f"{__file__}, compiled", "exec"), scope)
+    return scope["make"]
 
 
 def filler(values: SpaceValues, column: Array, batch: tuple[int, ...] = ()) -> Put:

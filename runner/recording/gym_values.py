@@ -237,8 +237,8 @@ def only_number(value: object, what: str, kinds: str = "iubf", expected: str = "
 
 def element_of(values: Value, i: int | slice) -> Value:
     """Return one of many values, or some, that are nested as their space."""
-    if isinstance(values, Mapping):
-        return {key: element_of(part, i) for key, part in values.items()}
     if isinstance(values, tuple):
         return tuple(element_of(part, i) for part in values)
+    if values.__class__ is not np.ndarray and isinstance(values, Mapping):  # the latter takes longer
+        return {key: element_of(part, i) for key, part in values.items()}
     return values[i]
