@@ -22,8 +22,18 @@ from runner.loops.generators import States
 from runner.loops.values import as_given, require_reset, warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
-from runner.recording.fillers import Change, Put, PutStep, filler, step_filler
-from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, only_number
+from runner.recording.gym_values import (
+    Change,
+    Leaf,
+    Put,
+    PutStep,
+    SpaceValues,
+    StateLeaf,
+    element_of,
+    filler,
+    only_number,
+    step_filler,
+)
 from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.reset_options import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions
 from runner.recording.reset_states import ResetState

@@ -18,9 +18,8 @@ from runner.environments.games import game_spaces
 from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
-from runner.recording.fillers import filler
 from runner.recording.gym_spaces import recorded_space, value_of
-from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of
+from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, filler
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
