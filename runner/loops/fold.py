@@ -202,9 +202,9 @@ class _Fold:
                 file,
                 layout,
                 packing=packing,
-                watch=self._outcomes.take_records,
                 observer=Observer(fresh.parent),
             )
+            recorder.watch(schema.EPISODE, self._outcomes.take_episodes)
             self._recorder = recorder
             try:
                 off_table = self._copy_units()

@@ -12,9 +12,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 from blake3 import blake3
-from numpy.typing import NDArray
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
 from runner.config.job import NOT_CONTENT
@@ -23,6 +21,7 @@ from runner.loops.description import Described
 from runner.loops.fold import OWNER_WAITS, fold_if_over
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
+from runner.recording import schema
 from runner.recording.action_recorder import ActionRecorder
 from runner.recording.actions import ACTION_TOPICS
 from runner.recording.compaction import compacted
@@ -31,7 +30,6 @@ from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, write_description, write_maker, write_result
 from runner.recording.observer import Observer
 from runner.recording.recorder import Recorder
-from runner.recording.schema import Topic
 from runner.recording.syncing import SYNCER
 from runner.recording.writer import create_recording
 from runner.runs.code import CodeCollector
@@ -76,7 +74,6 @@ class LoopRun:
             packing=options.packing.packing,
             record_steps=options.steps == "all",
             beat=self._beat,
-            watch=self._watch,
             before=self.describe,
             grouped=True,
             observer=Observer(
@@ -85,6 +82,7 @@ class LoopRun:
                 LineRedactor() if options.packing.console and not is_shard else None,
             ),
         )
+        self.recorder.watch(schema.EPISODE, self.outcomes.take_episodes)
         self._actions = (
             ActionRecorder(self.recorder, described.environments, options.packing.chunk_steps)
             if options.steps == "actions"
@@ -131,11 +129,6 @@ class LoopRun:
             write_maker(self._file, phase, maker)
             mark(self.run.folder, maker)
             del self.own_makers[phase]
-
-    def _watch(self, topic: Topic, records: NDArray[np.void]) -> None:
-        self.outcomes.take_records(topic, records)
-        if self._actions is not None:
-            self._actions.take_records(topic, records)
 
     def _run_facts(self) -> dict[str, str]:
         described, mdp, run = self.described, self.described.mdp, self.run

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
-from runner.recording import schema
 from runner.recording.metrics import METRICS, RECENT_EPISODES, defined_metrics, finite_mean
 from runner.recording.schema import Topic
 
@@ -39,14 +38,14 @@ class Outcomes:
         """Values of those trials, summed over agents, by metric."""
         self._logged: dict[str, float | None] = {}
 
-    def take_records(self, topic: Topic, records: NDArray[np.void]) -> None:
-        """Add what the recorder gets, if it is records of episodes."""
-        if topic.name == schema.TRAIN_EPISODE.name:
+    def take_episodes(self, topic: Topic, records: NDArray[np.void]) -> None:
+        """Add episodes that the recorder gets."""
+        if topic.phase == "train":
             self._trained += len(records)
             last = records[-RECENT_EPISODES:]
             results = np.column_stack([last["returns"].sum(axis=1), last["length"]])
             self._recent = np.concatenate([self._recent, results])[-RECENT_EPISODES:]
-        elif topic.name == schema.EVAL_EPISODE.name:
+        else:
             if self._evaluated_after != self._trained:
                 self._evaluated_after, self._trials, self._values = self._trained, 0, {}
             self._trials += len(records)

@@ -25,15 +25,13 @@ class ActionRecorder:
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
         self._rows: list[Records] = []
         self._phase = ""
+        recorder.watch(schema.STEP, self.take_steps)
 
-    def take_records(self, topic: Topic, records: Records) -> None:
-        """Take the steps among the records that the recorder gets."""
-        if topic.message is not schema.STEP:
-            return
+    def take_steps(self, topic: Topic, records: Records) -> None:
+        """Take steps that the recorder gets."""
         if topic.phase != self._phase:
             self.commit()
             self._phase = topic.phase
-        records = self._recorder.rows(topic, records)
         rows = np.zeros(len(records), kept_dtype(records.dtype))
         for name in rows.dtype.names or ():
             if name != "digest":

@@ -41,6 +41,9 @@ _FIRST_RECORDS: Final = 256
 BLOCK_BYTES: Final = 8 << 20
 """The most bytes of a block, unless one record has more."""
 
+Watcher = Callable[[Topic, Records], None]
+"""Takes rows of a topic."""
+
 
 @dataclass
 class _Lane:
@@ -76,8 +79,6 @@ class Recorder:
         reference: what the recording already holds.
         beat: called about once a second while the recorder is in use, by the thread that writes.
         threads: False packs and writes in the thread that records.
-        watch: called with the records of a block as they are committed; the block is used again. `rows`
-            returns them as rows.
         before: called once, before the first message is written. With it, threads are started and messages
             written only when some have gathered, or by `release`, so that a short recording costs little.
         observer: what it sees of the time, the machine and the output is recorded.
@@ -95,7 +96,6 @@ class Recorder:
         reference: Reference | None = None,
         beat: Callable[[], None] = lambda: None,
         threads: bool = True,
-        watch: Callable[[Topic, Records], None] = lambda *_: None,
         before: Callable[[], None] | None = None,
         observer: Observer | None = None,
         packed: PackedChunks | None = None,
@@ -103,7 +103,7 @@ class Recorder:
     ) -> None:
         packing = replace(packing or Packing(), values=not layout.has_states)
         self._file = file
-        self._watch = watch
+        self._watchers: dict[MessageType, Watcher] = {}
         self._packed, self._grouped = packed, grouped
         self._chunk_steps = packing.chunk_steps
         self._first_records = _FIRST_RECORDS if before is not None else None
@@ -173,9 +173,9 @@ class Recorder:
         """Return the dtype of the rows of a topic."""
         return row_dtype(self._lanes[topic].message)
 
-    def rows(self, topic: Topic, records: Records) -> Records:
-        """Return records of a topic, as the block has them, as its rows."""
-        return rows_of(self._lanes[topic].message, records)
+    def watch(self, message: MessageType, watcher: Watcher) -> None:
+        """Call a function with the rows of such messages as they are committed; their block is used again."""
+        self._watchers[message] = watcher
 
     def block(self, topic: Topic) -> Records:
         """Return the free records of the topic's open block, to be filled from the first on."""
@@ -347,7 +347,8 @@ class Recorder:
             self._reference.check_new(topic, fresh)
         lane.filled += len(positions)
         self.counts[topic.name] += len(positions)
-        self._watch(topic, fresh)
+        if topic.message in self._watchers:
+            self._watchers[topic.message](topic, rows_of(lane.message, fresh))
         if has_reference:
             self._send_block(lane, write=False)
         elif (lane.open is not None and lane.filled == len(lane.open)) or (
