@@ -13,6 +13,7 @@ from typing import Any, Final, Protocol
 from runner.recording.recorder import FLUSH_SECONDS
 
 _RETRY_SECONDS: Final = 0.01
+"""When a signal that interrupted the recording of a step is sent again; a step takes microseconds."""
 
 
 class Flushable(Protocol):
@@ -40,7 +41,7 @@ class Flusher:
         self.loops: weakref.WeakSet[Flushable] = weakref.WeakSet()
         self._to_flush: weakref.WeakSet[Flushable] = weakref.WeakSet()
         self._thread: threading.Thread | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.Lock()  # for `_to_flush` and `_thread`: a loop is added, or the thread ends
 
     def add(self, loop: Flushable) -> None:
         """Flush a loop from now on, as long as its `flush` returns True; close it before SIGTERM ends it."""
@@ -64,7 +65,7 @@ class Flusher:
                     self._thread = None
                     return
             for loop in loops:
-                if not loop.flush():
+                if not loop.flush():  # without the lock: a loop that begins does not wait for slow disks
                     with self._lock:
                         self._to_flush.discard(loop)
             del loop, loops  # nothing is kept alive while the thread sleeps

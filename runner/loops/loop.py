@@ -57,6 +57,8 @@ class Loop:
         self.active: StepBuffer | None = None
         """The rows of the last step; None before any, and when the loop is closed."""
         self.options = options
+        # Reentrant: an error, or a signal, closes the loop while a step is recorded. It is taken first: with
+        # it, closing takes the observer's lock and the syncer's.
         self.lock = threading.RLock()
         self.closed = False
         self.is_foreign = False
@@ -319,7 +321,7 @@ class Loop:
         Returns whether to call it again.
         """
         self.should_stop = self.should_stop or (self.options.join or self.run).is_stop_requested
-        if not self.lock.acquire(timeout=0.1):
+        if not self.lock.acquire(timeout=0.1):  # other loops wait to be flushed by this thread
             return True
         try:
             if self.closed or self.is_foreign:

@@ -102,6 +102,7 @@ class _Thread:
     def clear(self) -> None:
         """Forget all observers and the thread."""
         self._observers: weakref.WeakSet[Observer] = weakref.WeakSet()
+        # Reentrant: a signal or a garbage collection may close another run in the thread that holds it.
         self._lock = threading.RLock()
         self._wake = threading.Event()
         self._thread: threading.Thread | None = None
@@ -132,13 +133,14 @@ class _Thread:
             if self._observers or thread is None:
                 return
             self._wake.set()
-            self._thread, self._wake = None, threading.Event()
+            self._thread, self._wake = None, threading.Event()  # another, or the next thread would stop, too
+        # Without the lock, which the thread may wait for. A garbage collection may get here in that thread.
         if thread is not threading.current_thread():
             thread.join(SAMPLE_SECONDS)  # it may wait for a driver or a disk for ever
 
     def ensure_running(self) -> None:
         """Start the thread, if it does not run."""
-        if self._thread is None:
+        if self._thread is None:  # asked again with the lock: most calls need none
             with self._lock:
                 if self._thread is None and self._observers:
                     self._thread = threading.Thread(
@@ -158,6 +160,7 @@ class _Thread:
                 return
             if due := [observer for observer in observers if observer.wants_host()]:
                 sampler = sampler or HostSampler()
+                # Without the lock: a driver may take long to answer, and a recorder never waits for that.
                 sample = sampler.sample()
                 for observer in due:
                     observer.see_host(sample)

@@ -37,7 +37,8 @@ MAX_PENDING: Final = 32
 MAX_HELD: Final = 4
 """Pieces of work that are held before threads are started; fewer than a topic has buffers."""
 SYNC_SECONDS: Final = 5.0
-"""Interval at which what was written is synced to disk."""
+"""Interval at which what was written is synced to disk: what a power failure may cost. A sync takes
+milliseconds, in which nothing is written."""
 MAX_BATCH_BYTES: Final = 1 << 18
 MAX_BATCH_MESSAGES: Final = 4096
 """A batch of messages is sent before it has more than either."""
@@ -99,6 +100,7 @@ class Pipeline:
         self._encoders: ThreadPoolExecutor | None = None
         self._writer: threading.Thread | None = None
         self._queue: queue.Queue[tuple[_Work, Future[Chunk] | None] | None]
+        """Work in order, each with its chunk to come; None ends the writer's thread."""
         self._before = before
         self._held: list[_Work] | None = None if before is None else []
         if threads and before is None:
@@ -167,7 +169,7 @@ class Pipeline:
             raise
         if threads:
             self._start()
-        for work in held:
+        for work in held:  # nothing else is sent meanwhile: the caller lets one thread send at a time
             self._enqueue(work)
 
     @property
@@ -206,7 +208,7 @@ class Pipeline:
             if self._encoders is not None and work.encode is not None:
                 with contextlib.suppress(RuntimeError):  # the interpreter is exiting: the writer encodes
                     chunk = self._encoders.submit(work.encode)
-            self._queue.put((work, chunk))
+            self._queue.put((work, chunk))  # chunks are done in any order, and written in this one
 
     def _write_queue(self) -> None:
         while True:
@@ -229,7 +231,7 @@ class Pipeline:
                     self._last_sync = now
         except BaseException as error:  # the recording thread raises it
             self.failure = error
-        work.done()
+        work.done()  # also after a failure, when nothing is written: the sender may wait for the block
         if now - self._last_beat > _BEAT_SECONDS:
             self._beat()
             self._last_beat = now

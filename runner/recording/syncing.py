@@ -36,8 +36,9 @@ class Syncer:
 
     def clear(self) -> None:
         """Forget all files, as in a forked process: they belong to the other one."""
-        self._waiting: deque[tuple[Path, Failed]] = deque()
-        self._lock, self._syncing = threading.Lock(), threading.Lock()
+        self._waiting: deque[tuple[Path, Failed]] = deque()  # safe without a lock
+        self._lock = threading.Lock()  # for the fields below; never held while files are synced
+        self._syncing = threading.Lock()  # held until all are on disk: who waits for it waits for them
         self._thread: threading.Thread | None = None
         self._is_exiting = False
         self._ends_with_process = False
