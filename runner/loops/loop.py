@@ -57,8 +57,8 @@ class Loop:
         self.active: StepBuffer | None = None
         """The rows of the last step; None before any, and when the loop is closed."""
         self.options = options
-        # Reentrant: an error, or a signal, closes the loop while a step is recorded. It is taken first: with
-        # it, closing takes the observer's lock and the syncer's.
+        # Reentrant: an error closes the loop while a step is recorded. It is taken before the observer's lock
+        # and the syncer's, by closing.
         self.lock = threading.RLock()
         self.closed = False
         self.is_foreign = False
