@@ -169,11 +169,6 @@ class Loop:
             raise RunnerError(f"run {self.run.run_id} is closed: nothing more can be recorded in it.")
         return self._recorder.position + (self.active.pending if self.active else 0)
 
-    def moment(self, rows: StepBuffer) -> tuple[int, int, int]:
-        """Return `position`, and the steps and the episode of a phase."""
-        step, episode = rows.progress
-        return self.position, step, episode
-
     def at_step(self, steps: int) -> None:
         """State how many training steps the whole run had when what is recorded from now on happened.
 

@@ -62,9 +62,6 @@ class LoopState(Protocol):
     def position(self) -> int:
         """The number of steps executed so far; raises `RunnerError` if the loop is closed."""
 
-    def moment(self, rows: StepBuffer) -> tuple[int, int, int]:
-        """Return `position`, and the steps and the episode of a phase."""
-
     def rows(self, phase: str) -> StepBuffer:
         """Return the steps of a phase; raises `ConfigError` if there is no such phase."""
 
@@ -101,7 +98,7 @@ class Messages:
         self.has_logged = False
         """Whether anything was logged."""
         self._series: dict[tuple[str, str], _Series] = {}
-        self._numbers: list[tuple[_Series, float, tuple[int, int, int]]] = []
+        self._numbers: list[tuple[_Series, float, int, int, int]] = []
         """Logged numbers that the recorder does not have yet, with position, step and episode."""
 
     def log(self, phase: str, name: str, value: object) -> None:
@@ -130,7 +127,8 @@ class Messages:
         with loop.lock:
             if loop.is_foreign and not loop.records():
                 return
-            self._numbers.append((series, value, loop.moment(series.rows)))
+            step, episode = series.rows.progress
+            self._numbers.append((series, value, loop.position, step, episode))
             if len(self._numbers) == _MAX_WAITING or len(name) > _LONG_NAME:
                 self.commit()
 
@@ -138,9 +136,10 @@ class Messages:
         """Hand logged numbers to the recorder. The caller holds the lock."""
         numbers, self._numbers = self._numbers, []
         if numbers:
-            payloads = [series.encode(value, step, episode) for series, value, (_, step, episode) in numbers]
-            self._recorder.extend(schema.SCALAR_TOPIC, payloads, [moment[0] for _, _, moment in numbers])
-            for name, value in {series.name: value for series, value, _ in numbers}.items():
+            payloads = [series.encode(value, step, episode) for series, value, _, step, episode in numbers]
+            positions = [position for _, _, position, _, _ in numbers]
+            self._recorder.extend(schema.SCALAR_TOPIC, payloads, positions)
+            for name, value in {series.name: value for series, value, *_ in numbers}.items():
                 self._outcomes.take_logged(name, value)
 
     def _log_text(self, name: str, text: str) -> None:
