@@ -14,6 +14,7 @@ import contextlib
 import queue
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -282,7 +283,7 @@ class MessageBatches:
 
     def __init__(self, send: Send) -> None:
         self._send = send
-        self._batches: dict[Topic, _Batch] = {}
+        self._batches: defaultdict[Topic, _Batch] = defaultdict(_Batch)
 
     def extend(self, topic: Topic, log_times: Sequence[int], payloads: Sequence[bytes]) -> None:
         """Add messages to their topic's batch."""
@@ -296,14 +297,12 @@ class MessageBatches:
     def add(self, topic: Topic, log_times: Sequence[int], records: Sequence[bytes]) -> None:
         """Add whole message records to their topic's batch, or to as many as they fill."""
         for log_time, record in zip(log_times, records, strict=True):
-            batch = self._batches.get(topic)
-            if batch is not None and (
+            batch = self._batches[topic]
+            if batch.times and (
                 batch.size + len(record) > MAX_BATCH_BYTES or len(batch.times) == MAX_BATCH_MESSAGES
             ):
                 self.flush_topic(topic)
-                batch = None
-            if batch is None:
-                batch = self._batches[topic] = _Batch()
+                batch = self._batches[topic]
             batch.records.append(record)
             batch.times.append(log_time)
             batch.size += len(record)
