@@ -41,6 +41,7 @@ from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import svg_file
 from runner.export.plots.style import CurveStyle
 from runner.export.plugin import installed_export
+from runner.export.reports.report import render_report
 from runner.export.rerun.cache import cached_export
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
@@ -260,6 +261,11 @@ def installed_file(path: Path, name: str) -> bytes:
         file = Path(folder) / "export"
         installed_export(name).write(recording, file)
         return file.read_bytes()
+
+
+def report(path: Path) -> bytes:
+    """Return the report of a run, a page without links to others."""
+    return render_report([path])[0].encode()
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

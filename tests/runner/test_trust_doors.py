@@ -383,6 +383,7 @@ BODIES = {
     "POST /runs/{run}/marks": {"at": "0:1"},
     "DELETE /runs/{run}/marks/{name}": {},
     "POST /runs/{run}/replay/mark": {},
+    "POST /runs/{run}/remove": {},
     "POST /runs/{run}/stop": {},
     "PATCH /runs/{run}": {"note": "x"},
 }

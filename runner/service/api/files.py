@@ -152,6 +152,14 @@ async def replay(
 
 
 @router.get(
+    "/report.html", response_class=Response, responses=FILE | BUSY_ERRORS, summary="The report of the run."
+)
+async def report(run: RecordedRun, compute: ComputationOf) -> Response:
+    """Return what `dualtaxi report` writes, as a download."""
+    return _attachment(await compute(computed.report, run.recording), f"{run.file_stem}.html")
+
+
+@router.get(
     "/exports/{name}",
     response_class=Response,
     responses=FILE | BUSY_ERRORS,
@@ -165,9 +173,13 @@ async def installed(
         raise RunNotFound(
             f"no installed package adds an export {name!r}; `dualtaxi export --help` lists them."
         )
-    file_name = f"{run.file_stem}{installed_export(name).ending}"
     body = await compute(computed.installed_file, run.recording, name, alone=True)
-    headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(file_name)}"}
+    return _attachment(body, f"{run.file_stem}{installed_export(name).ending}")
+
+
+def _attachment(body: bytes, name: str) -> Response:
+    """Return a file to be saved under a name, which a browser never shows as a page of the service."""
+    headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
     return Response(body, media_type=MEDIA, headers=headers)
 
 

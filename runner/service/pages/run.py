@@ -17,11 +17,12 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from runner.analysis.axes import EPISODES
 from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
 from runner.client.jobs import RunProgress
-from runner.errors import RecordingError, RunnerError
+from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining, has_environment
+from runner.runs.catalogue.removal import clean, plan, remove
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
 from runner.service import fragments
@@ -101,6 +102,22 @@ def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) ->
     except RunnerError as error:
         return _overview(request, run, jobs, settings, problem=message_of(error, request))
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
+
+
+@router.post("/remove")
+def remove_run(
+    request: Request, run: FoundRun, form: Form, jobs: JobsOf, catalogue: CatalogueOf, settings: SettingsOf
+) -> Response:
+    """Remove a run for good, once that was confirmed by its id."""
+    try:
+        if form.get("confirm", "").strip() != run.run_id:
+            raise ConfigError(f"To remove the run and its recording for good, type its id, {run.run_id}.")
+        remove(plan(run, run.folder.parent))
+        clean(run.folder.parent)
+    except RunnerError as error:
+        return _overview(request, run, jobs, settings, problem=message_of(error, request))
+    catalogue.changed()
+    return RedirectResponse("/runs", HTTPStatus.SEE_OTHER)
 
 
 @router.get("/status")

@@ -8,6 +8,8 @@ import re
 from checked_pages import ACCEPT_HTML, page_of
 from submitted import ICY
 
+from runner.runs.resolve import find_run
+from runner.runs.run import label
 from tests.waiting import until
 
 
@@ -47,7 +49,7 @@ def test_mistakes_are_shown_at_their_lines(client):
 
 
 def test_a_form_of_another_site_is_refused(client):
-    for address in ("/submit", "/runs/first/labels", "/queue/1/cancel"):
+    for address in ("/submit", "/runs/first/labels", "/runs/first/remove", "/queue/1/cancel"):
         answer = client.post(address, data={"text": "name: x"}, headers={"Origin": "http://evil.example"})
         assert answer.status_code == 403
 
@@ -75,3 +77,26 @@ def test_the_page_of_a_finished_job_links_to_its_run_and_requests_no_events(clie
     assert re.search(r"ago, finished <time[^>]* data-age>[^<]+</time> ago, took [\d.]+ s<", page)
     place = re.search(r'data-place="(\d+)"', page)[1]
     assert client.get(f"/api/v1/jobs/{number}/events?after={place}").status_code == 204
+
+
+def test_a_run_is_removed_when_its_id_is_typed(client, recordings):
+    run = find_run("first", recordings)
+    for typed in ("", "first", find_run("second", recordings).run_id):
+        answer = client.post("/runs/first/remove", data={"confirm": typed}, headers=ACCEPT_HTML)
+        assert (answer.status_code, f"type its id, {run.run_id}" in answer.text) == (400, True)
+    label(run, tag=["keep"])
+    answer = client.post("/runs/first/remove", data={"confirm": run.run_id}, headers=ACCEPT_HTML)
+    assert (answer.status_code, "it is tagged keep" in answer.text) == (400, True)
+    label(run, untag=["keep"])
+    answer = client.post("/runs/first/remove", data={"confirm": run.run_id}, follow_redirects=False)
+    assert (answer.status_code, answer.headers["location"]) == (303, "/runs")
+    assert not run.folder.exists()
+    assert "1 run" in page_of(client, "/runs")
+
+
+def test_a_report_is_downloaded_and_not_shown_as_a_page(client):
+    answer = client.get("/api/v1/runs/first/report.html")
+    assert answer.headers["content-disposition"].startswith("attachment")
+    assert "text/html" not in answer.headers["content-type"]
+    assert answer.text.startswith("<!doctype html>")
+    assert "http" not in "".join(re.findall(r'(?:src|href)="([^"]*)"', answer.text))
