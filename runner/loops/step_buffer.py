@@ -45,9 +45,14 @@ MAX_SEED: Final = 2**64 - 1
 _MAX_STATE: Final = 2**32 - 1
 _RESET: Final = [("row", "<i8"), ("environment", "<i8"), ("seed", "<u8"), ("seeded", "?")]
 """What is kept of a reset until it is recorded, besides its observation: the row that comes after it."""
-_OF_GAMES: Final = ("acted", "agents_terminated", "agents_truncated")
+_OF_AGENTS: Final = ("acted", "agents_terminated", "agents_truncated")
+"""The columns that have a bit for each agent; steps of one environment alone have none of them."""
 _TRUE: Final = b"\1"
 _NO_STATES: Final[States] = {}
+
+
+def _columns_of_agents(steps: np.dtype[np.void]) -> tuple[str, ...]:
+    return tuple(name for name in _OF_AGENTS if name in (steps.names or ()))
 
 
 class StepBuffer:
@@ -74,9 +79,13 @@ class StepBuffer:
     ) -> None:
         self._recorder, self._first_action, self._mode = recorder, first_action, mode
         self._phase, self._topics = phase, schema.topics_of(phase)
-        self._mdp, self._n = described.mdp, described.environments
+        self._mdp, self._n, self._has_turns = (
+            described.mdp,
+            described.environments,
+            described.layout.has_turns,
+        )
         self._batch = () if mode is None else (self._n,)
-        self._is_game, self._has_turns = described.layout.kind == "game", described.layout.has_turns
+        self._of_agents = _columns_of_agents(recorder.dtype(self._topics.steps))
         self._learners = recorder.dtype(self._topics.episodes)["returns"].shape[0]
         self._log = EpisodeLog(self._n, self._learners, self._mdp, self._has_turns, zero=-0.0)
         self._dtype = recorder.dtype(self._topics.resets)["observation"]
@@ -131,7 +140,7 @@ class StepBuffer:
 
     def _values(self, space: Any, what: str) -> SpaceValues:
         leaf = StateLeaf if self._starts and not self._batch else Leaf
-        return SpaceValues(space, what, warn_user, leaf, self._is_game)
+        return SpaceValues(space, what, warn_user, leaf, bool(self._of_agents))
 
     def _filler(self, values: SpaceValues, column: Any) -> Put:
         """Return a function that puts values of all environments into a row of a column, [rows, N]."""
@@ -152,7 +161,7 @@ class StepBuffer:
             self._ended += int(np.count_nonzero(self._ends[self._counted : self.filled].any(axis=1)))
             self._counted = self.filled
         episode = self._log.ended + self._ended
-        if not self._batch and not self._is_game and self._idle_at == self.filled:
+        if not self._batch and not self._of_agents and self._idle_at == self.filled:
             episode = max(episode - 1, 0)
         return self._recorder.steps[self._phase] + self.filled * self._n, episode
 
@@ -323,7 +332,7 @@ class StepBuffer:
         marks = np.zeros(len(rows), self._marks.dtype)
         marks["environment"] = environment
         marks["begins"] = rows["t"] == 0  # also after a game that ended without the end of any agent
-        for name in _OF_GAMES if self._is_game else ():
+        for name in self._of_agents:
             marks[name] = rows[name]
         ends = np.stack([rows["terminated"], rows["truncated"]], axis=1)[..., np.newaxis]
         self._extend(action[:, np.newaxis], after[:, np.newaxis], rows["rewards"], ends, marks)
@@ -461,7 +470,7 @@ class StepBuffer:
         self._first_action(action)
         room, n = max(1, self._recorder.capacity(self._topics.steps) // self._n), self._n
         self._room = self._full_at = room
-        masks = [(name, "<u4") for name in (*_OF_GAMES, "environment")]
+        masks = [(name, "<u4") for name in (*_OF_AGENTS, "environment")]
         self._marks = np.zeros(room, [*masks, ("over", "?"), ("begins", "?")])
         action = self._recorder.dtype(self._topics.steps)["action"]
         dtypes = {"action": np.dtype(np.int64) if self._starts else action, "observation": self._dtype}
@@ -480,7 +489,7 @@ class StepBuffer:
             return
         self._put_action = self._filler(self._action, self._actions)
         self._put_observation = self._filler(self._observation, self._observations)
-        if not (self._batch or self._is_game or self._are_bytes):
+        if not (self._batch or self._of_agents or self._are_bytes):
             self._bytes = None if self._starts else rows.view(np.uint8).data
             self._put, self.keep = step_filler(
                 self._action, self._observation, rows, self._put_parts, self._copied
@@ -509,7 +518,7 @@ class StepBuffer:
             self._hold(self._put_action(row, action))
         self._hold(self._put_observation(row, observation))
         try:
-            self._rewards[row] = rewards if self._is_game else float(rewards)
+            self._rewards[row] = rewards if self._of_agents else float(rewards)
         except (TypeError, ValueError):
             self._rewards[row] = only_number(rewards, "reward")
         self._ends[row] = [[bool(terminated)], [bool(truncated)]]
@@ -608,8 +617,7 @@ class StepBuffer:
         """
         actions, after = self._actions[:rows], self._observations[:rows]
         if not self._starts:
-            names = _OF_GAMES if self._is_game else ()
-            marks = {name: self._marks[name][:rows, np.newaxis] for name in names}
+            marks = {name: self._marks[name][:rows, np.newaxis] for name in self._of_agents}
             return {"action": actions, "next_observation": after, **marks}
         least_state, least_action = self._starts
         state = np.vstack([self._state, after])
