@@ -25,6 +25,7 @@ from runner.cli.parameter_types import (
     TRIAL,
     ConfigName,
     RunName,
+    RunOrFilter,
 )
 from runner.runs.run import recordings_folder
 from runner.util.values import Ranges
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 run_argument: Final = argument(metavar="RUN", type=RunName())
 runs_argument: Final = argument(metavar="RUN...", nargs=-1, required=True, type=RunName())
+compared_argument: Final = argument(metavar="RUN...", nargs=-1, required=True, type=RunOrFilter())
 config_argument: Final = argument(metavar="CONFIG", type=ConfigName())
 filter_argument: Final = argument(metavar="[FILTER]...", nargs=-1, type=FILTER_WORD)
 

@@ -75,6 +75,17 @@ class RunName(Completed):
         return "`dualtaxi ls` lists the runs; @latest is the newest."
 
 
+class RunOrFilter(RunName):
+    """The name of runs, or a filter of runs; completes names, else the fields of a filter."""
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        """Return ids and names, newest first; without any, the fields."""
+        names = super().shell_complete(ctx, param, incomplete)
+        return names or FILTER_WORD.shell_complete(ctx, param, incomplete)
+
+
 def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
     try:
         return completions(incomplete, recordings_folder(ctx.params.get("recordings")))
@@ -110,13 +121,18 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
     return {each.name: each.about for each in shipped().values()}
 
 
-def _filter_words(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
-    before = re.sub(r"[\w.]*$", "", incomplete)
-    if re.search(r"\bstatus *[!=]= *[\"']$", before):
-        return {f"{before}{status}{before[-1]}": "" for status in columns.STATUSES}
-    words = {name: field.meaning for name, field in columns.FIELDS.items()}
-    words[columns.SETTING] = "a value of the configuration, such as config.discount"
-    return {before + word: meaning for word, meaning in words.items()}
+class Expression(Completed):
+    """An expression; completes the names in it, each with its meaning."""
+
+    def __init__(self, name: str, words: Mapping[str, str]) -> None:
+        super().__init__(name, lambda _ctx, incomplete: self._completed(incomplete))
+        self.words = words
+
+    def _completed(self, incomplete: str) -> Mapping[str, str]:
+        before = re.sub(r"[\w.]*$", "", incomplete)
+        if "status" in self.words and re.search(r"\bstatus *[!=]= *[\"']$", before):
+            return {f"{before}{status}{before[-1]}": "" for status in columns.STATUSES}
+        return {before + word: meaning for word, meaning in self.words.items()}
 
 
 def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
@@ -176,7 +192,11 @@ def _axis(text: str) -> Axis:
 
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
-FILTER_WORD: Final = Completed("filter", _filter_words)
+FILTER_WORD: Final = Expression(
+    "filter",
+    {name: field.meaning for name, field in columns.FIELDS.items()}
+    | {columns.SETTING: "a value of the configuration, such as config.discount"},
+)
 EPISODE: Final = Parsed(
     "episode", "N, train:N, eval:N:TRIAL, typical, best, worst or last, without a step", _episode
 )

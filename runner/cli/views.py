@@ -14,7 +14,7 @@ from runner.cli.options import (
     run_argument,
 )
 from runner.cli.output import draw, facts, files_written, print_json, print_sections, say
-from runner.cli.parameter_types import FILE, INDEX
+from runner.cli.parameter_types import FILE, INDEX, Expression
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
 from runner.export.places import new_file, require_new
@@ -55,7 +55,10 @@ def command_of(view: View) -> Command:
         if output is not None:
             say(f"Written: {output.absolute()}")
 
-    declared = {"run_name": run_argument, **{name: _declared(each) for name, each in view.inputs.items()}}
+    declared = {
+        "run_name": run_argument,
+        **{name: _declared(each, view) for name, each in view.inputs.items()},
+    }
     if view.file_ending:
         output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=view.file_help)
         declared |= {"output": output, "force": force_option}
@@ -67,10 +70,10 @@ def command_of(view: View) -> Command:
     return Command(view.name, call, declared, help=view.help)
 
 
-def _declared(given: Input) -> Declared:
-    """Return the argument or option of an input."""
+def _declared(given: Input, view: View) -> Declared:
+    """Return the argument or option of an input; an argument completes the words that the view lists."""
     if given.required:
-        return argument(metavar=given.name.upper())
+        return argument(metavar=given.name.upper(), type=Expression(given.name, view.words))
     flag = f"--{given.name}"
     if given.kind is bool:
         return option(flag, is_flag=True, help=given.help)

@@ -80,13 +80,21 @@ def run_of_id(run_id: str, recordings: Path) -> Run | None:
 
 
 def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:
-    """Return all runs of a name, the oldest first; else the run that `find_run` returns.
+    """Return all runs of a name or a filter, the oldest first; else the run that `find_run` returns.
 
     Raises:
         RunNotFound: no run matches, or the name is a prefix of several ids.
+        RunnerError: the filter is none.
     """
+    from runner.runs.catalogue.filters import is_expression, parse
     from runner.runs.catalogue.index import look
 
+    if is_expression(name) and not os.path.lexists(name):
+        chosen = parse(name)
+        matches = look([recordings], lambda index: index.candidates(chosen), report)
+        if not matches:
+            raise RunNotFound(f"no run in {recordings} matches {name}. `dualtaxi ls` lists the runs.")
+        return [candidate.run() for candidate in reversed(matches)]
     runs = look([recordings], lambda index: of_name(name, index), report, quick=True)
     return [candidate.run() for candidate in runs] or [find_run(name, recordings, report=report)]
 

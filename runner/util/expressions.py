@@ -139,14 +139,20 @@ class Parser(ABC, Generic[Part]):
 
     def error(self, node: ast.expr, message: str) -> RunnerError:
         """Return the error that marks a node in the expression."""
-        start = len(self._data[: node.col_offset].decode())
-        return self.marked(start, len(self.text_of(node)), message)
+        return RunnerError(f"{self.what}: {message}{self.lines_of(node)}")
 
     def marked(self, start: int, length: int, message: str) -> RunnerError:
         """Return the error that marks a place in the expression."""
+        return RunnerError(f"{self.what}: {message}{self._lines(start, length)}")
+
+    def lines_of(self, node: ast.expr) -> str:
+        """Return the lines with which an error shows the expression, and marks a node in it."""
+        return self._lines(len(self._data[: node.col_offset].decode()), len(self.text_of(node)))
+
+    def _lines(self, start: int, length: int) -> str:
         first = max(0, start - _AROUND)
         shown, marks = self.text[first : start + _AROUND], "^" * min(length, _AROUND)
-        return RunnerError(f"{self.what}: {message}\n  {shown}\n  {' ' * (start - first)}{marks}")
+        return f"\n  {shown}\n  {' ' * (start - first)}{marks}"
 
     def text_of(self, node: ast.expr) -> str:
         """Return a node's own text."""

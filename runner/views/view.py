@@ -115,3 +115,13 @@ class View:
         """The rows of the list that the page shows: what may be written, and what it means."""
         lines = self.help.partition(f"{self.list_title}:\n")[2].partition("\n\n")[0].splitlines()
         return dict(re.split(" {2,}", line.strip(), maxsplit=1) for line in lines if self.list_title)
+
+    @property
+    def words(self) -> dict[str, str]:
+        """The names in that list, such as `q` of `q[S, A]`, and their meanings."""
+        return {
+            word: meaning
+            for names, meaning in self.list_rows.items()
+            for word in re.findall(r"[\w.]+", names)
+            if word.islower() and "." not in word
+        }

@@ -12,6 +12,7 @@ from runner.cli.command import Command, argument, option
 from runner.cli.options import (
     all_option,
     axis_option,
+    compared_argument,
     force_option,
     html_option,
     json_option,
@@ -19,7 +20,6 @@ from runner.cli.options import (
     normalise_option,
     recordings_option,
     require_one,
-    runs_argument,
     target_option,
 )
 from runner.cli.output import echo, print_json, print_sections, require_page, say
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 
 @click.command("compare", cls=Command)
 def compare_command(
-    run_names: tuple[str, ...] = runs_argument,
+    run_names: tuple[str, ...] = compared_argument,
     by: str | None = option(
         "--by", metavar="PATH", help="Group by a value of the configuration, such as discount."
     ),
@@ -75,10 +75,11 @@ def compare_command(
 ) -> None:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 
-    Runs that differ in nothing but the seed are one group; the name of several runs stands for all of them.
-    Groups are compared seed by seed, as runs of one seed share their draws. For each metric: median and
-    interquartile mean (IQM) with a 95 % bootstrap interval; for each pair of groups the differences, and the
-    probability that a run of A is better than one of B; and the share of runs that reach a level.
+    Runs that differ in nothing but the seed are one group; the name of several runs stands for all of them,
+    and a filter, as in `dualtaxi ls`, for the runs that match it. Groups are compared seed by seed, as runs
+    of one seed share their draws. For each metric: median and interquartile mean (IQM) with a 95 % bootstrap
+    interval; for each pair of groups the differences, and the probability that a run of A is better than one
+    of B; and the share of runs that reach a level.
 
     With --normalise, algorithms are compared over several environments by normalised scores: IQM, median,
     mean and optimality gap, the probability of improvement, performance profiles and sample-efficiency
@@ -91,6 +92,7 @@ def compare_command(
       dualtaxi compare cooperative competitive
       dualtaxi compare first second third --metric mean_length --moment 10000
       dualtaxi compare ppo dqn --at-step 100000
+      dualtaxi compare 'status == "finished" and 0.9 < config.discount < 1' --by discount
       dualtaxi compare sweep --by discount --target success_percent=80
       dualtaxi compare ppo dqn --normalise scores.csv --metric training.mean_return
       dualtaxi compare cooperative competitive --html comparison.html

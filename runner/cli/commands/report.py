@@ -12,9 +12,9 @@ from runner.cli.command import Command, option
 from runner.cli.options import (
     Writing,
     axis_option,
+    compared_argument,
     curve_options,
     normalise_option,
-    runs_argument,
     writing_options,
 )
 from runner.cli.output import require_page, say
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 @click.command("plot", cls=Command)
 def plot_command(
-    run_names: tuple[str, ...] = runs_argument,
+    run_names: tuple[str, ...] = compared_argument,
     axis: Axis = axis_option,
     style: CurveStyle = curve_options,
     normalise: str | None = normalise_option,
@@ -45,7 +45,8 @@ def plot_command(
 
     Runs that differ in nothing but the seed are drawn as one line, their interquartile mean, with its 95 %
     interval as a band; below four runs, their mean and range. A run that was recorded twice counts once, with
-    a message. A name shared by several runs stands for all of them.
+    a message. A name shared by several runs stands for all of them, and a filter, as in `dualtaxi ls`, for
+    the runs that match it.
 
     With --normalise the figure has normalised scores over environments instead, as in `dualtaxi compare`:
     aggregates, performance profiles and sample-efficiency curves of the returns.
@@ -151,7 +152,7 @@ def _plot_sweep(name: str, recordings: Path, to: Writing) -> None:
 
 @click.command("report", cls=Command)
 def report_command(
-    run_names: tuple[str, ...] = runs_argument,
+    run_names: tuple[str, ...] = compared_argument,
     episodes: tuple[EpisodeRef, ...] = option(
         "--episode",
         type=EPISODE,
@@ -175,7 +176,7 @@ def report_command(
 
     It has the plots, what was learned before, in the middle of and after training, all evaluations, the
     configuration and provenance, and a replay of the best and the worst trial of the last evaluation and
-    of the first and the last training episode. It needs no network.
+    of the first and the last training episode. It needs no network. Runs are named as for `dualtaxi plot`.
 
     The page of a sweep, given by its name, has the objective against each parameter, parallel coordinates,
     the ranking, what mattered, and the learning curves of the best and the median trial.

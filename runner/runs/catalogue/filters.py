@@ -40,8 +40,6 @@ _FLIPPED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
     ast.Gt: ast.Lt,
     ast.GtE: ast.LtE,
 }
-_ITEM: Final = re.compile(r"""\[["']?([^]"']*)["']?\]""")
-"""A part of a path in brackets: `config["lambda"]`, `config.branches[0]`."""
 _NUMBERS: Final = (ColumnKind.NUMBER, ColumnKind.SIZE, ColumnKind.AGE)
 _SEEDS: Final = range(2 * SEED_SHIFT)
 _AMOUNT: Final = re.compile(r"(\d{1,15}(?:\.\d+)?)\s*([a-z]*)", re.IGNORECASE)
@@ -55,8 +53,8 @@ class Filter:
 
     condition: Sql | None
     """The condition on a row; None if any row matches."""
-    settings: frozenset[str] = frozenset()
-    """The paths of configurations in it."""
+    settings: frozenset[tuple[str, str]] = frozenset()
+    """The paths of configurations in it, and the lines of an error that mark each."""
 
     def also(self, condition: Sql) -> Filter:
         """Return the filter for rows that match another condition as well."""
@@ -76,6 +74,11 @@ def parse(text: str, now: datetime | None = None) -> Filter:
         RunnerError: it is no filter, or has an unknown field; the message shows the place.
     """
     return FilterParser(text, now or datetime.now(UTC)).parse() if text.strip() else ANY_RUN
+
+
+def is_expression(text: str) -> bool:
+    """Return whether a text is an expression, not words to search for."""
+    return bool(_SIGNS.search(text) or _WORDS & set(text.split()))
 
 
 @dataclass(frozen=True)
@@ -121,12 +124,12 @@ class FilterParser(Parser[FilterPart]):
     def __init__(self, text: str, now: datetime) -> None:
         super().__init__(text)
         self._now = now
-        self._settings: set[str] = set()
+        self._settings: set[tuple[str, str]] = set()
         self._selects = False
 
     def parse(self) -> Filter:
         """Return the parsed filter."""
-        if _SIGNS.search(self.text) or _WORDS & set(self.text.split()):
+        if is_expression(self.text):
             condition = self.whole()
             if not self._selects:
                 raise RunnerError(f"filter: found {self.text}, expected a field in it.")
@@ -153,8 +156,8 @@ class FilterParser(Parser[FilterPart]):
             return self.marked(term.start(), len(term[0]), message)
         if "decimal" in error.msg:
             error.msg += " (a date, an age or a size is put in quotes)"
-        if "unterminated" in error.msg:
-            error.msg += """ (put words to search for in quotes: "O'Brien")"""
+        if '"' not in self.text and ("unterminated" in error.msg or not _SIGNS.search(self.text)):
+            error.msg += f' (put words to search for in quotes: "{self.text}")'
         return super().syntax_error(error)
 
     def fixed(self, value: float | str) -> FilterPart:
@@ -219,7 +222,7 @@ class FilterParser(Parser[FilterPart]):
 
     def named(self, node: ast.expr) -> FilterPart:
         """Return a column."""
-        name = _ITEM.sub(r".\1", self.text_of(node))
+        name = self._path(node)
         try:
             column = _column(name)
         except RunnerError as error:
@@ -227,7 +230,7 @@ class FilterParser(Parser[FilterPart]):
         self._selects = True
         if column.name.startswith(SETTING):
             path = column.name.removeprefix(SETTING)
-            self._settings.add(path)
+            self._settings.add((path, self.lines_of(node)))
             at = setting_path(path)
             stored, kind = Sql("json_extract(settings, ?)", (at,)), Sql("json_type(settings, ?)", (at,))
             number = _sql("CASE WHEN {} IN ('integer', 'real') THEN {} END", kind, stored)
@@ -238,6 +241,22 @@ class FilterParser(Parser[FilterPart]):
         elif column.kind in TEXT_KINDS:
             stored = Sql(f"NULLIF({sql.text}, '')")
         return FilterPart(NUMBER if column.kind in _NUMBERS else column.name, sql, column, stored)
+
+    def _path(self, node: ast.expr) -> str:
+        """Return the name of a column, with dots for brackets: `config["lambda"]`, `config.branches[0]`."""
+        match node:
+            case ast.Name(id=name):
+                return name
+            case ast.Attribute(value=value, attr=name):
+                return f"{self._path(value)}.{name}"
+            case ast.Subscript(value=value, slice=ast.Constant(value=int() | str() as item)):
+                return f"{self._path(value)}.{item}"
+        wrong = node.slice if isinstance(node, ast.Subscript) else node
+        raise self.error(
+            wrong,
+            f"found {self.text_of(wrong)}, expected a field; a key or an item of the configuration is "
+            'written config["KEY"] or config.KEY[0].',
+        )
 
     def _compared_column(
         self, node: ast.Compare, term: FilterPart, column: Column, operator: type[ast.cmpop], value: Any

@@ -214,6 +214,11 @@ class CatalogueIndex:
         """Return the newest runs, of a name if one is given."""
         return self._names(Sql("name = ?", (text(name),)) if name else None, limit)
 
+    def candidates(self, chosen: Filter) -> list[Candidate]:
+        """Return the runs that match a filter, the newest first."""
+        self._check_settings(chosen)
+        return self._names(chosen.condition)
+
     def _names(self, condition: Sql | None, limit: int = -1) -> list[Candidate]:
         columns = "root, entry, id AS run_id, name, seed, created AS milliseconds"
         part = Sql("ORDER BY created DESC, id DESC LIMIT ?", (limit,))
@@ -239,13 +244,13 @@ class CatalogueIndex:
         Raises:
             RunnerError: it has one; the message suggests a similar path.
         """
-        for path in sorted(chosen.settings):
+        for path, lines in sorted(chosen.settings):
             kind = Sql("json_type(settings, ?) IS NOT NULL", (setting_path(path),))
             if self._query("1", Filter(kind), Sql("LIMIT 1")).fetchone() or not self.count():
                 continue
             newest = self._query("settings", ANY_RUN, Sql("ORDER BY created DESC LIMIT 200"))
             paths = {path for (settings,) in newest for path in json.loads(settings)}
-            raise RunnerError(f"filter: no run's configuration has {path!r}.{nearest(path, paths)}")
+            raise RunnerError(f"filter: no run's configuration has {path!r}.{nearest(path, paths)}{lines}")
 
 
 def look(

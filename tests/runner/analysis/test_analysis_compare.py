@@ -325,6 +325,8 @@ def test_the_command_prints_text_json_and_markdown(command):
     assert [metric["line"] for metric in as_json["metrics"]] == ["taxi_1", "taxi_2"]
     assert as_json["metrics"][0]["groups"][0]["seeds"] == [0, 1, 2]
     assert command("near", "far", "--markdown").stdout.startswith("## Groups")
+    filtered = json.loads(command('seed < 2 and name in ("near", "far")', "--json").stdout)
+    assert [group["seeds"] for group in filtered["metrics"][0]["groups"]] == [[0, 1], [0, 1]]
     by_value = command("near", "far", "--by", "discount", "--moment", "10")
     assert "discount = 0.95" in by_value.stdout
 
@@ -340,6 +342,8 @@ def test_the_command_prints_text_json_and_markdown(command):
         (["near", "far", "--moment", "14"], "the nearest are those after 10 and 20"),
         (["near", "far", "--by", "tables"], "expected two values"),
         (["near", "nobody"], "nobody"),
+        (["seed > 7"], "matches seed > 7"),
+        (["name = 'near'"], "equality is =="),
     ],
 )
 def test_what_cannot_be_compared_is_reported_with_exit_code_2(command, words, expected):

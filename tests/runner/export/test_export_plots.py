@@ -184,6 +184,8 @@ def test_a_name_stands_for_all_its_runs(pictured, tmp_path):
     runs = [pictured("lake", name="trio", seed=seed) for seed in (1, 2, 3)]
     words = ("trio", "--recordings", runs[0].folder.parent, "-o", tmp_path / "p.svg")
     assert "of 3 runs" in plot(*words).stdout
+    few = ("seed > 1 and name == 'trio'", "--recordings", runs[0].folder.parent, "-o", tmp_path / "few.svg")
+    assert "of 2 runs" in plot(*few).stdout
 
 
 def test_errors_name_the_problem(pictured, tmp_path):

@@ -339,7 +339,14 @@ def test_any_text_is_a_filter_or_refused_with_its_place(folder, text):
     ("text", "message"),
     [
         ("sede == 3", "Did you mean 'seed'?"),
-        ("config.discuont == 3", "Did you mean 'discount'?"),
+        (
+            "seed == 3 and config.discuont == 3",
+            "Did you mean 'discount'?\n  seed == 3 and config.discuont == 3\n                ^^^^^^^^^^^^^^^",
+        ),
+        ("config[1+1] == 3", "config.KEY[0].\n  config[1+1] == 3\n         ^^^"),
+        ("config[seed] == 3", "found seed, expected a field"),
+        ("config[0:1] == 3", "found 0:1, expected a field"),
+        ("in winter", 'put words to search for in quotes: "in winter"'),
         ('status == "finishd"', "Did you mean 'finished'?"),
         ('name == "a" and', "invalid syntax"),
         ("seed == 3)", "unmatched ')'\n  seed == 3)\n           ^"),
