@@ -197,7 +197,7 @@ class RemoteJob:
     workers: int
     """How many workers of the server it holds while it is running."""
     error: str
-    progress: Json | None
+    progress: JobProgress | None
     """Its progress, if it is running and its worker has reported any."""
     begun: dict[int, str]
     """The ids of started runs by seed; empty for a sweep, whose runs have the tag sweep=NAME."""

@@ -13,9 +13,11 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel
+from pydantic_core import ErrorDetails
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
+from runner.config.problems import found
 from runner.errors import (
     ConfigError,
     Diverged,
@@ -44,6 +46,30 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     RunNotFound: HTTPStatus.NOT_FOUND,
     StorageError: HTTPStatus.INSUFFICIENT_STORAGE,
 }
+
+
+_EXPECTED: Final = {
+    **dict.fromkeys(("int_parsing", "int_parsing_size", "int_type", "int_from_float"), "a whole number"),
+    **dict.fromkeys(("float_parsing", "float_type", "finite_number"), "a number"),
+    **dict.fromkeys(("bool_parsing", "bool_type"), "true or false"),
+    "dict_type": "a mapping",
+    "enum": "{expected}",
+    "greater_than": "more than {gt}",
+    "greater_than_equal": "{ge} or more",
+    "json_invalid": "JSON ({error})",
+    "less_than": "less than {lt}",
+    "less_than_equal": "{le} or less",
+    "list_type": "a list",
+    "literal_error": "{expected}",
+    "model_attributes_type": "a mapping",
+    "string_pattern_mismatch": "text that matches {pattern}",
+    "string_too_long": "{max_length:,} characters at most",
+    "string_too_short": "{min_length} characters at least",
+    "string_type": "text",
+    "too_long": "{max_length:,} values at most",
+    "too_short": "{min_length} values at least",
+}
+"""What was expected, by the type of an error of Pydantic."""
 
 
 class HttpProblem(BaseModel):
@@ -149,10 +175,25 @@ async def _http_error(request: Request, error: Exception) -> Response:
 async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
     assert isinstance(error, RequestValidationError)
     problems = [
-        HttpProblem(path=".".join(map(str, each["loc"])), message=str(each["msg"])) for each in error.errors()
+        HttpProblem(path=".".join(map(str, detail["loc"])), message=_in_words(detail))
+        for detail in error.errors()
     ]
     message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
     return json_error(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))
+
+
+def _in_words(detail: ErrorDetails) -> str:
+    """Return what was found in a parameter or a field, and what was expected."""
+    if detail["type"] == "missing":
+        return "missing"
+    if detail["type"] == "extra_forbidden":
+        return "unknown key"
+    expected = _EXPECTED.get(detail["type"], detail["msg"]).format_map(detail.get("ctx", {}))
+    if detail["type"] == "json_invalid":
+        return f"expected {expected}"
+    value = detail["input"]
+    given = "a body without the type application/json" if isinstance(value, bytes) else found(value)
+    return f"found {given}, expected {expected}"
 
 
 async def _disconnected(request: Request, error: Exception) -> Response:  # noqa: ARG001

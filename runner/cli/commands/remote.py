@@ -248,10 +248,18 @@ def jobs(limit: int = limit_option(20), server: Server = server_options, as_json
         print_json({"jobs": [_job_as_json(job) for job in newest]})
     elif newest:
         rows = [
-            (str(job.number), job.kind, job.name, job.state, f"{job.runs:,}", str(job.workers))
+            (
+                str(job.number),
+                job.kind,
+                job.name,
+                job.state,
+                job.progress.text if job.progress else "",
+                f"{job.runs:,}",
+                str(job.workers),
+            )
             for job in newest
         ]
-        left = ("kind", "name", "state")
+        left = ("kind", "name", "state", "progress")
         draw(table("job", *left, "runs", "workers", rows=rows, left=left, shrinking=("name",)))
     else:
         say("No jobs yet. `dualtaxi remote submit FILE` submits one.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 from click.testing import CliRunner
 
 import runner
@@ -53,10 +54,32 @@ def test_a_wrong_filter_is_refused_with_a_suggestion(client):
     assert "Did you mean 'status'?" in answer.json()["error"]["message"]
 
 
-def test_an_invalid_parameter_is_named(client):
-    answer = client.get("/api/v1/runs", params={"limit": "many"})
+@pytest.mark.parametrize(
+    ("method", "address", "sent", "message"),
+    [
+        ("GET", "runs?limit=many", {}, "query.limit: found 'many', expected a whole number"),
+        ("GET", "runs?limit=-1", {}, "query.limit: found '-1', expected 0 or more"),
+        ("GET", "jobs/0", {}, "path.number: found '0', expected 1 or more"),
+        ("GET", "runs/first/when", {}, "query.expression: missing"),
+        ("GET", "runs/first/stepss/train.arrow", {}, "expected 'steps' or 'episodes'"),
+        (
+            "POST",
+            "jobs?source=a/b",
+            {"content": "x"},
+            "query.source: found 'a/b', expected text that matches",
+        ),
+        ("POST", "explanations", {"content": "{"}, "body: found a body without the type application/json"),
+        ("POST", "explanations", {"json": [1]}, "body: found a list of 1, expected a mapping"),
+        ("POST", "explanations", {"json": {"a": 3}}, "body.a: found 3, expected text; body.b: missing"),
+        ("POST", "explanations", {"json": {"a": "x", "b": "y", "c": 1}}, "body.c: unknown key"),
+    ],
+)
+def test_an_invalid_parameter_is_named_with_what_was_expected(client, method, address, sent, message):
+    answer = client.request(method, f"/api/v1/{address}", **sent)
     assert answer.status_code == 422
-    assert answer.json()["error"]["problems"][0]["path"] == "query.limit"
+    error = answer.json()["error"]
+    assert message in error["message"]
+    assert error["problems"][0]["path"] == error["message"].partition(":")[0]
 
 
 def test_a_run_begun_after_the_last_scan_is_found_at_once(client, recordings):

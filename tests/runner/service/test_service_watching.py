@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 
 import pytest
+from click.testing import CliRunner
 from served import Served
 from submitted import ENDLESS, ICY
 
+from runner.cli import cli
 from runner.client.client import Client
 from runner.client.connection import ServerError
 from runner.client.jobs import BestTrial, JobEvent, LogEvent, RemoteJob, SweepProgress, parse_events
@@ -53,6 +56,12 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
         second = client.submit(json.dumps(ICY), "icy.yaml")
         assert (second.name, second.state, second.runs) == ("icy", "queued", 2)
         assert [job.number for job in client.jobs()] == [second.number, first.number]
+        server.until(lambda jobs: (jobs[first.number]["progress"] or {}).get("episode", 0) > 0)
+        listed = CliRunner().invoke(cli, ["remote", "jobs", "--server", server.url]).stdout
+        assert re.search(
+            rf"^ *{first.number} .* running +\d[\d,]* of \d[\d,]* episodes", listed, re.MULTILINE
+        )
+        assert re.search(rf"^ *{second.number} .* queued  ", listed, re.MULTILINE)
         assert client.cancel(first.number).is_over
         *_, last = client.watch(second.number)
         assert last.kind == "state"
