@@ -30,9 +30,13 @@ def _do_job(context: click.Context, _parameter: click.Parameter, folder: Path | 
     from runner.api import interruptible
     from runner.client.jobs import EventData, JobEvent
     from runner.service.jobs.channel import JobChannel, JobSpec
-    from runner.service.jobs.store import read_job
+    from runner.service.jobs.store import STATE_FILE, read_job
     from runner.service.jobs.worker import do_job
 
+    if not (folder / STATE_FILE).is_file():
+        raise click.BadParameter(
+            f"found no {STATE_FILE} in {folder}, expected the folder of a job, such as recordings/.jobs/17."
+        )
     stdout, folder = sys.stdout, folder.resolve()
     spec = JobSpec(folder, read_job(folder), os.environ.get("RAY_ADDRESS"))
 

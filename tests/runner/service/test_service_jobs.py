@@ -343,6 +343,9 @@ def test_a_command_does_a_job_from_its_folder_alone(tmp_path):
     lines, code = done_by_command("run", broken)
     assert code == 1
     assert "Missing" in lines[-1]["values"]["error"]
+    refused = CliRunner().invoke(cli, ["run", "--job", str(folder)])
+    assert refused.exit_code == 2
+    assert "expected the folder of a job" in refused.stderr
 
 
 def done_by_command(command, folder):
