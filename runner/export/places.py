@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fnmatch
-import secrets
+import os
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -72,8 +72,8 @@ def new_folder(path: Path, force: bool, patterns: Sequence[str]) -> Iterator[Pat
     """
     if path.exists():
         _require_replaceable(path, force, patterns)
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
-    old = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+    temporary = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
+    old = path.with_name(f".{path.name}.{os.urandom(4).hex()}")
     try:
         with storage_errors(path):
             temporary.mkdir(parents=True)

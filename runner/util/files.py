@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
 import json
 import os
-import secrets
 import shutil
 import stat
 from collections.abc import Iterator
@@ -96,6 +94,8 @@ def hash_of(path: Path) -> tuple[int, str]:
     Raises:
         OSError: it cannot be read.
     """
+    import hashlib  # loads OpenSSL
+
     from blake3 import blake3  # listing runs does not need it
 
     with open_regular(path) as stream:
@@ -163,7 +163,7 @@ def replacing(path: Path, mark: str = "") -> Iterator[Path]:
     Raises:
         OSError: the file cannot be replaced.
     """
-    fresh = path.with_name(f".{mark}{secrets.token_hex(4)}.{path.name}")
+    fresh = path.with_name(f".{mark}{os.urandom(4).hex()}.{path.name}")
     try:
         yield fresh
         fresh.replace(path)
