@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from runner.loops.env import record
     from runner.loops.parallel import record_aec, record_parallel
     from runner.loops.vector import record_vector
+    from runner.query.find import find
     from runner.query.sql import sql
     from runner.recording.gym_spaces import register_space
     from runner.recording.reader import Recording, open_recording
@@ -54,6 +55,7 @@ __all__ = [
     "branch",
     "evaluate",
     "explain",
+    "find",
     "find_run",
     "frames",
     "integrations",
@@ -89,6 +91,7 @@ _HOME = {
     "branch": "runner.debugging.branch",
     "evaluate": "runner.execution.rerecord",
     "explain": "runner.debugging.explain",
+    "find": "runner.query.find",
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",
     "list_runs": "runner.runs.listing",

@@ -69,8 +69,13 @@ class Shape:
     def __init__(self, run: RunDescription, extras: Sequence[ExtraLayout] = ()) -> None:
         self.run_id, self.learners, self.extras = run.run_id, run.agents, extras
         self._topics = run.topics
-        self._mdp = run.mdp if run.tabular else None
-        self._events = self._mdp.event_names if self._mdp else ()
+        space, first = run.spaces["action"], 0
+        if not run.has_states:
+            first = space.get("start", 0)
+        is_discrete = space.get("type") == "Discrete"
+        self._actions = range(first, first + space["n"]) if is_discrete else range(0)
+        self.mdp = run.mdp if run.tabular else None
+        self._events = self.mdp.event_names if self.mdp else ()
         where = self._where = str(run.path)
         if len(self._events) != int(run.run["events"]):
             raise RecordingError(f"{where}: found {len(self._events)} events, expected {run.run['events']}.")
@@ -140,12 +145,27 @@ class Shape:
     @cached_property
     def own_actions(self) -> list[str]:
         """The columns of the agents' own actions, such as `action_taxi_1`; none if there is one agent."""
-        return _names("action_", self._mdp.agents) if self._mdp and len(self._mdp.agents) > 1 else []
+        return _names("action_", self.mdp.agents) if self.mdp and len(self.mdp.agents) > 1 else []
+
+    @cached_property
+    def action_values(self) -> dict[str, range]:
+        """The values of each column of discrete actions."""
+        counts = self.mdp.action_counts if self.mdp and self.own_actions else ()
+        return {"action": self._actions} | dict(zip(self.own_actions, map(range, counts), strict=True))
 
     @cached_property
     def event_columns(self) -> list[str]:
         """The columns that count events, such as `n_taxi_1_drop_off`."""
         return _names("n_", self._events)
+
+    @cached_property
+    def event_masks(self) -> dict[str, int]:
+        """The bits of events by name, such as `taxi_1_drop_off`; `drop_off` has the bits of all agents."""
+        masks: dict[str, int] = {}
+        for bit, (event, column) in enumerate(zip(self._events, self.event_columns, strict=True)):
+            for name in {column.removeprefix("n_"), event.rpartition(".")[2]}:
+                masks[name] = masks.get(name, 0) | 1 << bit
+        return masks
 
     def _columns_of(self, topic: Topic) -> list[ArchiveColumn]:
         fields = {field.name: field for field in self.messages[topic].fields}
@@ -174,8 +194,8 @@ class Shape:
 
     def _action_of(self, agent: int, name: str) -> ArchiveColumn:
         """Return the column of an agent's own action, which follows from the joint one."""
-        assert self._mdp is not None
-        own = self._mdp.own_actions[:, agent].astype(np.int32)
+        assert self.mdp is not None
+        own = self.mdp.own_actions[:, agent].astype(np.int32)
         return ArchiveColumn(name, _INT32, lambda records: pa.array(own[records["action"] % len(own)]))
 
     def _summed(self, name: str, source: str) -> list[ArchiveColumn]:

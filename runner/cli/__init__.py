@@ -41,6 +41,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     },
     "Inspect": {
         "ls": ("ls", "List the recorded runs."),
+        "find": ("query", "Find the episodes of all runs that match an expression."),
         "sql": ("query", "Ask the recorded runs, and every step of them, in SQL."),
         "show": ("show", "Show a run: evaluations, tables, configuration."),
         "play": ("play", "Replay a recorded episode in the terminal."),

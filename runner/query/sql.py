@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 MEMORY_MB: Final = 500
 _ROWS: Final = 1 << 14
-_SETTINGS: Final = {
+SETTINGS: Final = {
     "enable_external_access": "false",
     "autoload_known_extensions": "false",
     "autoinstall_known_extensions": "false",
@@ -53,7 +53,7 @@ class QueryResult:
         self._errors = (duckdb.Error, pa.ArrowException, RuntimeError)
         self._runs, self._seconds, self._memory = runs, seconds, memory
         self._deadline = time.monotonic() + (seconds or threading.TIMEOUT_MAX)
-        self._connection = duckdb.connect(":memory:", config=_SETTINGS | {"memory_limit": f"{memory}MB"})
+        self._connection = duckdb.connect(":memory:", config=SETTINGS | {"memory_limit": f"{memory}MB"})
         self._thread = ThreadPoolExecutor(1, "sql")  # as nothing interrupts a call of DuckDB in this one
         try:
             self._reader = self._call(self._begin, query)

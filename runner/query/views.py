@@ -15,13 +15,17 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.dataset as ds
+from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_records
 from runner.analysis.frames import evaluation_column
 from runner.archive import layout
+from runner.archive.columns import Shape
 from runner.archive.places import at_hand
+from runner.environments.mdp import events_of
 from runner.errors import NotInRecording, RunnerError
 from runner.query.chunks import Condition, RunTables, opened_tables
 from runner.recording.marks import read_marks
@@ -44,6 +48,7 @@ _MARKS: Final = {
     **dict.fromkeys(("episode", "t"), pa.int64()),
     "tags": _TEXTS,
 }
+_ROW: Final = ("root", "entry", "id", "name", "status")
 _REPORT_SECONDS: Final = 0.2
 
 
@@ -89,7 +94,7 @@ class SelectedRuns:
 
     def __init__(self, roots: Sequence[Path], chosen: Filter, report: Callable[[str], None]) -> None:
         self._roots, self._chosen = roots, chosen
-        self._rows = look(roots, lambda index: index.select(chosen, columns=("root", "entry", "id")))
+        self.rows = look(roots, lambda index: index.select(chosen, columns=_ROW))
         self._report, self._reported = report, time.monotonic()
         self._read_runs: set[str] = set()
         self._read_rows = 0
@@ -100,16 +105,18 @@ class SelectedRuns:
 
     def __str__(self) -> str:
         """Return how far the query has read."""
-        return f"{self._read_rows:,} rows of {len(self._read_runs):,} of {len(self._rows):,} runs were read"
+        return f"{self._read_rows:,} rows of {len(self._read_runs):,} of {len(self.rows):,} runs were read"
 
     def view(self, name: str) -> pa.Table | Relation:
         """Return a view."""
         if name in TABLES:
-            return self._relation(name)
+            relation = self.table(name, self.rows)
+            self._read_runs.clear()  # none of their rows were read yet
+            return relation
         return {"runs": self._runs, "evaluations": self._evaluations, "marks": self._marks}[name]()
 
     @contextlib.contextmanager
-    def _reading(self, name: str, row: IndexRow) -> Iterator[Run]:
+    def reading(self, name: str, row: IndexRow) -> Iterator[Run]:
         """Yield a run; leave it out of a view if the block raises an error."""
         try:
             yield listed_run(Path(row["root"], row["entry"]), row["id"])
@@ -144,9 +151,9 @@ class SelectedRuns:
     def _evaluations(self) -> pa.Table:
         """Return the columns of `runner.frames.evaluations`, with _ for dots, and the sums over agents."""
         rows: list[dict[str, object]] = []
-        for row in self._rows:
+        for row in self.rows:
             with (
-                self._reading("evaluations", row) as run,
+                self.reading("evaluations", row) as run,
                 open_recording(at_hand(run).recording) as recording,
             ):
                 for record in evaluation_records(recording):
@@ -159,24 +166,26 @@ class SelectedRuns:
     def _marks(self) -> pa.Table:
         marks = [
             {"run": row["id"], "ref": mark.at} | mark.as_row()
-            for row in self._rows
+            for row in self.rows
             for mark in read_marks(Path(row["root"], row["entry"])).marks
         ]
         return _table(marks, _MARKS)
 
-    def _relation(self, name: str) -> Relation:
-        """Return the view of a table, with the columns of all runs."""
+    def table(self, name: str, among: Sequence[IndexRow]) -> Relation:
+        """Return the view of a table, with the columns of all of these runs."""
         kinds, rows = {"run": pa.string()}, []
-        for row in self._rows:
-            with self._reading(name, row) as run, opened_tables(run) as tables:
+        for row in among:
+            with self.reading(name, row) as run, opened_tables(run) as tables:
                 table = tables.shape.tables.get(TABLES[name])
                 if table is None or not tables.count(table):
                     raise NotInRecording(f"it has no {name}.")
                 for column in table.columns:
                     kinds[column.name] = _wider(kinds.get(column.name), column.type)
+                if name == "steps":
+                    events = [event for event in tables.shape.event_masks if event not in kinds]
+                    kinds |= dict.fromkeys(events, pa.bool_())
                 rows.append(row)
                 self._count(row, 0)
-        self._read_runs.clear()
         for left_out in ("run_id", "taken"):
             kinds.pop(left_out, None)
         own_names: dict[str, str] = {}
@@ -198,7 +207,7 @@ class SelectedRuns:
     ) -> Iterator[pa.RecordBatch]:
         """Yield some columns of a table; some of the rows may not satisfy the condition."""
         for k in condition.may_hold([{"run": (row["id"], row["id"])} for row in rows]):
-            with self._reading(name, rows[k]) as run, opened_tables(run) as tables:
+            with self.reading(name, rows[k]) as run, opened_tables(run) as tables:
                 for batch in _batches_of(tables, TABLES[name], own_names, needed, condition):
                     self._count(rows[k], batch.num_rows)
                     yield batch
@@ -208,13 +217,22 @@ def _batches_of(
     tables: RunTables, file: str, own_names: Mapping[str, str], needed: pa.Schema, condition: Condition
 ) -> Iterator[pa.RecordBatch]:
     table = tables.shape.tables[file]
-    own = [name for name in map(own_names.__getitem__, needed.names) if name in table.columns.names]
+    names = [own_names[name] for name in needed.names]
+    stored = [name for name in names if name in table.columns.names]
+    masks = tables.shape.event_masks if file == layout.STEPS else {}
+    masks = {name: masks[name] for name in names if name in masks and name not in stored}
+    of_events = _columns_of_events(tables.shape) if masks else []
     is_turn = ["taken"] if "taken" in table.columns.names else []  # else it is no step of its environment
     for chunks in tables.chunks(table, condition):
-        for batch in chunks.read(condition.may_hold(chunks.known), own + is_turn):
+        read = list(dict.fromkeys([*stored, *is_turn, *of_events]))
+        for batch in chunks.read(condition.may_hold(chunks.known), read):
             rows = batch.filter(batch["taken"]) if is_turn else batch
+            own = {name: rows[name] for name in stored}
+            if masks:
+                events = _events_of(tables.shape, rows)
+                own |= {name: pa.array(events & mask != 0) for name, mask in masks.items()}
             values = [
-                rows[own_names[column.name]].cast(column.type)
+                own[own_names[column.name]].cast(column.type)
                 if own_names[column.name] in own
                 else pa.nulls(rows.num_rows, column.type)
                 for column in needed
@@ -224,6 +242,24 @@ def _batches_of(
                 run = pa.repeat(pa.scalar(tables.shape.run_id), rows.num_rows)
                 values.insert(needed.get_field_index("run"), run)
             yield pa.RecordBatch.from_arrays(values, schema=needed)
+
+
+def _columns_of_events(shape: Shape) -> list[str]:
+    """Return the columns from which the events of steps follow."""
+    rewards = shape.per_learner("reward") or ["reward"]
+    return ["state", "action", "next_state", "terminated", *rewards]
+
+
+def _events_of(shape: Shape, rows: pa.RecordBatch) -> NDArray[np.uint32]:
+    """Return the events of steps, a bit mask each."""
+    assert shape.mdp is not None
+    names = _columns_of_events(shape)
+    kinds = [*((name, np.int64) for name in names[:4]), ("rewards", np.float64, len(names) - 4)]
+    steps = np.empty(len(rows), kinds)
+    for name in names[:4]:
+        steps[name] = rows[name]
+    steps["rewards"] = np.stack([rows[name] for name in names[4:]], axis=1)
+    return events_of(shape.mdp, steps)
 
 
 def _table(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, pa.DataType | None]) -> pa.Table:

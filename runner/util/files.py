@@ -25,6 +25,8 @@ RESTORED: Final = "restored"
 """The folder of the cache with recordings restored from archives; their names begin with the run's id."""
 TABLES: Final = "tables"
 """The folder of the cache with Q-tables along long runs; their names begin with the run's id."""
+EPISODES: Final = "episodes"
+"""The folder of the cache with the index of episodes; the names of its files begin with the run's id."""
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 """On Windows, leaves line ends as they are."""
 _to_json: Final = json.JSONEncoder(ensure_ascii=False).encode

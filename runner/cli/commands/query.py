@@ -1,7 +1,9 @@
-"""`dualtaxi sql`: a question about the recorded runs in SQL."""
+"""Questions about all recorded runs: `dualtaxi sql` in SQL, `dualtaxi find` for episodes."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Final
@@ -11,8 +13,8 @@ import click
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
-from runner.cli.options import folders_option, force_option, json_option, require_one
-from runner.cli.output import console, draw, echo, echo_csv, grid_table, json_list, say
+from runner.cli.options import folders_option, force_option, json_option, limit_option, require_one
+from runner.cli.output import console, draw, echo, echo_csv, grid_table, json_list, print_json, say
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
@@ -24,10 +26,13 @@ _SHOWN: Final = 1000
 _SECONDS: Final = 600
 
 
+_runs_option: Final = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`.")
+
+
 @click.command("sql", cls=Command)
 def sql_command(
     query: str = argument(metavar="QUERY"),
-    runs: str = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`."),
+    runs: str = _runs_option,
     as_csv: bool = option("--csv", is_flag=True, help="Print CSV."),
     as_json: bool = json_option,
     parquet: Path | None = option("--parquet", type=FILE, metavar="FILE", help="Write a file of Parquet."),
@@ -68,7 +73,7 @@ def sql_command(
 
     if parquet is not None:
         require_new(parquet, force)
-    try:
+    with _told_how_far():
         with stage_line("reading") as report:
             result = sql(
                 query, recordings=recordings, runs=runs, timeout=timeout, memory=memory, report=report
@@ -91,11 +96,85 @@ def sql_command(
             draw(grid_table(Grid(tuple(result.columns.names), cells), shrinking=console().is_terminal))
             if len(shown) > _SHOWN:
                 say(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
+    _say_left_out(result.left_out)
+
+
+@contextlib.contextmanager
+def _told_how_far() -> Iterator[None]:
+    """On Ctrl-C, say how far the query has read."""
+    try:
+        yield
     except KeyboardInterrupt as interrupt:
         say("\n".join(getattr(interrupt, "__notes__", [])))
         raise
-    left_out = result.left_out
+
+
+def _say_left_out(left_out: Sequence[str]) -> None:
+    """Name the first runs that were left out."""
     for sentence in left_out[:MAX_PROBLEMS]:
         say(sentence)
     if len(left_out) > MAX_PROBLEMS:
         say(f"{len(left_out) - MAX_PROBLEMS:,} more runs are left out.")
+
+
+@click.command("find", cls=Command)
+def find_command(
+    expression: str = argument(metavar="EXPRESSION"),
+    runs: str = _runs_option,
+    phase: str | None = option(
+        "--phase",
+        type=click.Choice(["train", "eval"]),
+        help="Training or evaluation.  [default: both]",
+    ),
+    sort: str = option(
+        "--sort",
+        default="",
+        metavar="NUMBER",
+        help="Sort by a number, such as ret, or -ret from the highest.",
+    ),
+    limit: int = limit_option(20),
+    as_json: bool = json_option,
+    recordings: tuple[Path, ...] = folders_option,
+) -> None:
+    """Find the episodes of all recorded runs that match EXPRESSION.
+
+    It is a condition in Python's syntax. Words alone are searched for in the id, name, tags and note of runs.
+
+    Of an episode:
+      ret, ret.taxi_1, length          sum of rewards, or of an agent's rewards; number of steps
+      success, terminated, truncated   how it ended
+      any(C), all(C), never(C)         whether a condition holds at some, every or no step
+      count(C)                         at how many steps it holds
+      then(C, D, within=5)             whether D holds at most 5 steps after C
+      min(V), max(V), sum(V), first(V), last(V)    of a value over the steps
+
+    Of a step, in these functions: reward, t, state, next_state, next_observation[0], action, which is
+    compared with its name or number; events such as collision, taxi_1.pickup, or pickup for any agent;
+    explored. They are the columns of steps that `dualtaxi sql` has.
+
+    An index of episodes in the cache answers most of it. It is made when a run is first asked. Steps are
+    read of those episodes alone that the index leaves open. A run that has not what the expression names
+    is left out.
+
+    Examples:
+      dualtaxi find 'ret < -100 and count(collision) >= 2 and length > 50'
+      dualtaxi find 'any(action == "north + east") and success' --phase eval --sort length
+      dualtaxi find 'max(next_observation[2]) > 0.2' --runs 'environment == "CartPole-v1"'
+      dualtaxi find 'then(pickup, drop_off, within=5)' --sort -ret --json
+    """
+    require("pyarrow", extra="sql", purpose="`find`")
+    from runner.query.find import find
+
+    with _told_how_far(), stage_line("reading") as report:
+        found = find(
+            expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
+        )
+    if as_json:
+        print_json(found.as_json())
+    else:
+        if found.hits:
+            draw(grid_table(found.grid, shrinking=console().is_terminal))
+        say(found.sentence)
+        if len(found.hits) < found.count:
+            say(f"Shown are the first {len(found.hits):,}; --limit 0 shows all.")
+    _say_left_out(found.left_out)

@@ -1,0 +1,198 @@
+"""The index of episodes: what `find` asks about them, a file for each run in the user's cache.
+
+    episodes/RUN-HEX.parquet     a row for each episode: its columns, and of its steps the counts of flags,
+                                 events and actions, and least, greatest and last numbers
+
+It is made from the run's own tables when it is first asked for. HEX has hashes of the recording's path and
+state, and of the facts in the file's metadata. An index of another state is not found.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from blake3 import blake3
+
+from runner.analysis.evaluations import Evaluation, evaluations_of
+from runner.archive.batches import Batches
+from runner.archive.columns import Shape
+from runner.archive.places import at_hand
+from runner.environments.naming import action_names, actions_in_words
+from runner.errors import RecordingError
+from runner.query.conditions import ENDS, Facts, quoted
+from runner.query.views import SelectedRuns
+from runner.recording.reader import open_recording
+from runner.runs.catalogue.columns import IndexRow
+from runner.runs.listing import listed_run
+from runner.runs.run import RECORDING_FILE, RUN_FILE
+from runner.util.files import EPISODES, cache_folder, remove_oldest, replacing, storage_errors
+
+MAX_FILES: Final = 20_000
+_VERSION: Final = 1
+_HEX: Final = 16
+"""The digits of each hash in a name."""
+_MAX_COLUMNS: Final = 64
+"""The most numbers of steps, and the most actions, that are in an index."""
+_NOT_INDEXED: Final = ("run", "phase", "position", "step", "episode", "environment")
+_PLAIN: Final = ("phase", "episode", "first_step", "last_step", "length", "penalties", "return", *ENDS)
+_AT: Final = (
+    "CASE WHEN phase = 'train' THEN '' || episode WHEN episode < stop "
+    "THEN 'eval:' || after || ':' || (episode - start) ELSE 'eval:-1:' || episode END"
+)
+"""The text of a reference to an episode."""
+_COUNTED: Final = "row_number() OVER (PARTITION BY phase, environment ORDER BY episode) - 1"
+"""The number by which steps of several environments name their episode."""
+
+
+class EpisodeIndex:
+    """The files of the index, made by a connection to DuckDB."""
+
+    def __init__(self, connection: Any) -> None:
+        self.folder = cache_folder() / EPISODES
+        self._connection = connection
+        with storage_errors(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._files = {path.stem[:-_HEX]: path for path in self.folder.glob("*-*.parquet")}
+
+    def file(self, row: IndexRow, runs: SelectedRuns) -> Path:
+        """Return the file of a run, which is made if it is missing.
+
+        Raises:
+            RunnerError: the run has no episodes, is damaged, or its archive cannot be reached.
+        """
+        name = RUN_FILE if row["status"] == "archived" else RECORDING_FILE
+        path = Path(row["root"], row["entry"], name)
+        with storage_errors(path):
+            state = path.stat()
+        start = f"{row['id']}-{_hash(str(path))}"
+        stem = start + _hash([_VERSION, state.st_mtime_ns, state.st_size, state.st_ino])
+        if stem not in self._files:
+            with storage_errors(self.folder), replacing(self.folder / f"{start}.parquet") as fresh:
+                kind = self._write(row, runs, fresh)
+                for older in self.folder.glob(f"{start}*"):
+                    older.unlink(missing_ok=True)
+            self._files[stem] = (self.folder / f"{start}.parquet").rename(
+                self.folder / f"{stem}{kind}.parquet"
+            )
+            remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
+        return self._files[stem]
+
+    def _write(self, row: IndexRow, runs: SelectedRuns, path: Path) -> str:
+        """Write the index of a run, and return the hash of its facts."""
+        views = {name: runs.table(name, [row]) for name in ("episodes", "steps")}
+        runs.left_out.pop(f"{row['id']} steps", None)  # a run need not have steps
+        run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
+        with open_recording(run.recording) as recording:
+            shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
+            evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
+        episodes, steps = (view.schema for view in views.values())
+        plain = {name for name in episodes.names if name in _PLAIN or name.startswith(("return_", "n_"))}
+        if shape.mdp is None or not shape.mdp.success_events:
+            plain -= {"success"}
+        aggregates = _aggregates(shape, steps)
+        facts = Facts([*sorted(plain), *aggregates], _names_of_actions(shape))
+        for name, view in (*views.items(), ("evaluations", evaluations)):
+            self._connection.register(name, view)
+        has_turns = "environment" in episodes.names
+        columns = ", ".join(map(quoted, sorted(plain)))
+        environment, own = ("environment", _COUNTED) if has_turns else ("0", "episode")
+        chosen = (
+            f"SELECT {columns}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
+            "ASOF LEFT JOIN evaluations ON episode >= start"
+        )
+        rows = with_steps(chosen, steps, aggregates, {}) if aggregates else f"({chosen})"
+        metadata = json.dumps(asdict(facts))
+        self._connection.execute(
+            f"COPY (SELECT * FROM {rows} ORDER BY phase DESC, episode) TO {literal(str(path))} "
+            f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{facts: {literal(metadata)}}})"
+        )
+        if reasons := [reason for key, reason in runs.left_out.items() if key.startswith(f"{row['id']} ")]:
+            raise RecordingError(reasons[0])
+        return _hash(metadata)
+
+
+def kind_of(path: Path) -> str:
+    """Return the hash of the facts in an index."""
+    return path.stem[-_HEX:]
+
+
+def facts_of(path: Path) -> Facts:
+    """Return what the episodes and steps of the run of an index have."""
+    return Facts(**json.loads(pq.read_schema(path).metadata[b"facts"]))
+
+
+def with_steps(
+    chosen: str,
+    steps: pa.Schema,
+    aggregates: Mapping[str, str],
+    windows: Mapping[str, str],
+    among: str = "TRUE",
+) -> str:
+    """Return SQL for episodes and aggregates of their steps, which are NULL where steps were lost.
+
+    Args:
+        chosen: SQL for the episodes.
+        steps: the columns of the view `steps`. NaN in them is NULL.
+        aggregates: the SQL of each, by name.
+        windows: columns of steps that these need, the SQL of each by name.
+        among: a condition on the steps to read.
+    """
+    numbers = [quoted(one.name) for one in steps if pa.types.is_floating(one.type)]
+    replaced = (
+        f" REPLACE ({', '.join(f'nullif({name}, {_NAN}) AS {name}' for name in numbers)})" if numbers else ""
+    )
+    environment = "" if "environment" in steps.names else ", 0 AS environment"
+    more, parts = (
+        "".join(f", {sql} AS {quoted(name)}" for name, sql in named.items())
+        for named in (windows, aggregates)
+    )
+    return (
+        f"(SELECT chosen.*, s.* EXCLUDE (of, turn, own, n) FROM ({chosen}) chosen LEFT JOIN "
+        f"(SELECT phase AS of, environment AS turn, episode AS own, count(*) AS n{parts} FROM "
+        f"(SELECT *{more} FROM (SELECT *{replaced}{environment} FROM steps WHERE {among})) GROUP BY ALL) s "
+        "ON of = phase AND turn = environment AND s.own = chosen.own AND n = length)"
+    )
+
+
+_NAN: Final = "'NaN'"
+
+
+def literal(text: str) -> str:
+    """Return a text in SQL."""
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _hash(value: object) -> str:
+    return blake3(json.dumps(value).encode()).hexdigest()[:_HEX]
+
+
+def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
+    """Return the columns of the index that need steps, with their SQL."""
+    numbers = [one.name for one in steps if pa.types.is_integer(one.type) or pa.types.is_floating(one.type)]
+    columns = {
+        f"{function}({name})": f"CASE WHEN count({{0}}) = count(*) THEN {sql} END".format(quoted(name))
+        for name in [name for name in numbers if name not in _NOT_INDEXED][:_MAX_COLUMNS]
+        for function, sql in (("min", "min({0})"), ("max", "max({0})"), ("last", "arg_max({0}, step)"))
+    }
+    flags = [one.name for one in steps if pa.types.is_boolean(one.type)]
+    columns |= {f"count({name})": f"count_if({quoted(name)})" for name in flags}
+    return columns | {
+        f"count({name} == {k})": f"count_if({quoted(name)} = {k})"
+        for name, values in shape.action_values.items()
+        if name in numbers and len(values) <= _MAX_COLUMNS
+        for k in values
+    }
+
+
+def _names_of_actions(shape: Shape) -> dict[str, list[str]]:
+    """Return the names of actions by number, by the column of steps."""
+    if shape.mdp is None or (names := action_names(shape.mdp)) is None:
+        return {}
+    own = dict(zip(shape.own_actions, names, strict=False))
+    return {"action": list(actions_in_words(shape.mdp))} | own

@@ -1,0 +1,289 @@
+"""Find episodes in all runs, by a condition on them and their steps.
+
+    found = runner.find("ret < -100 and count(collision) >= 2", runs='"tutorial" in tags', sort="ret")
+    for hit in found.hits:
+        print(hit.run_id, hit.at, hit.ret)
+
+DuckDB asks the index of episodes, a file for each run; steps are read of those episodes alone that the index
+does not decide. `runner.query.conditions` has the language.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from runner.analysis.episodes import EpisodeRef
+from runner.analysis.sections import Grid
+from runner.errors import RunnerError
+from runner.query.conditions import ENDS, EpisodeParser, Facts
+from runner.query.episode_index import EpisodeIndex, facts_of, kind_of, literal, with_steps
+from runner.query.sql import MEMORY_MB, SETTINGS
+from runner.query.views import SelectedRuns
+from runner.recording.marks import read_marks
+from runner.runs.catalogue.filters import parse
+from runner.runs.run import recordings_folder
+from runner.util.extras import require
+from runner.util.humanize import counted
+from runner.util.values import Json
+
+LIMIT: Final = 20
+PHASES: Final = ("train", "eval")
+_WORDS: Final = re.compile(r"[\w\s-]+")
+"""Words to search for in names and tags, if they are no condition."""
+_MOST_EVENTS: Final = 3
+_MAX_LISTED: Final = 2_000
+"""The most episodes whose steps are asked for one by one."""
+_OPEN: Final = {"enable_external_access": "true"}
+
+
+@dataclass(frozen=True)
+class Hit:
+    """An episode that was found."""
+
+    run_id: str
+    name: str
+    at: str
+    """The episode as other commands take it: `812`, or `eval:3000:17`."""
+    ret: float
+    """The sum of all rewards."""
+    length: int
+    ended: str
+    """`success`, `terminated`, `truncated`, or `reset` before its end."""
+    events: dict[str, int]
+    """How often each event happened, without those that did not."""
+    marks: list[str]
+    """The texts of its marks."""
+
+    @property
+    def replay(self) -> str:
+        """The address of its replay."""
+        return f"/runs/{self.run_id}/replay/{EpisodeRef.parse(self.at).episode_path}"
+
+
+@dataclass(frozen=True)
+class Found:
+    """The episodes that match an expression."""
+
+    expression: str
+    hits: list[Hit]
+    """The first of them, as they are sorted."""
+    count: int
+    """The number of all that match."""
+    runs: int
+    """The number of runs that were searched."""
+    left_out: list[str]
+    """Sentences on the runs that could not be searched."""
+
+    @property
+    def sentence(self) -> str:
+        """Say how many episodes match."""
+        verb = "matches" if self.count == 1 else "match"
+        return f"{counted(self.count, 'episode')} of {counted(self.runs, 'run')} {verb}."
+
+    @property
+    def grid(self) -> Grid:
+        """The hits as a table."""
+        headings = ("run", "name", "episode", "return", "length", "ended", "events", "marks")
+        rows = []
+        for hit in self.hits:
+            most = sorted(hit.events, key=lambda name: -hit.events[name])[:_MOST_EVENTS]
+            events = ", ".join(f"{name} {hit.events[name]:,}" for name in most)
+            numbers = f"{hit.ret:,.6g}", f"{hit.length:,}"
+            rows.append((hit.run_id, hit.name, hit.at, *numbers, hit.ended, events, ", ".join(hit.marks)))
+        return Grid(headings, rows, links=[hit.replay for hit in self.hits])
+
+    def as_json(self) -> Json:
+        """Return the result as JSON can hold it."""
+        return {**vars(self), "hits": [{**vars(hit), "replay": hit.replay} for hit in self.hits]}
+
+
+def find(
+    expression: str,
+    recordings: str | os.PathLike[str] | list[Path] | tuple[Path, ...] | None = None,
+    *,
+    runs: str = "",
+    phase: str | None = None,
+    sort: str = "",
+    limit: int | None = LIMIT,
+    memory: int = MEMORY_MB,
+    report: Callable[[str], None] = lambda _: None,
+) -> Found:
+    """Return the episodes of all runs that match an expression.
+
+    Args:
+        expression: such as `any(action == "north + east") and length > 50`; words alone are searched for in
+            the ids, names, tags and notes of runs.
+        recordings: the folder of runs, or several: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        runs: a filter as of `dualtaxi ls`; the runs that match it are searched.
+        phase: `train` or `eval`; both by default.
+        sort: a number to sort by, such as `ret` or `-count(collision)`; the newest run is first by default.
+        limit: the most hits; None for all.
+        memory: the megabytes that DuckDB may use.
+        report: called with how far it has read, a few times a second.
+
+    Raises:
+        RunnerError: an expression is wrong, with a mark at its place, or names what no run has.
+        MissingExtra: DuckDB is not installed.
+    """
+    if phase not in (None, *PHASES):
+        raise RunnerError(f"phase: found {phase!r}, expected train or eval.")
+    chosen, condition = parse(runs), expression.strip()
+    if _WORDS.fullmatch(condition) and condition not in ENDS:
+        words, condition = parse(condition).condition, "True"
+        chosen = chosen.also(words) if words is not None else chosen
+    folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
+    search = _Search(SelectedRuns(folders, chosen, report), memory)
+    with contextlib.closing(search.connection):
+        try:
+            search.take(condition, phase, sort)
+            return search.found(expression, limit)
+        except KeyboardInterrupt as interrupt:
+            interrupt.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
+            raise
+        except search.errors as error:
+            if "Out of Memory" in str(error):
+                raise RunnerError(f"find: needs more than {memory:,} MB of memory.") from error
+            for path in search.files.values():
+                path.unlink(missing_ok=True)
+            raise RunnerError(
+                f"find: {error}\nThe index of these runs was removed: the next search makes it again."
+            ) from error
+
+
+_Question = tuple[str, str, dict[str, str], dict[str, str]]
+"""An expression in SQL, the number to sort by, and the aggregates and windows of steps that they need."""
+
+
+class _Search:
+    """A search in some runs."""
+
+    def __init__(self, runs: SelectedRuns, memory: int) -> None:
+        duckdb = require("duckdb", extra="sql", purpose="`find`")
+        self.errors = (duckdb.Error, pa.ArrowException)
+        self.runs = runs
+        self.connection = duckdb.connect(
+            ":memory:", config=SETTINGS | {"memory_limit": f"{memory}MB"} | _OPEN
+        )
+        self._index = EpisodeIndex(self.connection)
+        self.connection.execute(f"SET allowed_directories = [{literal(str(self._index.folder))}]")
+        self.connection.execute(f"SET temp_directory = {literal(str(self._index.folder / 'spilled'))}")
+        self.connection.execute("SET enable_external_access = false")
+        self.connection.execute("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
+        self.files: dict[int, Path] = {}
+        """The indexes of runs, by the number of the row."""
+
+    def take(self, condition: str, phase: str | None, sort: str) -> None:
+        """Search all runs.
+
+        Raises:
+            RunnerError: no run has what the expression names.
+        """
+        kinds: dict[str, list[int]] = {}
+        for k, row in enumerate(self.runs.rows):
+            with self.runs.reading("find", row):
+                self.files[k] = self._index.file(row, self.runs)
+                kinds.setdefault(kind_of(self.files[k]), []).append(k)
+        wrong = []
+        for numbers in kinds.values():
+            facts = facts_of(self.files[numbers[0]])
+            try:
+                first, second = (_parsed(facts, condition, sort, reads) for reads in (False, True))
+            except RunnerError as error:
+                wrong.append(error)
+                ids = [self.runs.rows[k]["id"] for k in numbers]
+                self.runs.left_out |= {
+                    f"{name} find": f"run {name} is left out of find: {error}" for name in ids
+                }
+            else:
+                self._ask(numbers, first, second, f" AND phase = '{phase}'" if phase else "")
+        if wrong and len(wrong) == len(kinds):
+            raise wrong[0]
+
+    def _ask(self, numbers: Sequence[int], first: _Question, second: _Question, among: str) -> None:
+        """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
+        where, key, aggregates, _ = first
+        is_open = f"{where} IS NULL OR {key} IS NULL" if aggregates else "FALSE"
+        self.connection.execute(
+            f"INSERT INTO hits SELECT ($runs)[file_index::BIGINT + 1], file_row_number, {key}, {is_open} "
+            f"FROM read_parquet($files) WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}",
+            {"files": [str(self.files[k]) for k in numbers], "runs": numbers},
+        )
+        opened = self.connection.execute(
+            "SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run"
+        ).fetchall()
+        for (k,) in opened:
+            with self.runs.reading("find", self.runs.rows[k]):
+                self._read(k, *second)
+        self.connection.execute("DELETE FROM hits WHERE is_open")
+
+    def _read(
+        self, k: int, where: str, key: str, aggregates: dict[str, str], windows: dict[str, str]
+    ) -> None:
+        """Add those of the open episodes of a run that match by their steps."""
+        row, path = self.runs.rows[k], literal(str(self.files[k]))
+        chosen = (
+            f"SELECT * FROM read_parquet({path}) JOIN (SELECT row FROM hits WHERE is_open AND run = {k}) "
+            "ON row = file_row_number"
+        )
+        ends = "min(first_step), max(last_step), list(DISTINCT episode)"
+        ((low, high, episodes),) = self.connection.execute(f"SELECT {ends} FROM ({chosen})").fetchall()
+        steps = self.runs.table("steps", [row])
+        if "step" not in steps.schema.names:
+            return  # it is left out
+        among = f"step BETWEEN {low} AND {high}"
+        if "environment" not in steps.schema.names and len(episodes) <= _MAX_LISTED:
+            among += f" AND episode IN ({', '.join(map(str, episodes))})"
+        self.connection.register("steps", steps)
+        rows = with_steps(chosen, steps.schema, aggregates, windows, among)
+        self.connection.execute(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM {rows} WHERE {where}")
+
+    def found(self, expression: str, limit: int | None) -> Found:
+        """Return the first episodes, as they are sorted."""
+        ids = {key.split()[0] for key in self.runs.left_out}
+        gone = [k for k, row in enumerate(self.runs.rows) if row["id"] in ids]
+        self.connection.execute("DELETE FROM hits WHERE list_contains($runs, run)", {"runs": gone})
+        ((count,),) = self.connection.execute("SELECT count(*) FROM hits").fetchall()
+        first = "SELECT run, row FROM hits ORDER BY key NULLS LAST, run, row LIMIT $limit"
+        places = self.connection.execute(first, {"limit": count if limit is None else limit}).fetchall()
+        hits: dict[object, Hit] = {}
+        for k in {k for k, _ in places}:
+            rows = [row for run, row in places if run == k]
+            hits |= {(k, row): hit for row, hit in zip(rows, self._hits(k, rows), strict=True)}
+        ordered = [hits[place] for place in places]
+        return Found(
+            expression, ordered, count, len(self.runs.rows) - len(gone), list(self.runs.left_out.values())
+        )
+
+    def _hits(self, k: int, rows: Sequence[int]) -> Iterator[Hit]:
+        """Yield episodes of a run."""
+        row = self.runs.rows[k]
+        marks = read_marks(Path(row["root"], row["entry"])).marks
+        for values in pq.read_table(self.files[k]).take(rows).to_pylist():
+            place = values["phase"], values["episode"]
+            yield Hit(
+                run_id=row["id"],
+                name=row["name"],
+                at=values["at"],
+                ret=values["return"],
+                length=values["length"],
+                ended=next((name for name in ENDS if values.get(name)), "reset"),
+                events={name[2:]: n for name, n in values.items() if name.startswith("n_") and n},
+                marks=[mark.text for mark in marks if (mark.phase, mark.episode) == place],
+            )
+
+
+def _parsed(facts: Facts, condition: str, sort: str, reads_steps: bool) -> _Question:
+    parser = EpisodeParser(condition, facts, reads_steps)
+    where, key = parser.whole().sql, "0"
+    if sort:
+        key = EpisodeParser(sort, facts, reads_steps, parser.aggregates, parser.windows).sort_key()
+    return f"({where})", f"({key})::DOUBLE", parser.aggregates, parser.windows

@@ -1,0 +1,306 @@
+"""Episodes are found in all runs, by their index where it decides, and by their steps where it does not."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import gymnasium
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner
+from gymnasium import spaces
+
+import runner
+from runner.archive.runs import archive_run
+from runner.cli import cli
+from runner.errors import RunnerError
+from runner.query.conditions import EpisodeParser
+from runner.query.views import SelectedRuns
+from runner.recording.reader import open_recording
+from runner.runs.resolve import find_run
+from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
+from tests.runner.recording.making import LAKE, TAXIS, make_run
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with jobs, a loop of a pole, and one of several poles."""
+    folder = tmp_path_factory.mktemp("runs")
+    runner.label(make_run(folder, TAXIS), tag=["fast"])
+    make_run(folder, LAKE)
+    rng = np.random.default_rng(0)
+    with runner.record(gymnasium.make("CartPole-v1"), folder, name="pole") as env:
+        for seed in range(80):
+            env.reset(seed=seed)
+            for _ in range(int(rng.integers(5, 200))):
+                *_, terminated, truncated, _ = env.step(int(rng.integers(2)))
+                if terminated or truncated:
+                    break
+    envs = gymnasium.make_vec("CartPole-v1", 3, vectorization_mode="sync")
+    with runner.record_vector(envs, folder, name="poles") as recorded:
+        recorded.action_space.seed(2)
+        recorded.reset(seed=7)
+        for _ in range(300):
+            recorded.step(recorded.action_space.sample())
+    return folder
+
+
+EXPRESSIONS = [
+    "ret < -100 and count(collision) >= 2 and length > 50",
+    'any(action == "north + east")',
+    'any(action.taxi_1 == "north") and not success',
+    'count(action in ("north + east", "east + east")) > 3',
+    "never(collision)",
+    "all(reward < 0)",
+    "then(pickup, drop_off, within=5)",
+    "then(pickup, drop_off)",
+    "any(taxi_1.pickup and reward.taxi_2 < 0)",
+    "count(pickup) == 1 or count(not collision) < 10",
+    "count(pickup or collision) * 2 > length / 4",
+    "max(t) > 60 and sum(reward) < -200",
+    "any(state > 20) and last(next_state) != 5",
+    "ret.taxi_1 > ret.taxi_2",
+    "any(explored and t > 80)",
+    "abs(ret + length) > 100",
+    "truncated and 10 < length",
+    "any(next_observation[2] > 0.2)",
+    "all(abs(next_observation[2]) < 0.1)",
+    "max(next_observation[0]) - min(next_observation[0]) > 0.1",
+    "last(next_observation[3]) < 0 < first(next_observation[3])",
+    "not any(next_observation[2] > 0.2 and action == 1)",
+    "count(next_observation[1] > 0) >= 10",
+    "all(next_observation[2] == next_observation[2])",
+    "count(action == 1) > 0.6 * length",
+    "any(reward == -2) and not all(reward >= -2)",
+    "count(action < 2) > 3",
+]
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS)
+def test_the_index_finds_what_the_steps_say(folder, expression, monkeypatch):
+    found = runner.find(expression, folder, limit=None)
+    monkeypatch.setattr(EpisodeParser, "_column", lambda *_: "NULL")
+    by_steps = runner.find(expression, folder, limit=None)
+    assert found == by_steps
+    assert found.count
+
+
+def expected_of(folder, name, holds):
+    """Return the references of the training episodes whose recorded steps satisfy a function."""
+    with open_recording(find_run(name, folder).recording) as recording:
+        episodes = recording.train.episodes.array()
+        return [str(row["episode"]) for row in episodes if holds(recording, row)]
+
+
+@pytest.mark.parametrize("name", ["pole", "poles"])
+def test_hits_are_what_the_recording_says(folder, name):
+    def leans(recording, row):
+        steps = recording.train.episode_steps(int(row["episode"]))
+        return bool((steps["next_observation"][:, 2] > 0.2).any())
+
+    expected = expected_of(folder, name, leans)
+    for expression in ("any(next_observation[2] > 0.2)", "any(next_observation[2] + 0 > 0.2)"):
+        found = runner.find(expression, folder, runs=f'name == "{name}"', limit=None)
+        assert [hit.at for hit in found.hits] == expected
+    assert expected
+
+
+def test_events_are_counted_at_their_steps(folder):
+    run = find_run("taxis", folder)
+    found = runner.find("length > 0", folder, runs="taxis", limit=None)
+    with open_recording(run.recording) as recording:
+        assert found.count == sum(phase.episodes.count() for phase in recording.phases)
+    steps = runner.sql(
+        "SELECT count_if(collision) c, count_if(pickup) p FROM steps", recordings=folder
+    ).arrow()
+    totals = [sum(hit.events.get(name, 0) for hit in found.hits) for name in ("collision", "taxi_1_pickup")]
+    assert totals[0] == steps["c"][0].as_py()
+    assert totals[1] <= steps["p"][0].as_py()
+
+
+def test_what_the_index_decides_reads_no_recording(folder, monkeypatch):
+    runner.find("length > 0", folder)
+
+    def refuse(*_):
+        raise AssertionError("steps were read")
+
+    monkeypatch.setattr(SelectedRuns, "table", refuse)
+    for expression in (*EXPRESSIONS[:3], "count(action == 1) > 5", "any(next_observation[2] > 0.2)"):
+        assert runner.find(expression, folder).count
+
+
+def test_a_hit_is_the_episode(folder):
+    (hit,) = runner.find("length > 0", folder, runs="taxis", phase="eval", sort="-length", limit=1).hits
+    with open_recording(find_run(hit.run_id, folder).recording) as recording:
+        record = max(recording.eval.episodes.array(), key=lambda row: row["length"])
+    assert (hit.length, hit.ret) == (record["length"], record["returns"].sum())
+    assert hit.at.startswith("eval:")
+    assert hit.replay == f"/runs/{hit.run_id}/replay/{hit.at.replace(':', '/')}"
+    assert runner.mark(find_run(hit.run_id, folder), hit.at, "slow").text == "slow"
+    (marked,) = runner.find("length > 0", folder, runs="taxis", phase="eval", sort="-length", limit=1).hits
+    assert marked.marks == ["slow"]
+
+
+def test_words_search_names_and_tags(folder):
+    assert runner.find("fast", folder).count == runner.find("length > 0", folder, runs="taxis").count
+
+
+def test_sorting_and_limits(folder):
+    for sort in ("max(next_observation[2]) * 1", "-sum(reward)", "ret"):
+        every = runner.find("length > 10", folder, runs="pole", sort=sort, limit=None)
+        some = runner.find("length > 10", folder, runs="pole", sort=sort, limit=5)
+        assert some.hits == every.hits[:5]
+        assert some.count == len(every.hits)
+    returns = [hit.ret for hit in every.hits]
+    assert returns == sorted(returns)
+
+
+@pytest.mark.parametrize(
+    ("expression", "mark", "message"),
+    [
+        ("retr < 3", "^^^^", "Did you mean 'return'"),
+        ("any(colision)", "^^^^^^^^", "Did you mean 'collision'"),
+        ('any(action == "nort + east")', "^^^^^^^^^^^^^", "Did you mean 'north + east'"),
+        ("ret.taxi_3 < 1", "^^^^^^^^^^", "Did you mean"),
+        ("collision and ret < 3", "^^^^^^^^^", "any(collision)"),
+        ("any(any(collision))", "^^^^^^^^^^^^^^", "values of a step"),
+        ("cuont(collision) > 1", "^^^^^", "Did you mean 'count'"),
+        ("any(collision, within=3)", "^^^^^^^^^^^^^^^^^^^^^^^^", "within=STEPS"),
+        ("seed == 3", "^^^^", "expected one of"),
+        ("any(next_observation[-1] > 1)", "^^^^^^^^^^^^^^^^^^^^", "expected one of"),
+        ("length >", "^", "invalid syntax"),
+        ("(length + 1)", "^^^^^^^^^^", "expected a condition"),
+        ("__import__('os').system('x') == 0", "^", "found"),
+        ("length == 'x\" OR 1=1 --'", "^", "found text"),
+    ],
+)
+def test_a_mistake_is_marked(folder, expression, mark, message):
+    with pytest.raises(RunnerError) as error:
+        runner.find(expression, folder, runs="taxis")
+    assert message in str(error.value)
+    assert str(error.value).endswith(mark)
+
+
+def test_a_run_that_cannot_be_searched_is_named(folder, tmp_path):
+    runs = tmp_path / "runs"
+    shutil.copytree(folder, runs)
+    bare = make_run(runs, TAXIS | {"name": "bare", "recording": {"steps": "none"}})
+    damaged = make_run(runs, TAXIS | {"name": "hurt"})
+    damaged.recording.write_bytes(damaged.recording.read_bytes()[:700])
+    found = runner.find("then(taxi_1.pickup, taxi_1.drop_off, within=5)", runs)
+    reasons = "\n".join(found.left_out)
+    assert f"{bare.run_id} is left out of steps: it has no steps" in reasons
+    assert damaged.run_id in reasons
+    assert found.runs == 1
+    assert runner.find("count(collision) > 1", runs, runs="bare").count  # from the index alone
+
+
+def test_a_recording_that_changed_is_read_again(tmp_path):
+    first, second = (make_run(tmp_path / name, TAXIS | {"episodes": n}) for name, n in (("a", 20), ("b", 40)))
+    assert runner.find("length > 0", tmp_path / "a", phase="train").count == 20
+    shutil.copy(second.recording, first.recording)
+    assert runner.find("length > 0", tmp_path / "a", phase="train").count == 40
+    assert len(list((cache_folder() / EPISODES).glob(f"{first.run_id}-*"))) == 1
+
+
+def test_an_archived_run_has_the_same_hits(tmp_path):
+    run = make_run(tmp_path / "runs", TAXIS)
+    expressions = ("count(collision) > 1", "then(pickup, drop_off)")
+    before = [runner.find(expression, tmp_path / "runs", limit=None).hits for expression in expressions]
+    archive_run(run, str(tmp_path / "archive"), remove=True)
+    after = [runner.find(expression, tmp_path / "runs", limit=None).hits for expression in expressions]
+    assert after == before
+    shutil.rmtree(tmp_path / "archive")
+    assert runner.find(expressions[0], tmp_path / "runs", limit=None).hits == before[0]
+    found = runner.find(expressions[1], tmp_path / "runs")
+    assert (found.count, len(found.left_out)) == (0, 1)
+
+
+HOSTILE = ['x"); DROP TABLE hits; --', "a'b", 'say "n"', "ünï cöde", "A", "a"]
+
+
+def test_names_that_need_quoting_do_no_harm(tmp_path):
+    class Odd(gymnasium.Env):
+        observation_space = spaces.Dict({name: spaces.Box(-9, 9, (1,)) for name in HOSTILE})
+        action_space = spaces.Discrete(2)
+        t = 0
+
+        def reset(self, **_):
+            self.t = 0
+            return {name: np.zeros(1, np.float32) for name in HOSTILE}, {}
+
+        def step(self, _):
+            self.t += 1
+            values = {name: np.full(1, k + self.t / 8, np.float32) for k, name in enumerate(HOSTILE)}
+            return values, 0.0, self.t == 4, False, {}
+
+    with runner.record(Odd(), tmp_path, name="odd") as env:
+        for _ in range(3):
+            env.reset()
+            for _ in range(4):
+                env.step(0)
+    for k, name in enumerate(HOSTILE):
+        for above, count in ((k + 0.4, 3), (k + 0.6, 0)):
+            for more in ("", " + 0"):
+                expression = f"any(next_observation[{name!r}][0]{more} > {above})"
+                assert runner.find(expression, tmp_path).count == count, expression
+
+
+def test_one_episode_in_a_million(tmp_path, folder):
+    runner.find("length > 0", folder, runs="pole")
+    source, *_ = (cache_folder() / EPISODES).glob(f"{find_run('pole', folder).run_id}-*")
+    table, n = pq.read_table(source), 50_000
+    run = find_run("pole", folder)
+    made = []
+    for k in range(20):
+        place = tmp_path / f"run{k:05d}"
+        shutil.copytree(run.folder, place)
+        facts = json.loads((place / "run.json").read_text()) | {"run_id": place.name}
+        (place / "run.json").write_text(json.dumps(facts))
+        made.append(place)
+    runner.find("length > 0", tmp_path)
+    files = sorted((cache_folder() / EPISODES).glob("run00*"))
+    assert len(files) == 20
+    rows = table.take(np.random.default_rng(0).integers(len(table), size=n))
+    rows = rows.set_column(rows.column_names.index("episode"), "episode", pa.array(np.arange(n)))
+    for k, file in enumerate(files):
+        planted = np.where((np.arange(n) == 31_415) & (k == 13), 9.5, 0.1)
+        at = rows.column_names.index("max(next_observation_2)")
+        pq.write_table(rows.set_column(at, "max(next_observation_2)", pa.array(planted, pa.float32())), file)
+    found = runner.find("any(next_observation[2] > 1)", tmp_path)
+    assert [(hit.run_id, found.count) for hit in found.hits] == [("run00013", 1)]
+    assert runner.find("length > 0", tmp_path, sort="ret", limit=1).count == 1_000_000
+
+
+def test_the_command(folder):
+    def invoke(*words):
+        result = CliRunner().invoke(cli, ["find", *words, "--recordings", str(folder)])
+        assert result.exit_code == 0, result.output
+        return result
+
+    expression = "count(collision) >= 1"
+    found = runner.find(expression, folder)
+    assert json.loads(invoke(expression, "--json").stdout) == json.loads(json.dumps(found.as_json()))
+    text = invoke(expression)
+    assert found.hits[0].run_id in text.stdout
+    assert "is left out of find" in text.stderr
+    assert found.sentence in text.stderr
+
+
+def test_a_damaged_index_is_made_again(folder):
+    before = runner.find("length > 20", folder)
+    for file in (cache_folder() / EPISODES).iterdir():
+        file.write_bytes(file.read_bytes()[:40] + b"?")
+    with pytest.raises(RunnerError, match="the next search makes it again"):
+        runner.find("length > 20", folder)
+    assert runner.find("length > 20", folder) == before
