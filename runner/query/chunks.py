@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import and_
+from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
@@ -79,6 +80,38 @@ def _ranges(known: Known) -> Any:
         for name, (low, high) in known.items()
     ]
     return reduce(and_, ranges)
+
+
+class Relation(ds.Dataset):  # type: ignore[misc]
+    """A view that DuckDB asks for columns, and for the rows that satisfy a condition."""
+
+    def __init__(
+        self, columns: pa.Schema, read: Callable[[pa.Schema, Condition], Iterator[pa.RecordBatch]]
+    ) -> None:
+        self._columns, self._read = columns, read
+
+    @property
+    def schema(self) -> pa.Schema:
+        """The columns."""
+        return self._columns
+
+    def scanner(self, columns: Sequence[str] | None = None, filter: Any = None, **_: object) -> Any:  # noqa: A002
+        """Return what DuckDB uses of a scanner, which would read ahead in threads of its own."""
+        names, condition = columns or self._columns.names, Condition(filter, self._columns)
+        shown = _selected(self._columns, lambda name: name in names)
+        read = _selected(self._columns, lambda name: name in names or condition.mentions(name))
+        batches = self._read(read, condition)
+        rows = batches if filter is None else (batch.filter(filter) for batch in batches)
+        return SimpleNamespace(
+            projected_schema=shown,
+            to_reader=lambda: pa.RecordBatchReader.from_batches(
+                shown, (batch.select(shown.names) for batch in rows)
+            ),
+        )
+
+
+def _selected(columns: pa.Schema, is_selected: Callable[[str], bool]) -> pa.Schema:
+    return pa.schema([column for column in columns if is_selected(column.name)])
 
 
 @dataclass(frozen=True)

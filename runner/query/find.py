@@ -189,9 +189,11 @@ class _Search:
         """
         kinds: dict[str, list[int]] = {}
         for k, row in enumerate(self.runs.rows):
-            with self.runs.reading("find", row):
+            try:
                 self.files[k] = self._index.file(row, self.runs)
                 kinds.setdefault(kind_of(self.files[k]), []).append(k)
+            except RunnerError as error:
+                self.runs.leave_out("find", row, error)
         wrong = []
         for numbers in kinds.values():
             facts = facts_of(self.files[numbers[0]])
@@ -199,10 +201,8 @@ class _Search:
                 first, second = (_parsed(facts, condition, sort, reads) for reads in (False, True))
             except RunnerError as error:
                 wrong.append(error)
-                ids = [self.runs.rows[k]["id"] for k in numbers]
-                self.runs.left_out |= {
-                    f"{name} find": f"run {name} is left out of find: {error}" for name in ids
-                }
+                for k in numbers:
+                    self.runs.leave_out("find", self.runs.rows[k], error)
             else:
                 self._ask(numbers, first, second, f" AND phase = '{phase}'" if phase else "")
         if wrong and len(wrong) == len(kinds):

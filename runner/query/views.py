@@ -12,12 +12,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.dataset as ds
 from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_records
@@ -27,7 +25,6 @@ from runner.archive.columns import Shape
 from runner.archive.places import at_hand
 from runner.environments.mdp import events_of
 from runner.errors import NotInRecording, RunnerError
-from runner.query.chunks import Condition, RunTables, opened_tables
 from runner.recording.marks import read_marks
 from runner.recording.reader import open_recording
 from runner.runs.catalogue.columns import COLUMNS, IndexRow
@@ -36,6 +33,9 @@ from runner.runs.catalogue.index import look
 from runner.runs.listing import listed_run
 from runner.runs.run import Run
 from runner.util.values import flatten
+
+if TYPE_CHECKING:
+    from runner.query.chunks import Condition, Relation, RunTables
 
 TABLES: Final = {"steps": layout.STEPS, "episodes": layout.EPISODES, "scalars": layout.SCALARS}
 """The views of tables, which may be long."""
@@ -50,38 +50,6 @@ _MARKS: Final = {
 }
 _ROW: Final = ("root", "entry", "id", "name", "status")
 _REPORT_SECONDS: Final = 0.2
-
-
-class Relation(ds.Dataset):  # type: ignore[misc]
-    """A view that DuckDB asks for columns, and for the rows that satisfy a condition."""
-
-    def __init__(
-        self, columns: pa.Schema, read: Callable[[pa.Schema, Condition], Iterator[pa.RecordBatch]]
-    ) -> None:
-        self._columns, self._read = columns, read
-
-    @property
-    def schema(self) -> pa.Schema:
-        """The columns."""
-        return self._columns
-
-    def scanner(self, columns: Sequence[str] | None = None, filter: Any = None, **_: object) -> Any:  # noqa: A002
-        """Return what DuckDB uses of a scanner, which would read ahead in threads of its own."""
-        names, condition = columns or self._columns.names, Condition(filter, self._columns)
-        shown = _selected(self._columns, lambda name: name in names)
-        read = _selected(self._columns, lambda name: name in names or condition.mentions(name))
-        batches = self._read(read, condition)
-        rows = batches if filter is None else (batch.filter(filter) for batch in batches)
-        return SimpleNamespace(
-            projected_schema=shown,
-            to_reader=lambda: pa.RecordBatchReader.from_batches(
-                shown, (batch.select(shown.names) for batch in rows)
-            ),
-        )
-
-
-def _selected(columns: pa.Schema, is_selected: Callable[[str], bool]) -> pa.Schema:
-    return pa.schema([column for column in columns if is_selected(column.name)])
 
 
 class SelectedRuns:
@@ -121,7 +89,11 @@ class SelectedRuns:
         try:
             yield listed_run(Path(row["root"], row["entry"]), row["id"])
         except RunnerError as error:
-            self.left_out[f"{row['id']} {name}"] = f"run {row['id']} is left out of {name}: {error}"
+            self.leave_out(name, row, error)
+
+    def leave_out(self, name: str, row: IndexRow, error: RunnerError) -> None:
+        """Leave a run out of a view, or of `find`."""
+        self.left_out[f"{row['id']} {name}"] = f"run {row['id']} is left out of {name}: {error}"
 
     def _count(self, row: IndexRow, rows: int) -> None:
         if self.is_stopped:
@@ -134,6 +106,8 @@ class SelectedRuns:
 
     def _runs(self) -> Relation:
         """Return the columns of `dualtaxi ls`, and each configuration as JSON."""
+        from runner.query.chunks import Relation  # imports pandas
+
         kinds = {"run": pa.string()}
         kinds |= {name: _TYPES[column.type] for name, column in COLUMNS.items() if column.type}
         kinds |= {"seed": pa.uint64(), "created": _MOMENT, "tags": _TEXTS, "settings": pa.string()}
@@ -173,6 +147,8 @@ class SelectedRuns:
 
     def table(self, name: str, among: Sequence[IndexRow]) -> Relation:
         """Return the view of a table, with the columns of all of these runs."""
+        from runner.query.chunks import Relation, opened_tables  # imports pandas
+
         kinds, rows = {"run": pa.string()}, []
         for row in among:
             with self.reading(name, row) as run, opened_tables(run) as tables:
@@ -206,6 +182,8 @@ class SelectedRuns:
         condition: Condition,
     ) -> Iterator[pa.RecordBatch]:
         """Yield some columns of a table; some of the rows may not satisfy the condition."""
+        from runner.query.chunks import opened_tables  # imports pandas
+
         for k in condition.may_hold([{"run": (row["id"], row["id"])} for row in rows]):
             with self.reading(name, rows[k]) as run, opened_tables(run) as tables:
                 for batch in _batches_of(tables, TABLES[name], own_names, needed, condition):

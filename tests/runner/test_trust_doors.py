@@ -248,6 +248,7 @@ COMMANDS = {
     "rerecord": ["RUN"],
     "resume": ["RUN", "--accept-changes"],
     "show": ["RUN"],
+    "find": ["any(reward < 0)"],
     "sql": ["SELECT * FROM steps"],
     "values": ["RUN", "--episode", "0", "--checkpoint", "policy@40", "--policy", "policy_of_doors:policy"],
     "verify": ["RUN", "--rerun"],

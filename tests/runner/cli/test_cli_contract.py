@@ -81,6 +81,7 @@ WORDS = {
     "explain": "{tiny} {patient} --seeds 2",
     "label": "@latest --tag good",
     "mark": "{run} 0:1",
+    "find": "length>0 --limit 2",
     "sql": "VALUES(1)",
     "rm": "@latest --dry-run",
     "prune": "--keep-last 0 --dry-run",

@@ -26,6 +26,7 @@ def test_the_public_names():
         "branch",
         "evaluate",
         "explain",
+        "find",
         "find_run",
         "frames",
         "integrations",
