@@ -62,11 +62,8 @@ class Hit:
     """How often each event happened, without those that did not."""
     marks: list[str]
     """The texts of its marks."""
-
-    @property
-    def replay(self) -> str:
-        """The address of its replay."""
-        return f"/runs/{self.run_id}/replay/{EpisodeRef.parse(self.at).episode_path}"
+    replay: str
+    """The address of its replay."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +100,7 @@ class Found:
 
     def as_json(self) -> Json:
         """Return the result as JSON can hold it."""
-        return {**vars(self), "hits": [{**vars(hit), "replay": hit.replay} for hit in self.hits]}
+        return {**vars(self), "hits": list(map(vars, self.hits))}
 
 
 def find(
@@ -193,7 +190,8 @@ class _Search:
                 self.files[k] = self._index.file(row, self.runs)
                 kinds.setdefault(kind_of(self.files[k]), []).append(k)
             except RunnerError as error:
-                self.runs.leave_out("find", row, error)
+                if not any(key.startswith(f"{row['id']} ") for key in self.runs.left_out):
+                    self.runs.leave_out("find", row, error)
         wrong = []
         for numbers in kinds.values():
             facts = facts_of(self.files[numbers[0]])
@@ -273,6 +271,7 @@ class _Search:
                 run_id=row["id"],
                 name=row["name"],
                 at=values["at"],
+                replay=f"/runs/{row['id']}/replay/{EpisodeRef.parse(values['at']).episode_path}",
                 ret=values["return"],
                 length=values["length"],
                 ended=next((name for name in ENDS if values.get(name)), "reset"),

@@ -354,6 +354,15 @@ def query(roots: tuple[Path, ...], text: str, runs: str) -> bytes:
     )
 
 
+def find(roots: tuple[Path, ...], expression: str, runs: str, phase: str, sort: str, limit: int) -> bytes:
+    """Return the episodes that match an expression, as `dualtaxi find --json` prints them."""
+    require("pyarrow", extra="sql", purpose="`find`")
+    from runner.query import find
+
+    found = find.find(expression, roots, runs=runs, phase=phase or None, sort=sort, limit=limit)
+    return as_json(found.as_json())
+
+
 def as_json(value: object) -> bytes:
     """Return a value as JSON; NaN and infinity become null."""
     return json.dumps(finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")

@@ -1,13 +1,14 @@
-"""SQL over the runs of a server: an API route, and a page with a form."""
+"""Questions about all runs of a server, in SQL or for episodes: API routes, and pages with a form."""
 
 from __future__ import annotations
 
 import json
+from functools import partial
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, Literal
 
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, TypeAdapter
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Grid
@@ -38,6 +39,19 @@ class QueryResponse(BaseModel):
     """Sentences on the runs that were left out."""
 
 
+class Search(BaseModel):
+    """What is asked about episodes."""
+
+    expression: str = Field("", max_length=1000, description="A condition, as for `dualtaxi find`.")
+    runs: str = Field("", max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")
+    phase: Literal["", "train", "eval"] = Field("", description="Training or evaluation; both by default.")
+    sort: str = Field("", max_length=1000, description="A number to sort by, such as `-ret`.")
+    limit: int = Field(20, ge=1, le=1000, description="Maximum number of episodes.")
+
+
+SearchOf = Annotated[Search, Query()]
+
+
 @api.get(
     "/sql",
     response_model=QueryResponse,
@@ -47,6 +61,41 @@ class QueryResponse(BaseModel):
 async def sql(processes: ProcessesOf, settings: SettingsOf, query: Sql, runs: Runs = "") -> Response:
     """Return the first rows that `dualtaxi sql` returns."""
     return json_response(await _answer(processes, settings, query, runs))
+
+
+@api.get(
+    "/find",
+    response_model=dict[str, object],
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.SERVICE_UNAVAILABLE),
+    summary="Find the episodes of all runs that match an expression.",
+)
+async def find(request: Request, search: SearchOf) -> Response:
+    """Return what `dualtaxi find --json` prints."""
+    return json_response(await _found(request, search))
+
+
+@pages.get("/find")
+async def find_page(request: Request, search: SearchOf) -> Response:
+    """Show the form, and the episodes that match."""
+    shown: dict[str, object] = {"search": search, "problem": "", "found": None}
+    try:
+        if search.expression.strip():
+            from runner.query.find import Found  # needs the extra
+
+            shown["found"] = TypeAdapter(Found).validate_json(await _found(request, search))
+    except RunnerError as error:
+        shown["problem"] = message_of(error, request)
+    status = HTTPStatus.BAD_REQUEST if shown["problem"] else HTTPStatus.OK
+    return await run_in_threadpool(page, request, "find.html", shown, status)
+
+
+async def _found(request: Request, search: Search) -> bytes:
+    """Return the answer to a search, which is computed in a process with limits, or cached for seconds."""
+    state = request.app.state
+    values = *search.model_dump().values(), state.catalogue.state()
+    make = partial(state.processes, computed.find, state.settings.recordings, *values[:-1])
+    body: bytes = await state.cache.get_or_await((computed.find, *values), make)
+    return bytes(state.settings.without_folders(body.decode()).encode())
 
 
 @pages.get("/sql")

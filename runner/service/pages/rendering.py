@@ -28,6 +28,7 @@ from runner.util import humanize
 TEMPLATES: Final = files("runner.service.pages") / "templates"
 SECTIONS: Final = (
     ("/runs", "Runs"),
+    ("/find", "Find"),
     ("/sql", "SQL"),
     ("/sweeps", "Sweeps"),
     ("/queue", "Queue"),

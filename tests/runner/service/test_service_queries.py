@@ -52,6 +52,33 @@ def test_the_page_shows_what_it_is_asked(client):
     assert "<b>" not in text
 
 
+def test_the_route_finds_episodes(client, recordings):
+    search = {"expression": "length > 0 and count(reward < 0) > 1", "sort": "-length", "limit": 3}
+    answer = client.get("/api/v1/find", params=search).json()
+    found = runner.find(search["expression"], recordings, sort="-length", limit=3)
+    assert answer == found.as_json()
+    text = client.get("/find", params=search).text
+    for hit in found.hits:
+        assert f'<a href="{hit.replay}">' in text
+        assert client.get(hit.replay).status_code == 200
+    assert found.sentence in text
+    find_run("second", recordings).recording.write_bytes(b"nothing")
+    (reason,) = client.get("/api/v1/find", params={"expression": "length > 0"}).json()["left_out"]
+    assert str(recordings) not in reason
+
+
+def test_a_wrong_search_is_refused_in_both_forms(client):
+    assert "placeholder" in client.get("/find").text
+    search = {"expression": "lenght > 0"}
+    response = client.get("/api/v1/find", params=search)
+    assert response.status_code == 400
+    assert "Did you mean 'length'" in response.json()["error"]["message"]
+    response = client.get("/find", params=search)
+    assert response.status_code == 400
+    assert "lenght" in response.text
+    assert client.get("/find", params={"expression": "length > 0", "limit": 0}).status_code == 422
+
+
 def test_marks_are_set_listed_and_removed(client, recordings):
     run = find_run("first", recordings)
     path = f"/api/v1/runs/{run.run_id}/marks"
