@@ -34,14 +34,20 @@ AGGREGATES: Final[dict[Any, str]] = {
 }
 """The functions of an episode's steps."""
 _OF_NUMBERS: Final = ("min", "max", "sum", "first", "last")
-_BOUNDS: Final[dict[Operation, tuple[str, str]]] = {
-    ast.Lt: ("{0} < {3}", "{1} >= {2}"),
-    ast.LtE: ("{0} <= {3}", "{1} > {2}"),
-    ast.Gt: ("{1} > {2}", "{0} <= {3}"),
-    ast.GtE: ("{1} >= {2}", "{0} < {3}"),
-    ast.Eq: ("({0} <= {3} AND {1} >= {2} AND NULL)", "({0} <> {3} OR {1} <> {2})"),
+_AT_STEPS: Final[dict[Operation, tuple[str, str]]] = {
+    ast.Not: ("{0.fails}", "{0.some}"),
+    ast.And: ("({0.some} AND {1.some} AND NULL)", "({0.fails} OR {1.fails})"),
+    ast.Or: ("({0.some} OR {1.some})", "({0.fails} AND {1.fails} AND NULL)"),
+    ast.Lt: ("{0.low} < {1.high}", "{0.high} >= {1.low}"),
+    ast.LtE: ("{0.low} <= {1.high}", "{0.high} > {1.low}"),
+    ast.Gt: ("{0.high} > {1.low}", "{0.low} <= {1.high}"),
+    ast.GtE: ("{0.high} >= {1.low}", "{0.low} < {1.high}"),
+    ast.Eq: (
+        "({0.low} <= {1.high} AND {0.high} >= {1.low} AND NULL)",
+        "({0.low} <> {1.high} OR {0.high} <> {1.low})",
+    ),
 }
-"""Whether a comparison holds, or fails, at some step: from the least and the greatest value of both sides."""
+"""Over the index, whether a condition holds at some step, and whether it fails at some step."""
 
 
 @dataclass(frozen=True)
@@ -144,37 +150,28 @@ class EpisodeParser(Parser[Part]):
         sql = "" if isinstance(value, str) else f"'{value!r}'::DOUBLE"
         return Part(NUMBER if sql else TEXT, sql, low=sql, high=sql, label=repr(value), value=value)
 
-    def applied(  # noqa: PLR0911 - a line a kind
-        self, kind: str, operation: Operation, *parts: Part
-    ) -> Part:
+    def applied(self, kind: str, operation: Operation, *parts: Part) -> Part:
         """Return an operation on one or two terms, and what the index knows of it."""
         left, right = parts[0], parts[-1]
         if operation is ast.USub and isinstance(left.value, int | float):
             return self.fixed(-left.value)
         part = Part(kind, self.operations[operation].format(*(part.sql for part in parts)))
-        if operation is ast.Not:
-            return replace(part, some=left.fails, fails=left.some)
-        if operation is ast.And:
-            some, fails = f"({left.some} AND {right.some} AND NULL)", f"({left.fails} OR {right.fails})"
-            return replace(part, some=some, fails=fails)
-        if operation is ast.Or:
-            some, fails = f"({left.some} OR {right.some})", f"({left.fails} AND {right.fails} AND NULL)"
-            return replace(part, some=some, fails=fails)
-        if kind != CONDITION or not self._is_inside:
+        if not self._is_inside or operation not in _AT_STEPS:
             return part
+        some, fails = (text.format(*parts) for text in _AT_STEPS[operation])
+        if operation in (ast.Not, ast.And, ast.Or):
+            return replace(part, some=some, fails=fails)
         part = replace(part, sql=f"coalesce({part.sql}, FALSE)")
         if operation is ast.Eq:
-            part = replace(part, label=f"{left.label} == {right.label}")
-            if self._column("count", part) != "NULL":
-                return self._flag(part)
-        some, fails = (text.format(left.low, left.high, right.low, right.high) for text in _BOUNDS[operation])
-        is_simple = left.value is not None or right.value is not None
-        return replace(part, some=some, fails=fails) if is_simple else part
+            part = self._flag(replace(part, label=f"{left.label} == {right.label}"))
+        is_known = part.some != "NULL" or left.value is right.value is None
+        return part if is_known else replace(part, some=some, fails=fails)
 
     def _flag(self, part: Part) -> Part:
-        """Return a condition on steps that the index counts."""
-        count = self._column("count", part)
-        return replace(part, kind=CONDITION, some=f"({count} > 0)", fails=f"({count} < length)")
+        """Return a condition on steps, which the index may count."""
+        if (count := self._column("count", part)) == "NULL":
+            return part
+        return replace(part, some=f"({count} > 0)", fails=f"({count} < length)")
 
     def _column(self, function: str, part: Part) -> str:
         """Return the column of the index with a function of steps; NULL if there is none."""
@@ -263,7 +260,7 @@ class EpisodeParser(Parser[Part]):
         if not self._is_inside:
             return part
         if column in facts.flags:
-            return self._flag(part)
+            return self._flag(replace(part, kind=CONDITION))
         return replace(part, low=self._column("min", part), high=self._column("max", part))
 
 

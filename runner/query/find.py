@@ -13,10 +13,10 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -29,6 +29,7 @@ from runner.query.episode_index import EpisodeIndex, facts_of, kind_of, literal,
 from runner.query.sql import MEMORY_MB, SETTINGS
 from runner.query.views import SelectedRuns
 from runner.recording.marks import read_marks
+from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
 from runner.runs.run import recordings_folder
 from runner.util.extras import require
@@ -171,10 +172,10 @@ class _Search:
             ":memory:", config=SETTINGS | {"memory_limit": f"{memory}MB"} | _OPEN
         )
         self._index = EpisodeIndex(self.connection)
-        self.connection.execute(f"SET allowed_directories = [{literal(str(self._index.folder))}]")
-        self.connection.execute(f"SET temp_directory = {literal(str(self._index.folder / 'spilled'))}")
-        self.connection.execute("SET enable_external_access = false")
-        self.connection.execute("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
+        self._sql(f"SET allowed_directories = [{literal(str(self._index.folder))}]")
+        self._sql(f"SET temp_directory = {literal(str(self._index.folder / 'spilled'))}")
+        self._sql("SET enable_external_access = false")
+        self._sql("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
         self.files: dict[int, Path] = {}
         """The indexes of runs, by the number of the row."""
 
@@ -210,18 +211,16 @@ class _Search:
         """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
         where, key, aggregates, _ = first
         is_open = f"{where} IS NULL OR {key} IS NULL" if aggregates else "FALSE"
-        self.connection.execute(
+        self._sql(
             f"INSERT INTO hits SELECT ($runs)[file_index::BIGINT + 1], file_row_number, {key}, {is_open} "
             f"FROM read_parquet($files) WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}",
             {"files": [str(self.files[k]) for k in numbers], "runs": numbers},
         )
-        opened = self.connection.execute(
-            "SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run"
-        ).fetchall()
+        opened = self._sql("SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run")
         for (k,) in opened:
             with self.runs.reading("find", self.runs.rows[k]):
                 self._read(k, *second)
-        self.connection.execute("DELETE FROM hits WHERE is_open")
+        self._sql("DELETE FROM hits WHERE is_open")
 
     def _read(
         self, k: int, where: str, key: str, aggregates: dict[str, str], windows: dict[str, str]
@@ -233,7 +232,7 @@ class _Search:
             "ON row = file_row_number"
         )
         ends = "min(first_step), max(last_step), list(DISTINCT episode)"
-        ((low, high, episodes),) = self.connection.execute(f"SELECT {ends} FROM ({chosen})").fetchall()
+        ((low, high, episodes),) = self._sql(f"SELECT {ends} FROM ({chosen})")
         steps = self.runs.table("steps", [row])
         if "step" not in steps.schema.names:
             return  # it is left out
@@ -242,42 +241,44 @@ class _Search:
             among += f" AND episode IN ({', '.join(map(str, episodes))})"
         self.connection.register("steps", steps)
         rows = with_steps(chosen, steps.schema, aggregates, windows, among)
-        self.connection.execute(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM {rows} WHERE {where}")
+        self._sql(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM {rows} WHERE {where}")
 
     def found(self, expression: str, limit: int | None) -> Found:
         """Return the first episodes, as they are sorted."""
         ids = {key.split()[0] for key in self.runs.left_out}
-        gone = [k for k, row in enumerate(self.runs.rows) if row["id"] in ids]
-        self.connection.execute("DELETE FROM hits WHERE list_contains($runs, run)", {"runs": gone})
-        ((count,),) = self.connection.execute("SELECT count(*) FROM hits").fetchall()
+        searched = [k for k, row in enumerate(self.runs.rows) if row["id"] not in ids]
+        self._sql("DELETE FROM hits WHERE run NOT IN (SELECT unnest($runs))", {"runs": searched})
+        ((count,),) = self._sql("SELECT count(*) FROM hits")
         first = "SELECT run, row FROM hits ORDER BY key NULLS LAST, run, row LIMIT $limit"
-        places = self.connection.execute(first, {"limit": count if limit is None else limit}).fetchall()
-        hits: dict[object, Hit] = {}
+        places = self._sql(first, {"limit": count if limit is None else limit})
+        rows: dict[tuple[int, int], Json] = {}
         for k in {k for k, _ in places}:
-            rows = [row for run, row in places if run == k]
-            hits |= {(k, row): hit for row, hit in zip(rows, self._hits(k, rows), strict=True)}
-        ordered = [hits[place] for place in places]
-        return Found(
-            expression, ordered, count, len(self.runs.rows) - len(gone), list(self.runs.left_out.values())
-        )
+            wanted = [row for run, row in places if run == k]
+            values = pq.read_table(self.files[k]).take(wanted).to_pylist()
+            rows |= {(k, row): values for row, values in zip(wanted, values, strict=True)}
+        hits = [_hit(self.runs.rows[k], rows[k, row]) for k, row in places]
+        return Found(expression, hits, count, len(searched), list(self.runs.left_out.values()))
 
-    def _hits(self, k: int, rows: Sequence[int]) -> Iterator[Hit]:
-        """Yield episodes of a run."""
-        row = self.runs.rows[k]
-        marks = read_marks(Path(row["root"], row["entry"])).marks
-        for values in pq.read_table(self.files[k]).take(rows).to_pylist():
-            place = values["phase"], values["episode"]
-            yield Hit(
-                run_id=row["id"],
-                name=row["name"],
-                at=values["at"],
-                replay=f"/runs/{row['id']}/replay/{EpisodeRef.parse(values['at']).episode_path}",
-                ret=values["return"],
-                length=values["length"],
-                ended=next((name for name in ENDS if values.get(name)), "reset"),
-                events={name[2:]: n for name, n in values.items() if name.startswith("n_") and n},
-                marks=[mark.text for mark in marks if (mark.phase, mark.episode) == place],
-            )
+    def _sql(self, query: str, values: Mapping[str, object] | None = None) -> list[Any]:
+        rows: list[Any] = self.connection.execute(query, values).fetchall()
+        return rows
+
+
+def _hit(run: IndexRow, row: Json) -> Hit:
+    """Return the episode of a row in the index of a run."""
+    place = row["phase"], row["episode"]
+    marks = read_marks(Path(run["root"], run["entry"])).marks
+    return Hit(
+        run_id=run["id"],
+        name=run["name"],
+        at=row["at"],
+        replay=f"/runs/{run['id']}/replay/{EpisodeRef.parse(row['at']).episode_path}",
+        ret=row["return"],
+        length=row["length"],
+        ended=next((name for name in ENDS if row.get(name)), "reset"),
+        events={name[2:]: n for name, n in row.items() if name.startswith("n_") and n},
+        marks=[mark.text for mark in marks if (mark.phase, mark.episode) == place],
+    )
 
 
 def _parsed(facts: Facts, condition: str, sort: str, reads_steps: bool) -> _Question:

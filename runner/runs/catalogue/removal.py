@@ -30,6 +30,7 @@ from runner.runs.listing import listed_run
 from runner.runs.locking import locked
 from runner.runs.run import Run
 from runner.runs.store import Store
+from runner.util.files import EPISODES, cache_folder
 from runner.util.humanize import listed
 
 _STRAY_SECONDS: Final = 60
@@ -154,6 +155,8 @@ def remove(removal: Removal, foreign: bool = False) -> None:
             raise
         _delete(hidden, foreign)
         Store(removal.root).drop(run.folder.name)
+        for index in (cache_folder() / EPISODES).glob(f"{run.run_id}-*"):
+            index.unlink(missing_ok=True)
     except OSError as error:
         raise StorageError(f"{error.filename or hidden}: cannot be removed ({error.strerror}).") from error
 

@@ -22,7 +22,7 @@ from runner.runs.locking import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
 from runner.runs.store import Store
 from runner.runs.trust_marks import MARK_FILE
-from runner.util.files import EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
+from runner.util.files import EPISODES, EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 
 REMOVED: Final = ".removed-"
 """The prefix of a run's folder from the moment it is removed until its files are deleted."""
@@ -109,7 +109,7 @@ def cached(part: str) -> Counter[str]:
     """Return the bytes cached for each run, by its id; what is for several counts for the first.
 
     Args:
-        part: the folder in the cache: `EXPORTS`, `TABLES` or `RESTORED`.
+        part: the folder in the cache: `EXPORTS`, `TABLES`, `EPISODES` or `RESTORED`.
     """
     by_run: Counter[str] = Counter()
     with contextlib.suppress(OSError), os.scandir(cache_folder() / part) as entries:
@@ -181,7 +181,7 @@ def usage_of(
     Args:
         read: calls some work with the index and returns its result, as `look` does.
     """
-    exports, restored = cached(EXPORTS) + cached(TABLES), cached(RESTORED)
+    exports, restored = cached(EXPORTS) + cached(TABLES) + cached(EPISODES), cached(RESTORED)
     rows = read(lambda index: index.with_same_as(index.select(chosen, columns=_COLUMNS)))
     checkpoints = {root: Store(Path(root)).sizes() for root in {row["root"] for row in rows}}
     sums = Sums()

@@ -213,6 +213,15 @@ def test_a_recording_that_changed_is_read_again(tmp_path):
     assert len(list((cache_folder() / EPISODES).glob(f"{first.run_id}-*"))) == 1
 
 
+def test_removing_a_run_removes_its_index(tmp_path):
+    run = make_run(tmp_path, LAKE)
+    assert runner.find("length > 0", tmp_path).count
+    assert list((cache_folder() / EPISODES).glob(f"{run.run_id}-*"))
+    result = CliRunner().invoke(cli, ["rm", run.run_id, "--yes", "--recordings", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    assert not list((cache_folder() / EPISODES).glob(f"{run.run_id}-*"))
+
+
 def test_an_archived_run_has_the_same_hits(tmp_path):
     run = make_run(tmp_path / "runs", TAXIS)
     expressions = ("count(collision) > 1", "then(pickup, drop_off)")

@@ -224,7 +224,7 @@ def test_a_query_is_stopped_while_runs_are_opened(folder, monkeypatch):
         with opened_tables(run) as tables:
             yield tables
 
-    monkeypatch.setattr("runner.query.views.opened_tables", slowly)
+    monkeypatch.setattr("runner.query.chunks.opened_tables", slowly)
     with pytest.raises(RunnerError, match=r"stopped after 0\.2 s"):
         rows(folder, "SELECT count(*) FROM steps", timeout=0.2)
     assert len(opened) < 3
