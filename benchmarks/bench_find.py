@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
@@ -14,9 +15,10 @@ from benchmarks.bench_catalogue import many, one_run
 from benchmarks.bench_cold_start import command
 from benchmarks.figures import Figure, figure
 from benchmarks.processes import run
+from benchmarks.serving import percentile, response_times, serving
 from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
 
-RUNS, EPISODES_OF_RUN = 1_000, 5_000
+RUNS, EPISODES_OF_RUN, CLIENTS = 1_000, 5_000, 20
 EXPRESSIONS = (
     "ret < -100 and count(collision) >= 2 and length > 50",
     'any(action == "north + east") and never(collision)',
@@ -42,7 +44,12 @@ def measure(quick: bool) -> list[Figure]:
                 figure(f"find {expression}", seconds, "s", (1, 0.3), higher_is_better=False, detail=note),
                 figure("  peak memory", peaks, "MB", (500, 300), higher_is_better=False),
             ]
-    return figures
+        with serving(place, environment=environment) as service:
+            page = f"/find?expression={quote(EXPRESSIONS[0])}&sort=ret"
+            response_times(service, [page], clients=1, seconds=1)
+            times = [1000 * taken for taken in response_times(service, [page], CLIENTS, 3 if quick else 10)]
+    median, note = percentile(times, 50), f"{CLIENTS} clients ask the same; an answer is kept for seconds"
+    return [*figures, Figure("page of hits, median", median, "ms", 100, 30, False, detail=note)]
 
 
 def _write_many_episodes() -> None:

@@ -26,6 +26,7 @@ Args = ParamSpec("Args")
 Result = TypeVar("Result")
 
 PRELOADED: Final = (
+    "duckdb",
     "gymnasium",
     "pygame",
     "runner.analysis.diff",
@@ -37,6 +38,7 @@ PRELOADED: Final = (
     "runner.environments.loading",
     "runner.execution.estimate",
     "runner.execution.initial_tables",
+    "runner.query.find",
     "runner.replay.environment",
     "runner.runs.importing",
     "runner.service.computed",
