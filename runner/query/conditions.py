@@ -50,6 +50,10 @@ _AT_STEPS: Final[dict[Operation, tuple[str, str]]] = {
 """Over the index, whether a condition holds at some step, and whether it fails at some step."""
 
 
+_OF_STEPS: Final = re.compile(r"(?:min|count)\((?!.* == )(.*)\)|n_(.*)")
+"""A column of the index for each column of steps, and for each event, which may be known without steps."""
+
+
 @dataclass(frozen=True)
 class Facts:
     """What the episodes and steps of a run have."""
@@ -60,15 +64,10 @@ class Facts:
     """The names of actions by number, by the column of steps."""
 
     @property
-    def numbers(self) -> list[str]:
-        """The columns of steps with numbers."""
-        return [name[4:-1] for name in self.index if name.startswith("min(")]
-
-    @property
-    def flags(self) -> list[str]:
-        """The columns of steps with flags, and events, which may be known without steps."""
-        counted = [name[6:-1] for name in self.index if name.startswith("count(") and "==" not in name]
-        return counted + [name[2:] for name in self.index if name.startswith("n_")]
+    def steps(self) -> list[str]:
+        """The columns of steps with numbers, flags and events."""
+        matches = map(_OF_STEPS.fullmatch, self.index)
+        return list(dict.fromkeys(match[1] or match[2] for match in matches if match))
 
 
 def quoted(name: str) -> str:
@@ -247,7 +246,7 @@ class EpisodeParser(Parser[Part]):
         text, facts = self.text_of(node)[:60], self.facts
         name = re.sub("^ret(?=_|$)", "return", spelt(text))
         plain = [column for column in facts.index if "(" not in column and column != "phase"]
-        of_steps = {spelt(column): column for column in (*facts.numbers, *facts.flags)}
+        of_steps = {spelt(column): column for column in facts.steps}
         columns = of_steps if self._is_inside else {spelt(column): column for column in plain}
         if name not in columns:
             hint = nearest(text, [*columns, *AGGREGATES])
@@ -259,9 +258,9 @@ class EpisodeParser(Parser[Part]):
         part = Part(CONDITION if column in ENDS else NUMBER, quoted(column), label=column)
         if not self._is_inside:
             return part
-        if column in facts.flags:
-            return self._flag(replace(part, kind=CONDITION))
-        return replace(part, low=self._column("min", part), high=self._column("max", part))
+        if f"min({column})" in facts.index:
+            return replace(part, low=self._column("min", part), high=self._column("max", part))
+        return self._flag(replace(part, kind=CONDITION))
 
 
 def spelt(name: str) -> str:

@@ -40,7 +40,7 @@ _HEX: Final = 16
 _MAX_COLUMNS: Final = 64
 """The most numbers of steps, and the most actions, that are in an index."""
 _NOT_INDEXED: Final = ("run", "phase", "position", "step", "episode", "environment")
-_PLAIN: Final = ("phase", "episode", "first_step", "last_step", "length", "penalties", "return", *ENDS)
+_PLAIN: Final = ("phase", "episode", "first_step", "last_step", "length", "penalties", "return", *ENDS[1:])
 _AT: Final = (
     "CASE WHEN phase = 'train' THEN '' || episode WHEN episode < stop "
     "THEN 'eval:' || after || ':' || (episode - start) ELSE 'eval:-1:' || episode END"
@@ -73,48 +73,51 @@ class EpisodeIndex:
         start = f"{row['id']}-{_hash(str(path))}"
         stem = start + _hash([_VERSION, state.st_mtime_ns, state.st_size, state.st_ino])
         if stem not in self._files:
-            with storage_errors(self.folder), replacing(self.folder / f"{start}.parquet") as fresh:
-                kind = self._write(row, runs, fresh)
-                for older in self.folder.glob(f"{start}*"):
-                    older.unlink(missing_ok=True)
-            self._files[stem] = (self.folder / f"{start}.parquet").rename(
-                self.folder / f"{stem}{kind}.parquet"
-            )
+            for older in self.folder.glob(f"{start}*"):
+                older.unlink(missing_ok=True)
+            self._files[stem] = self._make(row, runs, stem)
             remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
         return self._files[stem]
 
-    def _write(self, row: IndexRow, runs: SelectedRuns, path: Path) -> str:
-        """Write the index of a run, and return the hash of its facts."""
+    def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
+        """Make the file of a run."""
         views = {name: runs.table(name, [row]) for name in ("episodes", "steps")}
         runs.left_out.pop(f"{row['id']} steps", None)  # a run need not have steps
+        _check(row, runs)
         run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
         with open_recording(run.recording) as recording:
             shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
-        episodes, steps = (view.schema for view in views.values())
-        plain = {name for name in episodes.names if name in _PLAIN or name.startswith(("return_", "n_"))}
-        if shape.mdp is None or not shape.mdp.success_events:
-            plain -= {"success"}
-        aggregates = _aggregates(shape, steps)
-        facts = Facts([*sorted(plain), *aggregates], _names_of_actions(shape))
         for name, view in (*views.items(), ("evaluations", evaluations)):
             self._connection.register(name, view)
-        has_turns = "environment" in episodes.names
-        columns = ", ".join(map(quoted, sorted(plain)))
-        environment, own = ("environment", _COUNTED) if has_turns else ("0", "episode")
-        chosen = (
+        episodes, steps = (view.schema for view in views.values())
+        plain = [name for name in episodes.names if name in _PLAIN or name.startswith(("return_", "n_"))]
+        if shape.mdp is not None and shape.mdp.success_events:
+            plain.append("success")
+        environment, own = ("environment", _COUNTED) if "environment" in episodes.names else ("0", "episode")
+        columns = ", ".join(map(quoted, plain))
+        rows = (
             f"SELECT {columns}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
             "ASOF LEFT JOIN evaluations ON episode >= start"
         )
-        rows = with_steps(chosen, steps, aggregates, {}) if aggregates else f"({chosen})"
-        metadata = json.dumps(asdict(facts))
-        self._connection.execute(
-            f"COPY (SELECT * FROM {rows} ORDER BY phase DESC, episode) TO {literal(str(path))} "
-            f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{facts: {literal(metadata)}}})"
-        )
-        if reasons := [reason for key, reason in runs.left_out.items() if key.startswith(f"{row['id']} ")]:
-            raise RecordingError(reasons[0])
-        return _hash(metadata)
+        if aggregates := _aggregates(shape, steps):
+            rows = with_steps(rows, steps, aggregates, {})
+        facts = json.dumps(asdict(Facts([*plain, *aggregates], _names_of_actions(shape))))
+        path = self.folder / f"{stem}{_hash(facts)}.parquet"
+        with storage_errors(path), replacing(path) as fresh:
+            self._connection.execute(
+                f"COPY (FROM ({rows}) ORDER BY phase DESC, episode) TO {literal(str(fresh))} "
+                f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{facts: {literal(facts)}}})"
+            )
+            _check(row, runs)
+        return path
+
+
+def _check(row: IndexRow, runs: SelectedRuns) -> None:
+    """Raise the error for which a run was left out."""
+    for key, reason in runs.left_out.items():
+        if key.startswith(f"{row['id']} "):
+            raise RecordingError(reason)
 
 
 def kind_of(path: Path) -> str:
@@ -143,24 +146,20 @@ def with_steps(
         windows: columns of steps that these need, the SQL of each by name.
         among: a condition on the steps to read.
     """
-    numbers = [quoted(one.name) for one in steps if pa.types.is_floating(one.type)]
-    replaced = (
-        f" REPLACE ({', '.join(f'nullif({name}, {_NAN}) AS {name}' for name in numbers)})" if numbers else ""
-    )
+    numbers = [quoted(one.name) for one in steps if pa.types.is_floating(one.type)]  # rewards, at least
+    replaced = ", ".join(f"nullif({name}, 'NaN') AS {name}" for name in numbers)
     environment = "" if "environment" in steps.names else ", 0 AS environment"
     more, parts = (
         "".join(f", {sql} AS {quoted(name)}" for name, sql in named.items())
         for named in (windows, aggregates)
     )
+    read = f"SELECT * REPLACE ({replaced}){environment} FROM steps WHERE {among}"
     return (
-        f"(SELECT chosen.*, s.* EXCLUDE (of, turn, own, n) FROM ({chosen}) chosen LEFT JOIN "
-        f"(SELECT phase AS of, environment AS turn, episode AS own, count(*) AS n{parts} FROM "
-        f"(SELECT *{more} FROM (SELECT *{replaced}{environment} FROM steps WHERE {among})) GROUP BY ALL) s "
-        "ON of = phase AND turn = environment AND s.own = chosen.own AND n = length)"
+        f"SELECT chosen.*, s.* EXCLUDE (of, turn, own, n) FROM ({chosen}) chosen LEFT JOIN "
+        f"(SELECT phase AS of, environment AS turn, episode AS own, count(*) AS n{parts} "
+        f"FROM (SELECT *{more} FROM ({read})) GROUP BY ALL) s "
+        "ON of = phase AND turn = environment AND s.own = chosen.own AND n = length"
     )
-
-
-_NAN: Final = "'NaN'"
 
 
 def literal(text: str) -> str:

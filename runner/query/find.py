@@ -241,7 +241,7 @@ class _Search:
             among += f" AND episode IN ({', '.join(map(str, episodes))})"
         self.connection.register("steps", steps)
         rows = with_steps(chosen, steps.schema, aggregates, windows, among)
-        self._sql(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM {rows} WHERE {where}")
+        self._sql(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM ({rows}) WHERE {where}")
 
     def found(self, expression: str, limit: int | None) -> Found:
         """Return the first episodes, as they are sorted."""

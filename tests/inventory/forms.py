@@ -56,6 +56,8 @@ PAGES: Final = (
     "/compare/replay?run={cooperative}&run={other}",
     "/compare/replay?run={pole}&run={loop-branch}",
     "/compare/tasks?run={pole}&run={taxi}",
+    "/find?expression=any(reward < 0) and length > 3&sort=-length&limit=2",
+    "/find?expression=any(rewrd < 0)",
     "/sql?query=SELECT name, seed FROM runs ORDER BY ALL",
     "/sql?query=SELECT nothing FROM runs",
     "/sweeps",
@@ -134,6 +136,9 @@ COMMANDS: Final = (
     "label pole",
     "label pole --json",
     "mark pole",
+    "find 'any(reward < 0) and length > 3' --sort=-length --limit 2",
+    "find 'any(reward < 0) and length > 3' --sort=-length --limit 2 --json",
+    "find 'any(rewrd < 0)'",
     "sql 'SELECT name, seed FROM runs ORDER BY ALL'",
     "sql 'SELECT name, seed FROM runs ORDER BY ALL' --json",
     "sql 'SELECT nothing FROM runs'",
@@ -242,6 +247,7 @@ COMMANDS: Final = (
 
 ROUTES: Final = (
     "/runs",
+    "/find?expression=length > 0&limit=1",
     "/sql?query=SELECT name FROM runs",
     "/runs/{run}",
     "/runs/{run}/metrics",

@@ -197,6 +197,9 @@ def test_a_run_that_cannot_be_searched_is_named(folder, tmp_path):
     bare = make_run(runs, TAXIS | {"name": "bare", "recording": {"steps": "none"}})
     damaged = make_run(runs, TAXIS | {"name": "hurt"})
     damaged.recording.write_bytes(damaged.recording.read_bytes()[:700])
+    with runner.record(gymnasium.make("CartPole-v1"), runs, name="begun") as env:
+        env.reset()
+        env.step(0)
     found = runner.find("then(taxi_1.pickup, taxi_1.drop_off, within=5)", runs)
     reasons = "\n".join(found.left_out)
     assert f"{bare.run_id} is left out of steps: it has no steps" in reasons
