@@ -254,7 +254,8 @@ class _Search:
         rows: dict[tuple[int, int], Json] = {}
         for k in {k for k, _ in places}:
             wanted = [row for run, row in places if run == k]
-            values = pq.read_table(self.files[k]).take(wanted).to_pylist()
+            shown = ["at", *(name for name in facts_of(self.files[k]).index if "(" not in name)]
+            values = pq.read_table(self.files[k], columns=shown).take(wanted).to_pylist()
             rows |= {(k, row): values for row, values in zip(wanted, values, strict=True)}
         hits = [_hit(self.runs.rows[k], rows[k, row]) for k, row in places]
         return Found(expression, hits, count, len(searched), list(self.runs.left_out.values()))
