@@ -20,7 +20,7 @@ from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
 
 RUNS, EPISODES_OF_RUN, CLIENTS = 1_000, 5_000, 20
 EXPRESSIONS = (
-    "ret < -100 and count(collision) >= 2 and length > 50",
+    "ret < -100 and count(collision) >= 2 and length > 20",
     'any(action == "north + east") and never(collision)',
     "count(pickup) > 400",
 )
