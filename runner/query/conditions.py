@@ -20,19 +20,19 @@ from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, 
 
 ENDS: Final = ("success", "terminated", "truncated")
 """The conditions of an episode."""
-AGGREGATES: Final[dict[Any, str]] = {
-    "any": "coalesce(bool_or({}), FALSE)",
-    "never": "NOT coalesce(bool_or({}), FALSE)",
-    "all": "coalesce(bool_and({}), TRUE)",
-    "count": "count_if({})",
-    "then": "coalesce(bool_or({1} AND {0}), FALSE)",
-    "min": "min({})",
-    "max": "max({})",
-    "sum": "sum({})",
-    "first": "arg_min({}, step)",
-    "last": "arg_max({}, step)",
+AGGREGATES: Final[dict[Any, tuple[str, str]]] = {
+    "any": ("coalesce(bool_or({0.sql}), FALSE)", "{0.some}"),
+    "never": ("NOT coalesce(bool_or({0.sql}), FALSE)", "(NOT {0.some})"),
+    "all": ("coalesce(bool_and({0.sql}), TRUE)", "(NOT {0.fails})"),
+    "count": ("count_if({0.sql})", "CASE WHEN NOT {0.some} THEN 0 WHEN NOT {0.fails} THEN length END"),
+    "then": ("coalesce(bool_or({0.sql} AND {1.sql}), FALSE)", "({0.some} AND {1.some} AND NULL)"),
+    "min": ("min({0.sql})", "{0.low}"),
+    "max": ("max({0.sql})", "{0.high}"),
+    "sum": ("sum({0.sql})", "NULL"),
+    "first": ("arg_min({0.sql}, step)", "NULL"),
+    "last": ("arg_max({0.sql}, step)", "NULL"),
 }
-"""The functions of an episode's steps."""
+"""The functions of an episode's steps, and what the index says of them if it has no column for them."""
 _OF_NUMBERS: Final = ("min", "max", "sum", "first", "last")
 _AT_STEPS: Final[dict[Operation, tuple[str, str]]] = {
     ast.Not: ("{0.fails}", "{0.some}"),
@@ -205,10 +205,12 @@ class EpisodeParser(Parser[Part]):
             return super().call(node, name)
         within = "UNBOUNDED"
         match name, node.keywords:
-            case "then", [ast.keyword(arg="within", value=ast.Constant(value=int() as steps))]:
-                within = str(min(max(steps, 1), 2**31))
+            case "then", [ast.keyword(arg="within", value=ast.Constant(value=int() as steps))] if (
+                0 < steps < 2**31
+            ):
+                within = str(int(steps))
             case _, [_, *_]:
-                raise self.error(node, f"expected {name}() without options; then() has within=STEPS.")
+                raise self.error(node, f"expected {name}() without options; then() has within=STEPS, from 1.")
         if self._is_inside or len(node.args) != 1 + (name == "then"):
             raise self.error(
                 node,
@@ -217,29 +219,18 @@ class EpisodeParser(Parser[Part]):
         self._is_inside = True
         parts = list(map(self.number if name in _OF_NUMBERS else self.condition, node.args))
         self._is_inside = False
-        known, terms = self._known(name, *parts), [part.sql for part in parts]
         if name == "then":
             rows = f"ORDER BY t ROWS BETWEEN {within} PRECEDING AND 1 PRECEDING"
-            window = f"bool_or({terms[0]}) OVER (PARTITION BY phase, environment, episode {rows})"
-            terms[0] = f"w{len(self.windows)}"
-            self.windows[terms[0]] = window
+            window = f"w{len(self.windows)}"
+            sql = f"bool_or({parts[0].sql}) OVER (PARTITION BY phase, environment, episode {rows})"
+            self.windows[window], parts[0] = sql, replace(parts[0], sql=window)
+        of_steps, known = (text.format(*parts) for text in AGGREGATES[name])
+        if (column := self._column(name, parts[0])) != "NULL":
+            known = column
         read = f"a{len(self.aggregates)}"
-        self.aggregates[read] = AGGREGATES[name].format(*terms)
+        self.aggregates[read] = of_steps
         kind = NUMBER if name in (*_OF_NUMBERS, "count") else CONDITION
         return Part(kind, f"coalesce({read}, {known})" if self.reads_steps else known)
-
-    def _known(self, name: str, part: Part, then: Part | None = None) -> str:
-        """Return what the index knows of a function of steps."""
-        if then is not None:
-            return f"({part.some} AND {then.some} AND NULL)"
-        column = self._column(name, part)
-        answers = {
-            "any": part.some,
-            "never": f"(NOT {part.some})",
-            "all": f"(NOT {part.fails})",
-            "count": f"CASE WHEN NOT {part.some} THEN 0 WHEN NOT {part.fails} THEN length END",
-        }
-        return answers.get(name, column) if column == "NULL" else column
 
     def named(self, node: ast.expr) -> Part:
         """Return the column that a node names: `next_observation[2]` is next_observation_2."""

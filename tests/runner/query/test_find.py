@@ -176,6 +176,7 @@ def test_sorting_and_limits(folder):
         ("any(any(collision))", "^^^^^^^^^^^^^^", "values of a step"),
         ("cuont(collision) > 1", "^^^^^", "Did you mean 'count'"),
         ("any(collision, within=3)", "^^^^^^^^^^^^^^^^^^^^^^^^", "within=STEPS"),
+        ("then(collision, collision, within=0)", "^" * 36, "within=STEPS"),
         ("seed == 3", "^^^^", "expected one of"),
         ("any(next_observation[-1] > 1)", "^^^^^^^^^^^^^^^^^^^^", "expected one of"),
         ("length >", "^", "invalid syntax"),
