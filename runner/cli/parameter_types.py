@@ -121,7 +121,7 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
     return {each.name: each.about for each in shipped().values()}
 
 
-class Expression(Completed):
+class ExpressionText(Completed):
     """An expression; completes the names in it, each with its meaning."""
 
     def __init__(self, name: str, words: Mapping[str, str]) -> None:
@@ -192,7 +192,7 @@ def _axis(text: str) -> Axis:
 
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
-FILTER_WORD: Final = Expression(
+FILTER_WORD: Final = ExpressionText(
     "filter",
     {name: field.meaning for name, field in columns.FIELDS.items()}
     | {columns.SETTING: "a value of the configuration, such as config.discount"},

@@ -14,7 +14,7 @@ from runner.cli.options import (
     run_argument,
 )
 from runner.cli.output import draw, facts, files_written, print_json, print_sections, say
-from runner.cli.parameter_types import FILE, INDEX, Expression
+from runner.cli.parameter_types import FILE, INDEX, ExpressionText
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
 from runner.export.places import new_file, require_new
@@ -73,7 +73,7 @@ def command_of(view: View) -> Command:
 def _declared(given: Input, view: View) -> Declared:
     """Return the argument or option of an input; an argument completes the words that the view lists."""
     if given.required:
-        return argument(metavar=given.name.upper(), type=Expression(given.name, view.words))
+        return argument(metavar=given.name.upper(), type=ExpressionText(given.name, view.words))
     flag = f"--{given.name}"
     if given.kind is bool:
         return option(flag, is_flag=True, help=given.help)

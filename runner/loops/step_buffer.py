@@ -24,11 +24,11 @@ from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
 from runner.recording.gym_values import (
     Change,
-    Leaf,
+    LeafValues,
     Put,
     PutStep,
     SpaceValues,
-    StateLeaf,
+    StateValues,
     element_of,
     filler,
     only_number,
@@ -139,7 +139,7 @@ class StepBuffer:
         self._action = self._values(described.recorded_action, "action")
 
     def _values(self, space: Any, what: str) -> SpaceValues:
-        leaf = StateLeaf if self._starts and not self._batch else Leaf
+        leaf = StateValues if self._starts and not self._batch else LeafValues
         return SpaceValues(space, what, warn_user, leaf, bool(self._of_agents))
 
     def _filler(self, values: SpaceValues, column: Any) -> Put:

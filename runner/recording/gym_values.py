@@ -41,7 +41,7 @@ _CODES: Final = {np.dtype(code).str: code for code in "?bBhHiIqQd"}
 """How `struct` packs single numbers. Shorter floats are packed as bytes, else some NaNs would change."""
 
 
-class Leaf:
+class LeafValues:
     """A part of a space without parts of its own, with the checks that its values pass.
 
     Args:
@@ -135,7 +135,7 @@ class Leaf:
         return RecordingError(f"found an {what} that is not of the environment's {what} space ({reason}).")
 
 
-class StateLeaf(Leaf):
+class StateValues(LeafValues):
     """A `Discrete` space with the states or the actions of one environment: any whole number is exact."""
 
     exact_scalars = frozenset([int])  # others are converted
@@ -154,7 +154,7 @@ class SpaceValues:
 
     Args:
         what: `observation` or `action`.
-        on_rounded: as for `Leaf`.
+        on_rounded: as for `LeafValues`.
         leaf: the class of the leaves.
         is_game: whether the space is the `Dict` of the agents of a game, of whom some may have no value.
     """
@@ -164,7 +164,7 @@ class SpaceValues:
         space: Any,
         what: str,
         on_rounded: OnRounded = lambda _: None,
-        leaf: type[Leaf] = Leaf,
+        leaf: type[LeafValues] = LeafValues,
         is_game: bool = False,
     ) -> None:
         where = "the agents' spaces" if is_game else f"the {what} space"
@@ -239,14 +239,14 @@ class _Source:
         self._scope[name] = value
         return name
 
-    def _inside(self, whole: str, leaf: Leaf) -> str:
+    def _inside(self, whole: str, leaf: LeafValues) -> str:
         return whole + "".join(f"[{self.name(key)}]" for key in leaf.keys)
 
     def value(
         self,
         whole: str,
         values: SpaceValues,
-        leaf: Leaf,
+        leaf: LeafValues,
         scalars: frozenset[type] | None,
         batch: tuple[int, ...] = (),
         fit: Change | None = None,

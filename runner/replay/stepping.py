@@ -19,7 +19,7 @@ from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_spaces import recorded_space, value_of
-from runner.recording.gym_values import Leaf, SpaceValues, StateLeaf, element_of, filler
+from runner.recording.gym_values import LeafValues, SpaceValues, StateValues, element_of, filler
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
@@ -93,7 +93,7 @@ class Stepper:
         self._recording, self._has_states = recording, recording.has_states
         self.observation_space, self.action_space = self._spaces()
         self._check_spaces()
-        leaf = StateLeaf if self._has_states else Leaf
+        leaf = StateValues if self._has_states else LeafValues
         space = self.observation_space
         self._observation = SpaceValues(space, "observation", leaf=leaf, is_game=self.is_game)
         self._after = "next_state" if self._has_states else "next_observation"

@@ -39,7 +39,7 @@ class QueryResponse(BaseModel):
     """Sentences on the runs that were left out."""
 
 
-class Search(BaseModel):
+class EpisodeQuestion(BaseModel):
     """What is asked about episodes."""
 
     expression: str = Field("", max_length=1000, description="A condition, as for `dualtaxi find`.")
@@ -49,7 +49,7 @@ class Search(BaseModel):
     limit: int = Field(20, ge=1, le=1000, description="Maximum number of episodes.")
 
 
-SearchOf = Annotated[Search, Query()]
+SearchOf = Annotated[EpisodeQuestion, Query()]
 
 
 @api.get(
@@ -89,7 +89,7 @@ async def find_page(request: Request, search: SearchOf) -> Response:
     return await run_in_threadpool(page, request, "find.html", shown, status)
 
 
-async def _found(request: Request, search: Search) -> bytes:
+async def _found(request: Request, search: EpisodeQuestion) -> bytes:
     """Return the answer to a search, which is computed in a process with limits, or cached for seconds."""
     state = request.app.state
     values = *search.model_dump().values(), state.catalogue.state()
