@@ -235,8 +235,7 @@ def _differing_part(name: str, a: Value, b: Value) -> tuple[str, Value, Value]:
 
 def have_same_spaces(a: Recording, b: Recording) -> bool:
     """Return whether the steps of two recordings, of which one is of a loop, are in the same spaces."""
-    left, right = ((recording.layout.kind, recording.spaces, recording.agents) for recording in (a, b))
-    return left == right
+    return a.spaces == b.spaces and a.agents == b.agents
 
 
 def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None:
@@ -267,10 +266,13 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
 
 
 def _compared(a: Recording, b: Recording, phase: str) -> tuple[str, ...]:
-    """Return the fields in which steps are compared: those that both recordings have."""
+    """Return the fields in which steps are compared: those that both recordings have.
+
+    Whether an action was explored is unknown of a loop, and 0 in its steps.
+    """
     ours, theirs = (recording.phase(phase).steps.row_dtype.names or () for recording in (a, b))
     fields = ("taken", *(FIELDS if a.has_states else _VALUE_FIELDS))
-    return tuple(name for name in fields if name in ours and name in theirs)
+    return tuple(name for name in fields if name in ours and name in theirs and name != "explored")
 
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:

@@ -8,9 +8,11 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pytest
 from gymnasium.vector import SyncVectorEnv
 
 import runner
+from runner.analysis.diff import can_compare_steps, diff
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import dualtaxi, make, play
 
@@ -33,6 +35,29 @@ def test_diff_names_the_step_at_which_loops_diverge(folder):
     foreign = dualtaxi(folder, "diff", "pole", "rooms")
     assert foreign.exit_code == 1
     assert "other spaces" in foreign.stdout
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_a_job_and_a_loop_over_the_same_states_are_compared_step_by_step(tmp_path, first):
+    cliff = {"id": "CliffWalking-v1", "kwargs": {"max_episode_steps": 40}}
+    job = runner.run({"episodes": 2, "env": cliff, "evaluation": None}, recordings=tmp_path)
+    with open_recording(job.recording) as recording:
+        rows = [row for block in recording.train.steps.blocks() for row in block]
+
+    def differences(changed: int | None) -> list[object]:
+        with runner.record(gymnasium.make(cliff["id"], **cliff["kwargs"]), tmp_path) as rec:
+            rec.reset(seed=1)
+            for number, row in enumerate(rows):
+                rec.step((int(row["action"]) + (number == changed)) % 4)
+                if row["terminated"] or row["truncated"]:
+                    rec.reset()
+        with open_recording(job.recording) as a, open_recording(rec.run.recording) as b:
+            found = [diff(*pair, first=first).divergence for pair in ((a, b), (b, a))]
+            assert can_compare_steps(a, b)
+        return [divergence and (divergence.step, divergence.field) for divergence in found]
+
+    assert differences(None) == [None, None]
+    assert differences(7) == [(7, "action")] * 2
 
 
 def test_diff_names_an_episode_of_a_vector_by_its_number_among_all(tmp_path):
