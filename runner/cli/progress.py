@@ -32,11 +32,12 @@ _DRAWN: Final = (_BAR, _SPINNER, "speed", "left", "elapsed")
 @contextlib.contextmanager
 def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], None]]:
     """Yield the function that a job reports its progress to."""
-    first: list[tuple[float, int]] = []  # when learning began, and the steps then
+    first: list[tuple[float, int]] = []  # when new steps began, and the steps then
 
     def report(progress: Progress) -> None:
         now, steps = time.monotonic(), progress.train_steps + progress.eval_steps
-        first[:] = first or [(now, steps)]
+        if not first or steps == first[0][1]:  # of a resumed run: while what is recorded is retrained
+            first[:] = [(now, steps)]
         seconds = now - first[0][0]
         speed = (steps - first[0][1]) / seconds if seconds else None
         update(completed=progress.episode, facts=progress_facts(progress, speed))

@@ -240,12 +240,18 @@ def _complete(run: Run, path: Path) -> Run:
 
 
 class _ResumedSession(Session):
-    """A session whose summary covers all that is recorded, also if it is stopped before the end of that."""
+    """A session that covers all that is recorded, also before it has retrained to the end of that."""
 
     def __init__(self, recording: Recording, reference: Reference, *session: Any) -> None:
         super().__init__(*session)
         self._recording = recording
         self._reference = reference
+        steps = (_steps(recording, phase) for phase in schema.PHASES)
+        self._recorded = (recording.train.episodes.count(), *steps)
+
+    def done(self) -> tuple[int, ...]:
+        """Return how much of the run is done: at least what is recorded, also while it is retrained."""
+        return tuple(map(max, super().done(), self._recorded))
 
     def summary(self, topics: dict[str, str]) -> dict[str, object]:
         """Return the summary of the run."""
@@ -257,9 +263,9 @@ class _ResumedSession(Session):
         return summary | {
             "content_digest": None,
             "topic_digests": {},
-            "episodes": counts[schema.TRAIN_EPISODE.name],
-            "train_steps": _steps(recording, "train"),
-            "eval_steps": _steps(recording, "eval"),
+            "episodes": self._recorded[0],
+            "train_steps": self._recorded[1],
+            "eval_steps": self._recorded[2],
             "messages": {name: count for name, count in counts.items() if count},
             "last_evaluation": evaluation_brief(evaluations[-1]) if evaluations else None,
         }

@@ -282,13 +282,13 @@ class Session:
             return
         self._last_report = moment
         progress = self._progress
-        progress.episode = self._learner.episode
-        progress.train_steps, progress.eval_steps = (
-            self.recorder.steps["train"],
-            self.recorder.steps["eval"],
-        )
+        progress.episode, progress.train_steps, progress.eval_steps = self.done()
         progress.bytes_written = self.recorder.bytes_written
         self._report(progress)
+
+    def done(self) -> tuple[int, ...]:
+        """Return how many episodes, training steps and evaluation steps of the run are done."""
+        return self._learner.episode, self.recorder.steps["train"], self.recorder.steps["eval"]
 
 
 def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Message:

@@ -69,6 +69,19 @@ def test_cut_off_anywhere(whole, tmp_path, share):
     assert_same(resume(run), whole)
 
 
+def test_progress_of_a_resumed_run_begins_with_what_is_recorded(whole, tmp_path):
+    run = copy_of(whole, tmp_path, summary={})
+    cut(run, int(0.97 * run.recording.stat().st_size))
+    with open_recording(run.recording) as recording:
+        recorded = recording.done()
+    seen = []
+    resume(run, report=lambda progress: seen.append((progress.episode, progress.train_steps)))
+    assert seen == sorted(seen)
+    assert recorded["episodes"] <= seen[0][0]
+    assert 0 < recorded["train_steps"] <= seen[0][1]
+    assert seen[-1] == (whole.summary["episodes"], whole.summary["train_steps"])
+
+
 @pytest.mark.parametrize(
     "config",
     [
@@ -183,7 +196,7 @@ def test_a_known_digest_is_a_proof(whole, tmp_path):
 
 def test_description_damaged(whole, tmp_path):
     run = copy_of(whole, tmp_path, summary={})
-    cut(run, int(0.9 * run.recording.stat().st_size))
+    cut(run, int(0.97 * run.recording.stat().st_size))
     data = bytearray(run.recording.read_bytes())
     at = data.index(b"format_version")
     data[at - 30 : at + 30] = bytes(60)
