@@ -211,8 +211,6 @@ class TopicChunks:
 
     def _read(self, chunks: Sequence[int]) -> Iterator[tuple[int, Records]]:
         """Yield the number of each of these chunks and its rows; the next ones are unpacked meanwhile."""
-        if self.dtype is not None:
-            self.chunk_numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
         for k, data in zip(chunks, self.file.chunks(map(self.entry, chunks)), strict=True):
             yield k, self._rows_of(k, data)
 
@@ -257,10 +255,10 @@ class TopicChunks:
 
     def stored(self, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the messages of each chunk as they are stored: message records, which must have one size."""
-        self.chunk_numbers  # noqa: B018 - as for `_read`
         return map(self._stored, range(len(self)) if chunks is None else chunks, self.records(chunks))
 
     def _stored(self, k: int, data: bytes) -> Records:
+        self.chunk_numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
         block: Records = np.frombuffer(data, self.dtype)
         is_foreign = block["channel_id"] != self.topic.channel
         if (is_foreign | (block["record_length"] != block.itemsize - RECORD_HEAD.size)).any():

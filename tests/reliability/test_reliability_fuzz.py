@@ -90,6 +90,19 @@ def _noise(part: bytes, rng: random.Random) -> bytes:
     return bytes(changed)
 
 
+def test_a_chunk_that_ends_within_a_record_is_refused(recordings, path):
+    path.write_bytes(with_chunks(recordings["tiny-0"], [chunk_body(steps_of_zeros(999)[:-1], "zstd")], False))
+    with open_recording(path) as recording:
+        for read in (
+            lambda: recording.train.steps.first_from("episode", 1),
+            lambda: list(recording.train.steps.rows()),
+            lambda: list(recording.train.steps.blocks()),
+            recording.train.steps.count,
+        ):
+            with pytest.raises(RecordingError, match="not a multiple"):
+                read()
+
+
 # --- files made to exhaust ------------------------------------------------------------------------------
 
 
