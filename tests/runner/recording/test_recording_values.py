@@ -34,9 +34,9 @@ DTYPES = ("b1", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f2", "f4", "f8"
 
 def numbers(code: str, shape: tuple[int, ...]) -> spaces.Space:
     dtype = np.dtype(code)
-    if dtype.kind == "b":
-        return spaces.Box(0, 1, shape, np.dtype("i1").type) if shape else spaces.Discrete(2)
-    low, high = (-1, 1) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    low, high = (0, 1) if dtype.kind == "b" else (-1, 1)
+    if dtype.kind in "iu":
+        low, high = np.iinfo(dtype).min, np.iinfo(dtype).max
     return spaces.Box(low, high, shape, dtype.type)
 
 
