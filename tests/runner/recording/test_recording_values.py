@@ -79,6 +79,41 @@ class Any(gymnasium.Env):
         return self.observation_space.sample(), self._t / 3, self._t == 4, False, {}
 
 
+class Pair:
+    """A game of two agents that see and take samples of a space each."""
+
+    def __init__(self, first, second):
+        self.metadata = {"name": "pair"}
+        self.possible_agents = self.agents = ["a", "b"]
+        self.of_agents = {"a": first, "b": second}
+        self.to_take = copy.deepcopy(self.of_agents)
+
+    def observation_space(self, agent):
+        return self.of_agents[agent]
+
+    def action_space(self, agent):
+        return self.to_take[agent]
+
+    def reset(self, seed=None, options=None):
+        return self._samples(), {agent: {} for agent in self.agents}
+
+    def step(self, actions):
+        ends = dict.fromkeys(self.agents, False)
+        return (
+            self._samples(),
+            dict.fromkeys(self.agents, 1.0),
+            ends,
+            ends,
+            {agent: {} for agent in self.agents},
+        )
+
+    def close(self):
+        pass
+
+    def _samples(self):
+        return {agent: self.of_agents[agent].sample() for agent in self.agents}
+
+
 def same(left, right):
     if isinstance(left, dict):
         return list(left) == list(right) and all(same(left[key], right[key]) for key in left)
@@ -199,6 +234,25 @@ def test_values_of_a_vector_come_back(observation):
     assert len(rows) == 6
     for number, row in enumerate(rows):
         assert same(plain(observation, row["next_observation"]), expected[number % 2][number // 2])
+
+
+@settings(max_examples=15)
+@given(nested(st.one_of(LEAVES, TEXTS)), nested(st.one_of(LEAVES, TEXTS)))
+def test_values_of_a_game_come_back(first, second):
+    with tempfile.TemporaryDirectory() as folder:
+        with runner.record_parallel(Pair(first, second), folder) as rec:
+            rec.reset(seed=5)
+            seen = []
+            for _ in range(3):
+                actions = {agent: rec.action_space(agent).sample() for agent in rec.agents}
+                seen.append((actions, rec.step(actions)[0]))
+        with open_recording(rec.run.recording) as recording:
+            rows = list(recording.train.transitions())
+    assert len(rows) == len(seen)
+    for row, (actions, after) in zip(rows, seen, strict=True):
+        for agent, space in (("a", first), ("b", second)):
+            assert same(plain(space, row["action"][agent]), actions[agent])
+            assert same(plain(space, row["next_observation"][agent]), after[agent])
 
 
 def test_the_action_of_an_agent_stands_by_its_name(tmp_path):
