@@ -255,6 +255,26 @@ def test_values_of_a_game_come_back(first, second):
             assert same(plain(space, row["next_observation"][agent]), after[agent])
 
 
+@pytest.mark.parametrize("shape", [(), (1,), (2, 3)])
+@pytest.mark.parametrize("code", DTYPES)
+def test_values_of_batches_come_back(code, shape, tmp_path):
+    space = numbers(code, shape)
+    space.seed(1)
+    seen = np.array([[space.sample() for _ in range(2)] for _ in range(7)], code)
+    rest = np.zeros((3, 2))
+    with runner.record_batches(
+        "any", tmp_path, observation_space=space, action_space=space, autoreset_mode="NextStep"
+    ) as rec:
+        rec.batch(seen[:4], seen[4:], rest, rest.astype(np.bool_))
+    with open_recording(rec.run.recording) as recording:
+        rows = list(recording.train.transitions())
+    after, taken = seen[1:4].reshape(-1, *shape), seen[4:].reshape(-1, *shape)
+    assert len(rows) == len(after)
+    for number, row in enumerate(rows):
+        assert same(row["next_observation"], after[number])
+        assert same(row["action"], taken[number])
+
+
 def test_the_action_of_an_agent_stands_by_its_name(tmp_path):
     env = Leaving()
     with runner.record_parallel(env, tmp_path) as rec:
