@@ -56,16 +56,18 @@ def rerun_loop(
         sample: how many episodes to rerun, at even distances; None for all that happened.
         tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
     """
+    start = (checked.if_rerun if sample is None else None) or checked
+    is_doubted = start is not checked
     is_empty = checked.verdict == "interrupted" and not checked.train_steps + checked.eval_steps
-    if is_empty or not checked.sound:
+    if is_empty or not start.sound:
         return checked
     with open_recording(checked.path) as recording:
         if reason := why_not_rerun(recording, trust):
             return replace(checked, reason=reason)
         if recording.maker is not None:
-            checked = replace(checked, changes=_other_versions(recording.maker))
+            start = replace(start, changes=_other_versions(recording.maker))
         assumed = recording.maker.assumed if recording.maker else ()
-    found = replace(checked, act="rerun", environment="installed", tolerance=tolerance, assumed=assumed)
+    found = replace(start, act="rerun", environment="installed", tolerance=tolerance, assumed=assumed)
     try:
         for message in stream_from_child(_rerun, checked.path, found, sample, trust):
             if isinstance(message, int):
@@ -76,8 +78,10 @@ def rerun_loop(
         if is_different and not reason and not all(_differs_again(found, trust, k) for k in _HASH_SEEDS):
             reason = OUTSIDE
     except CannotRedo as error:
-        return replace(checked, reason=str(error))
-    return replace(checked, reason=reason, difference=found.difference) if reason else found
+        return replace(checked, changes=start.changes, reason=str(error))
+    if reason or (is_doubted and (found.left_out or not found.sound)):  # the doubt may be of those left out
+        return replace(checked, changes=start.changes, reason=reason, difference=found.difference)
+    return found
 
 
 def _differs_again(found: Verification, trust: bool, hash_seed: int) -> bool:

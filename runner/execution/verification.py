@@ -82,6 +82,8 @@ class Verification:
     """What of the recording was not compared."""
     is_loop: bool = False
     """Whether its steps can be compared by a rerun of its environment only."""
+    if_rerun: Verification | None = None
+    """What holds instead if a rerun gives the recorded steps, though their order is unlikely."""
 
     @property
     def sound(self) -> bool:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +58,7 @@ from runner.replay.trust import require_may_train
 from runner.runs.checkpoints import read_checkpoints
 from runner.runs.listing import run_at
 from runner.runs.provenance import Differences, differing_provenance
+from runner.util.humanize import counted
 
 
 def verify(
@@ -145,7 +146,7 @@ def check(
     if found.sound:
         return replace(found, verdict="damaged", finding=f"{damage}{unreadable}", content_digest="")
     verdict = found.verdict if is_cut else "damaged"
-    return replace(found, verdict=verdict, notes=(*found.notes, str(damage)))
+    return replace(found, verdict=verdict, notes=(*found.notes, str(damage)), if_rerun=None)
 
 
 def _states_its_end(path: Path) -> bool:
@@ -309,7 +310,11 @@ def _check_loop(recording: Recording) -> Verification:
         return with_difference(replace(verification, notes=tuple(notes)), error)
     verification = replace(verification, notes=tuple(notes))
     off_table = sum(findings.rewards_off_table for findings in phases.values())
-    return _compare_totals(recording, verification, off_table, finished)
+    found = _compare_totals(recording, verification, off_table, finished)
+    if found.sound and (unlikely := _unlikely(recording, phases)):
+        finding = f"{recording.path}: {unlikely}"
+        return replace(found, verdict="damaged", finding=finding, content_digest="", if_rerun=found)
+    return found
 
 
 def _compare_totals(
@@ -379,7 +384,17 @@ def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[s
         count = findings.rewards_off_table
         yield f"{where}: {count:,} steps have rewards that are not in the environment's table"
     if findings.begun_without:
-        where = f"{topic.name}, step {findings.first_without}"
-        if findings.begun_by_reset >= findings.begun_without:
-            raise Inconsistent(f"{where}: found an episode without a reset before it, as others have")
-        yield f"{where}: {findings.begun_without:,} episodes began without a reset"
+        episodes = counted(findings.begun_without, "episode")
+        yield f"{topic.name}, step {findings.first_without}: {episodes} began without a reset"
+
+
+def _unlikely(recording: Recording, phases: Mapping[str, Findings]) -> str:
+    """Return what a forger may have left: most episodes begin with a reset, some do not; empty if nothing.
+
+    A loop may step an environment on after the end of an episode, but hardly ever does.
+    """
+    for phase, findings in phases.items():
+        if findings.begun_by_reset >= findings.begun_without > 0:
+            where = f"{recording.phase(phase).steps.topic.name}, step {findings.first_without}"
+            return f"{where}: found an episode without a reset before it, as others have"
+    return ""

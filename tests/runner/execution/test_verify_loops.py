@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 
 import gymnasium
 import numpy as np
@@ -335,3 +336,21 @@ def test_the_digests_of_other_topics_than_steps_are_compared_though_steps_are_le
     assert content_of(env.run.recording)
     with pytest.raises(RecordingError, match="other content than the digest"):
         content_of(altered(env.run.recording, tmp_path / "x.mcap", None, None, result=add))
+
+
+def test_a_step_after_the_end_of_an_episode_is_no_damage_if_a_rerun_gives_it(tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1", disable_env_checker=True), tmp_path) as env:
+        for episode in range(4):
+            env.reset(seed=episode)
+            over = False
+            while not over:
+                _, _, terminated, truncated, _ = env.step(0)
+                over = terminated or truncated
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium's, of the step after the end
+            env.step(0)
+    found = verify(env.run.recording)
+    assert (found.verdict, found.finding) == ("reproduced", "")
+    assert any("1 episode began without a reset" in note for note in found.notes)
+    unproved = verify(env.run.recording, rerun=False)
+    assert (unproved.verdict, "without a reset before it" in unproved.finding) == ("damaged", True)
