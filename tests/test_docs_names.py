@@ -1,0 +1,45 @@
+"""The table of names in docs/commands.md: every name exists, and no view is missing."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import runner
+from runner.service import pages, queries, views
+from runner.service.app import create_app
+from runner.service.settings import ServiceSettings
+from runner.views import VIEWS
+from tests.doors import commands, routes
+
+TEXT = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
+ROWS = [
+    [cell.strip().strip("`") for cell in line.strip("|").split("|")]
+    for line in TEXT.partition("\n## Names\n")[2].partition("\n## ")[0].splitlines()
+    if line.startswith("| ")
+][1:]
+
+
+def as_written(paths):
+    """Return paths with parameters as the table writes them."""
+    return {re.sub(r"{(\w+)}", lambda name: name[1].upper(), path) for path in paths}
+
+
+def test_every_name_exists(tmp_path):
+    settings = ServiceSettings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
+    addresses = as_written(create_app(settings).openapi()["paths"])
+    page_addresses = as_written(path for _, path in routes([pages.router, views.pages, queries.pages]))
+    names = {" ".join(path) for path in commands()}
+    for _, command, page, route, name in ROWS:
+        assert command in names
+        assert not page or page in page_addresses
+        assert not route or f"/api/v1{route}" in addresses
+        assert not name or name.removeprefix("runner.") in runner.__all__
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_every_view_has_a_row(view):
+    address = f"/runs/RUN/{view}"
+    assert [view, address, address] in [row[1:4] for row in ROWS]
