@@ -1,4 +1,4 @@
-"""The table of names in docs/commands.md: every name exists, and no view is missing."""
+"""The names in docs/commands.md exist, and have every view; docs/service.md has every route."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from runner.service.settings import ServiceSettings
 from runner.views import VIEWS
 from tests.doors import commands, routes
 
-TEXT = (Path(__file__).parents[1] / "docs" / "commands.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[1] / "docs"
+TEXT = (DOCS / "commands.md").read_text(encoding="utf-8")
 ROWS = [
     [cell.strip().strip("`") for cell in line.strip("|").split("|")]
     for line in TEXT.partition("\n## Names\n")[2].partition("\n## ")[0].splitlines()
@@ -43,3 +44,11 @@ def test_every_name_exists(tmp_path):
 def test_every_view_has_a_row(view):
     address = f"/runs/RUN/{view}"
     assert [view, address, address] in [row[1:4] for row in ROWS]
+
+
+def test_every_route_is_described(tmp_path):
+    settings = ServiceSettings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
+    text = (DOCS / "service.md").read_text(encoding="utf-8")
+    for path in create_app(settings).openapi()["paths"]:
+        last = re.findall(r"/[a-z._]+", path)[-1]
+        assert last in text, path
