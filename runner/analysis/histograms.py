@@ -219,5 +219,5 @@ def _action_names(recording: Recording, part: str) -> dict[float, str]:
     else:
         agent = part if part in recording.agents else ""
         names = recording.train.action_names(agent) if agent or not part else ()
-        start = int(recording.spaces["action"].get("start", 0))
+        start = 0 if recording.has_states else int(recording.spaces["action"].get("start", 0))
     return {float(start + i): spoken(name) for i, name in enumerate(names)}

@@ -10,6 +10,7 @@ state, and of the facts in the file's metadata. An index of another state is not
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -27,14 +28,14 @@ from runner.environments.naming import action_names, actions_in_words
 from runner.errors import RecordingError
 from runner.query.conditions import ENDS, Facts, quoted
 from runner.query.views import SelectedRuns
-from runner.recording.reader import open_recording
+from runner.recording.reader import Recording, open_recording
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.listing import listed_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 from runner.util.files import EPISODES, cache_folder, remove_oldest, replacing, storage_errors
 
 MAX_FILES: Final = 20_000
-_VERSION: Final = 1
+_VERSION: Final = 2
 _HEX: Final = 16
 """The digits of each hash in a name."""
 _MAX_COLUMNS: Final = 64
@@ -59,6 +60,9 @@ class EpisodeIndex:
         with storage_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
             self._files = {path.stem[:-_HEX]: path for path in self.folder.glob("*-*.parquet")}
+        self._of_runs = defaultdict[str, list[Path]](list)
+        for stem, path in self._files.items():
+            self._of_runs[stem[:-_HEX]].append(path)
 
     def file(self, row: IndexRow, runs: SelectedRuns) -> Path:
         """Return the file of a run, which is made if it is missing.
@@ -73,11 +77,14 @@ class EpisodeIndex:
         start = f"{row['id']}-{_hash(str(path))}"
         stem = start + _hash([_VERSION, state.st_mtime_ns, state.st_size, state.st_ino])
         if stem not in self._files:
-            for older in self.folder.glob(f"{start}*"):
+            for older in self._of_runs[start]:  # a search that reads it now begins again
                 older.unlink(missing_ok=True)
             self._files[stem] = self._make(row, runs, stem)
-            remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
         return self._files[stem]
+
+    def trim(self) -> None:
+        """Remove the oldest files beyond the limit."""
+        remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
 
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""
@@ -88,6 +95,7 @@ class EpisodeIndex:
         with open_recording(run.recording) as recording:
             shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
+            actions = _names_of_actions(shape, recording)
         for name, view in (*views.items(), ("evaluations", evaluations)):
             self._connection.register(name, view)
         episodes, steps = (view.schema for view in views.values())
@@ -95,14 +103,18 @@ class EpisodeIndex:
         if shape.mdp is not None and shape.mdp.success_events:
             plain.append("success")
         environment, own = ("environment", _COUNTED) if "environment" in episodes.names else ("0", "episode")
-        columns = ", ".join(map(quoted, plain))
+        numbers = {column.name for column in episodes if pa.types.is_floating(column.type)}
+        columns = ", ".join(
+            f"nullif({quoted(name)}, 'NaN') AS {quoted(name)}" if name in numbers else quoted(name)
+            for name in plain
+        )
         rows = (
             f"SELECT {columns}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
             "ASOF LEFT JOIN evaluations ON episode >= start"
         )
         if aggregates := _aggregates(shape, steps):
             rows = with_steps(rows, steps, aggregates, {})
-        facts = json.dumps(asdict(Facts([*plain, *aggregates], _names_of_actions(shape))))
+        facts = json.dumps(asdict(Facts([*plain, *aggregates], actions)))
         path = self.folder / f"{stem}{_hash(facts)}.parquet"
         with storage_errors(path), replacing(path) as fresh:
             self._connection.execute(
@@ -189,9 +201,11 @@ def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
     }
 
 
-def _names_of_actions(shape: Shape) -> dict[str, list[str]]:
+def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, list[str]]:
     """Return the names of actions by number, by the column of steps."""
     if shape.mdp is None or (names := action_names(shape.mdp)) is None:
-        return {}
+        is_from_0 = recording.has_states or not recording.spaces.get("action", {}).get("start")
+        own_names = recording.train.action_names() if is_from_0 and len(recording.agents) == 1 else ()
+        return {"action": list(own_names)} if own_names else {}
     own = dict(zip(shape.own_actions, names, strict=False))
     return {"action": list(actions_in_words(shape.mdp))} | own

@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,18 +29,21 @@ from runner.query.conditions import ENDS, EpisodeParser, Facts
 from runner.query.episode_index import EpisodeIndex, facts_of, kind_of, literal, with_steps
 from runner.query.sql import MEMORY_MB, SETTINGS
 from runner.query.views import SelectedRuns
-from runner.recording.marks import read_marks
+from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
 from runner.runs.run import recordings_folder
 from runner.util.extras import require
-from runner.util.humanize import counted
+from runner.util.humanize import UNKNOWN, counted
 from runner.util.values import Json
 
 LIMIT: Final = 20
 PHASES: Final = ("train", "eval")
 _WORDS: Final = re.compile(r"[\w\s-]+")
 """Words to search for in names and tags, if they are no condition."""
+_OF_CONDITIONS: Final = frozenset({"ret", "length", "not", "and", "or", *ENDS})
+_MAX_SPILLED: Final = "2GB"
+"""The most that a search that needs more memory may write to the cache."""
 _MOST_EVENTS: Final = 3
 _MAX_LISTED: Final = 2_000
 """The most episodes whose steps are asked for one by one."""
@@ -54,8 +58,8 @@ class Hit:
     name: str
     at: str
     """The episode as other commands take it: `812`, or `eval:3000:17`."""
-    ret: float
-    """The sum of all rewards."""
+    ret: float | None
+    """The sum of all rewards; None if it is not a number."""
     length: int
     ended: str
     """`success`, `terminated`, `truncated`, or `reset` before its end."""
@@ -84,6 +88,11 @@ class Found:
     @property
     def sentence(self) -> str:
         """Say how many episodes match."""
+        if not self.runs and are_words(self.expression):
+            return (
+                f"No run has {self.expression!r} in its id, name, tags or note; a condition on the steps of "
+                f"episodes is such as any({self.expression.split()[0]})."
+            )
         verb = "matches" if self.count == 1 else "match"
         return f"{counted(self.count, 'episode')} of {counted(self.runs, 'run')} {verb}."
 
@@ -95,7 +104,7 @@ class Found:
         for hit in self.hits:
             most = sorted(hit.events, key=lambda name: -hit.events[name])[:_MOST_EVENTS]
             events = ", ".join(f"{name} {hit.events[name]:,}" for name in most)
-            numbers = f"{hit.ret:,.6g}", f"{hit.length:,}"
+            numbers = UNKNOWN if hit.ret is None else f"{hit.ret:,.6g}", f"{hit.length:,}"
             rows.append((hit.run_id, hit.name, hit.at, *numbers, hit.ended, events, ", ".join(hit.marks)))
         return Grid(headings, rows, links=[hit.replay for hit in self.hits])
 
@@ -135,19 +144,39 @@ def find(
     if phase not in (None, *PHASES):
         raise RunnerError(f"phase: found {phase!r}, expected train or eval.")
     chosen, condition = parse(runs), expression.strip()
-    if _WORDS.fullmatch(condition) and condition not in ENDS:
+    if are_words(condition):
         words, condition = parse(condition).condition, "True"
         chosen = chosen.also(words) if words is not None else chosen
     folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
-    search = _Search(SelectedRuns(folders, chosen, report), memory)
+    question = condition, phase, sort
+    try:
+        return _search(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
+    except FileNotFoundError:  # another search replaced an index, as its recording grows
+        try:
+            return _search(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
+        except FileNotFoundError as error:
+            raise RunnerError("find: a recording changed while it was read; search again.") from error
+
+
+def are_words(expression: str) -> bool:
+    """Return whether an expression is words to search for in runs, and no condition."""
+    return bool(_WORDS.fullmatch(expression)) and _OF_CONDITIONS.isdisjoint(expression.split())
+
+
+def _search(
+    runs: SelectedRuns, memory: int, question: tuple[str, str | None, str], expression: str, limit: int | None
+) -> Found:
+    search = _Search(runs, memory)
     with contextlib.closing(search.connection):
         try:
-            search.take(condition, phase, sort)
+            search.take(*question)
             return search.found(expression, limit)
         except KeyboardInterrupt as interrupt:
             interrupt.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
             raise
         except search.errors as error:
+            if not all(path.exists() for path in search.files.values()):
+                raise FileNotFoundError(str(error)) from error
             if "Out of Memory" in str(error):
                 raise RunnerError(f"find: needs more than {memory:,} MB of memory.") from error
             for path in search.files.values():
@@ -174,6 +203,7 @@ class _Search:
         self._index = EpisodeIndex(self.connection)
         self._sql(f"SET allowed_directories = [{literal(str(self._index.folder))}]")
         self._sql(f"SET temp_directory = {literal(str(self._index.folder / 'spilled'))}")
+        self._sql(f"SET max_temp_directory_size = '{_MAX_SPILLED}'")
         self._sql("SET enable_external_access = false")
         self._sql("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
         self.files: dict[int, Path] = {}
@@ -193,6 +223,7 @@ class _Search:
             except RunnerError as error:
                 if not any(key.startswith(f"{row['id']} ") for key in self.runs.left_out):
                     self.runs.leave_out("find", row, error)
+        self._index.trim()
         wrong = []
         for numbers in kinds.values():
             facts = facts_of(self.files[numbers[0]])
@@ -205,7 +236,7 @@ class _Search:
             else:
                 self._ask(numbers, first, second, f" AND phase = '{phase}'" if phase else "")
         if wrong and len(wrong) == len(kinds):
-            raise wrong[0]
+            raise next((error for error in wrong if "Did you mean" in str(error)), wrong[0])
 
     def _ask(self, numbers: Sequence[int], first: _Question, second: _Question, among: str) -> None:
         """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
@@ -251,13 +282,19 @@ class _Search:
         ((count,),) = self._sql("SELECT count(*) FROM hits")
         first = "SELECT run, row FROM hits ORDER BY key NULLS LAST, run, row LIMIT $limit"
         places = self._sql(first, {"limit": count if limit is None else limit})
-        rows: dict[tuple[int, int], Json] = {}
-        for k in {k for k, _ in places}:
-            wanted = [row for run, row in places if run == k]
+        by_run = defaultdict[int, list[int]](list)
+        for k, row in places:
+            by_run[k].append(row)
+        hits_by_place: dict[tuple[int, int], Hit] = {}
+        for k, wanted in by_run.items():
             shown = ["at", *(name for name in facts_of(self.files[k]).index if "(" not in name)]
             values = pq.read_table(self.files[k], columns=shown).take(wanted).to_pylist()
-            rows |= {(k, row): values for row, values in zip(wanted, values, strict=True)}
-        hits = [_hit(self.runs.rows[k], rows[k, row]) for k, row in places]
+            run = self.runs.rows[k]
+            marks = read_marks(Path(run["root"], run["entry"])).marks
+            hits_by_place |= {
+                (k, row): _hit(run, of_row, marks) for row, of_row in zip(wanted, values, strict=True)
+            }
+        hits = [hits_by_place[k, row] for k, row in places]
         return Found(expression, hits, count, len(searched), list(self.runs.left_out.values()))
 
     def _sql(self, query: str, values: Mapping[str, object] | None = None) -> list[Any]:
@@ -265,10 +302,9 @@ class _Search:
         return rows
 
 
-def _hit(run: IndexRow, row: Json) -> Hit:
-    """Return the episode of a row in the index of a run."""
+def _hit(run: IndexRow, row: Json, marks: Sequence[Mark]) -> Hit:
+    """Return the episode of a row in the index of a run, which has these marks."""
     place = row["phase"], row["episode"]
-    marks = read_marks(Path(run["root"], run["entry"])).marks
     return Hit(
         run_id=run["id"],
         name=run["name"],

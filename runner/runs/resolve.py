@@ -84,7 +84,7 @@ def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> l
 
     Raises:
         RunNotFound: no run matches, or the name is a prefix of several ids.
-        RunnerError: the filter is none.
+        RunnerError: the filter is not valid.
     """
     from runner.runs.catalogue.filters import is_expression, parse
     from runner.runs.catalogue.index import look

@@ -37,6 +37,7 @@ from runner.analysis.series import (
     series_of,
     values_left_out,
 )
+from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import svg_file
 from runner.export.plots.style import CurveStyle
@@ -292,6 +293,8 @@ def plot(paths: Sequence[Path], axis: str, style: CurveStyle, metrics: Sequence[
     """Return metrics of runs over an axis in one figure, as SVG; all of them if none are named."""
     groups = groups_of(series_of(paths, axis_of(axis), metrics))
     panels = [panel for panel in panels_of(groups) if not metrics or panel.metric in metrics]
+    if not panels:
+        raise RunnerError(f"metric: found {', '.join(metrics)[:200]}, expected metrics that a run recorded.")
     return svg_file(curves_sheet(groups, panels, style))
 
 

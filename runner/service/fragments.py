@@ -32,7 +32,7 @@ from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if_in
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
-from runner.errors import ConfigError, RecordingError
+from runner.errors import ConfigError, RecordingError, shortened
 from runner.export.encoded import picture_note
 from runner.export.plots.curves import Plot
 from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
@@ -194,7 +194,7 @@ def maps(path: Path, state: Sequence[str] = ()) -> bytes:
         try:
             number = state_of(mdp, ", ".join(state)) if state else number
         except ConfigError:
-            problem = f"There is no state with {', '.join(state)}."
+            problem = f"There is no state with {shortened(', '.join(state), 200)}."
         rows = maps_of(mdp, recording.agents, stages_of(recording), number)
         form = shown.situation(situations(mdp, number) if rows else [], problem)
         maps = shown.maps(rows, drawing.width > svg.BROAD)

@@ -188,7 +188,8 @@ def _in_words(detail: ErrorDetails) -> str:
         return "missing"
     if detail["type"] == "extra_forbidden":
         return "unknown key"
-    expected = _EXPECTED.get(detail["type"], detail["msg"]).format_map(detail.get("ctx", {}))
+    known = _EXPECTED.get(detail["type"])
+    expected = detail["msg"] if known is None else known.format_map(detail.get("ctx", {}))
     if detail["type"] == "json_invalid":
         return f"expected {expected}"
     value = detail["input"]

@@ -152,9 +152,9 @@ def find_command(
     compared with its name or number; events such as collision, taxi_1.pickup, or pickup for any agent;
     explored. They are the columns of steps that `dualtaxi sql` has.
 
-    An index of episodes in the cache answers most of it. It is made when a run is first asked. Steps are
-    read of those episodes alone that the index leaves open. A run that has not what the expression names
-    is left out.
+    An index of episodes in the cache answers most of it; it is made when a run is first searched. Only the
+    steps of episodes that the index cannot decide are read. Runs without a column that the expression names
+    are left out.
 
     Examples:
       dualtaxi find 'ret < -100 and count(collision) >= 2 and length > 50'

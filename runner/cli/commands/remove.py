@@ -213,7 +213,7 @@ def _carry_out(
         contents -= contents_freed(staying)
         freed = sum(removal.freed for removal in removals) + contents
         for root in {removal.root for removal in removals}:
-            clean(root)
+            clean(root, {removal.run_id for removal in removals})
     removed = [
         {
             "run_id": removal.run_id,

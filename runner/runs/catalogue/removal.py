@@ -13,7 +13,7 @@ import secrets
 import shutil
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -155,14 +155,19 @@ def remove(removal: Removal, foreign: bool = False) -> None:
             raise
         _delete(hidden, foreign)
         Store(removal.root).drop(run.folder.name)
-        for index in (cache_folder() / EPISODES).glob(f"{run.run_id}-*"):
-            index.unlink(missing_ok=True)
     except OSError as error:
         raise StorageError(f"{error.filename or hidden}: cannot be removed ({error.strerror}).") from error
 
 
-def clean(root: Path) -> None:
-    """Delete the rest of runs whose removal was interrupted, and the contents that only they refer to."""
+def clean(root: Path, removed: Collection[str] = ()) -> None:
+    """Delete what removed runs leave: contents that only they refer to, indexes, rests of earlier removals.
+
+    Args:
+        removed: the ids of the runs that were removed.
+    """
+    for index in (cache_folder() / EPISODES).glob("*.parquet") if removed else ():
+        if index.name.partition("-")[0] in removed:
+            index.unlink(missing_ok=True)
     for stray in strays(root):
         with contextlib.suppress(OSError):
             if time.time() - stray.stat().st_mtime > _STRAY_SECONDS:

@@ -113,10 +113,10 @@ def remove_run(
         if form.get("confirm", "").strip() != run.run_id:
             raise ConfigError(f"To remove the run and its recording for good, type its id, {run.run_id}.")
         remove(plan(run, run.folder.parent))
-        clean(run.folder.parent)
     except RunnerError as error:
         return _overview(request, run, jobs, settings, problem=message_of(error, request))
     catalogue.changed()
+    clean(run.folder.parent, [run.run_id])
     return RedirectResponse("/runs", HTTPStatus.SEE_OTHER)
 
 

@@ -23,7 +23,7 @@ from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of
 from runner.recording.topic_chunks import TopicChunks
 from tests.runner.altering import altered
-from tests.runner.loops.making import Leaving, Rooms, drive, make, parallel, play
+from tests.runner.loops.making import Described, Leaving, Rooms, drive, make, parallel, play
 
 
 def forged(source, target, topics=None, result=None):
@@ -354,3 +354,10 @@ def test_a_step_after_the_end_of_an_episode_is_no_damage_if_a_rerun_gives_it(tmp
     assert any("1 episode began without a reset" in note for note in found.notes)
     unproved = verify(env.run.recording, rerun=False)
     assert (unproved.verdict, "without a reset before it" in unproved.finding) == ("damaged", True)
+
+
+def test_an_environment_with_a_method_of_games_comes_out_again(tmp_path):
+    with runner.record(Described(), tmp_path) as env:
+        for _ in play(env, 20):
+            pass
+    assert verify(env.run.recording).verdict == "reproduced"

@@ -213,3 +213,11 @@ def record_counting(
                     rec.step(np.zeros(N_COUNTING, int))
                 rec.reset(seed=2)
     return rec.run.recording
+
+
+class Described(Rooms):
+    """Rooms with a method that RLlib's games have too."""
+
+    def get_observation_space(self, agent: object = None) -> object:
+        """Return the space of the observations."""
+        return self.observation_space

@@ -317,3 +317,39 @@ def test_a_damaged_index_is_made_again(folder):
     with pytest.raises(RunnerError, match="the next search makes it again"):
         runner.find("length > 20", folder)
     assert runner.find("length > 20", folder) == before
+
+
+def test_a_return_that_is_no_number_matches_no_comparison(tmp_path):
+    with runner.record(Paying(float("nan")), tmp_path) as env:
+        env.reset(seed=0)
+        env.step(0)
+    assert [runner.find(f"ret {sign} 1", tmp_path).count for sign in ("<", ">=", "==")] == [0, 0, 0]
+    found = runner.find("length == 1", tmp_path)
+    assert [hit.ret for hit in found.hits] == [None]
+    assert "–" in found.grid.rows[0]
+
+
+def test_conditions_on_ends_are_no_words_and_words_that_no_run_has_are_named(tmp_path):
+    with runner.record(Paying(1.0), tmp_path, name="paid") as env:
+        env.reset(seed=0)
+        env.step(0)
+    assert runner.find("not truncated", tmp_path).count == 1
+    assert runner.find("terminated and not truncated", tmp_path).count == 1
+    assert runner.find("paid", tmp_path).count == 1
+    assert "No run has 'collision' in its id, name" in runner.find("collision", tmp_path).sentence
+
+
+class Paying(gymnasium.Env):
+    """Ends with its first step, and pays."""
+
+    observation_space = action_space = gymnasium.spaces.Discrete(2)
+
+    def __init__(self, reward):
+        self.reward = reward
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 1, self.reward, True, False, {}

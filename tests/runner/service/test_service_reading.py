@@ -258,3 +258,13 @@ def test_composed_values_of_a_loop_are_separate_columns(client, recordings):
     body = client.get("/api/v1/runs/walk/steps/train.arrow").content
     assert pa.ipc.open_stream(body).read_all().to_pydict() == shown_here
     assert client.get("/api/v1/runs/walk/qtable").status_code == 400
+
+
+def test_a_picture_of_curves_has_the_metrics_that_are_asked_for(client):
+    whole, one = (
+        client.get(f"/api/v1/curves.svg?run=first&run=second{more}").text
+        for more in ("", "&metric=mean_length")
+    )
+    assert len(one) < len(whole) / 3
+    refused = client.get("/api/v1/curves.svg?run=first&metric=nosuch")
+    assert (refused.status_code, "found nosuch" in refused.text) == (400, True)

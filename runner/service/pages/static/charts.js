@@ -56,14 +56,24 @@ function change(changes, keep = true) {
   fill(chosen());
 }
 
-const kept = (which) => new Set(JSON.parse(localStorage.getItem(which) ?? "[]"));
+function remembered(which) {
+  try {
+    return new Set(JSON.parse(localStorage.getItem(which) ?? "[]"));
+  } catch {
+    return new Set(); // the browser keeps nothing for pages, or something else was there
+  }
+}
 
-function keep(which, metric, is) {
-  const metrics = kept(which);
-  if (is) metrics.add(metric);
+function remember(which, metric, isMember) {
+  const metrics = remembered(which);
+  if (isMember) metrics.add(metric);
   else metrics.delete(metric);
-  localStorage.setItem(which, JSON.stringify([...metrics]));
-  show();
+  try {
+    localStorage.setItem(which, JSON.stringify([...metrics]));
+    show();
+  } catch (error) {
+    message.textContent = `The browser does not let pages keep anything: ${error.message}`;
+  }
 }
 
 // --- data -----------------------------------------------------------------------------------------------
@@ -122,8 +132,8 @@ function show() {
     panel.curves.push(curve);
     metrics.set(curve.metric, panel);
   }
-  const hidden = kept(HIDDEN),
-    pinned = kept(PINNED),
+  const hidden = remembered(HIDDEN),
+    pinned = remembered(PINNED),
     first = (metric) => (pinned.has(metric) ? -1 : rank(metric));
   const ranked = [...metrics]
     .filter(([metric]) => !hidden.has(metric))
@@ -135,7 +145,7 @@ function show() {
   restore.hidden = !left.length;
   restore.replaceChildren(
     "Hidden, click to show: ",
-    ...left.map(([metric, { title }]) => button(title, () => keep(HIDDEN, metric, false))),
+    ...left.map(([metric, { title }]) => button(title, () => remember(HIDDEN, metric, false))),
   );
   for (const [metric, one] of shown)
     if (!metrics.has(metric) || hidden.has(metric)) {
@@ -264,18 +274,35 @@ function tools(metric, { title }, isPinned) {
   picture.textContent = "SVG";
   picture.setAttribute("aria-label", `${title} as SVG`);
   return [
-    button("Pin", () => keep(PINNED, metric, !isPinned), {
+    button("Pin", () => remember(PINNED, metric, !isPinned), {
       "aria-pressed": isPinned,
       "aria-label": `Pin ${title}`,
     }),
-    button("Hide", () => keep(HIDDEN, metric, true), { "aria-label": `Hide ${title}` }),
+    button("Hide", () => remember(HIDDEN, metric, true), { "aria-label": `Hide ${title}` }),
     picture,
     button("CSV", () => download(metric), { "aria-label": `${title} as CSV` }),
   ];
 }
 
 async function download(metric) {
+  try {
+    save(`${metric}.csv`, await table(metric));
+  } catch (error) {
+    message.textContent = error.message;
+  }
+}
+
+function save(name, text) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([text], { type: "text/csv" }));
+  link.download = name;
+  link.click();
+  URL.revokeObjectURL(link.href);
+}
+
+async function table(metric) {
   const query = selection();
+  if (chosen().lines) query.set("lines", "true");
   query.set("metric", metric);
   for (const name of ["smooth", "log_x", "log_y"]) query.delete(name); // the values as they were recorded
   const { axis, curves } = await request(`/api/v1/curves?${query}`);
@@ -283,6 +310,7 @@ async function download(metric) {
   const columns = curves.flatMap((curve) => {
     const label = labelOf(curve, lines);
     const values = { [label]: curve.values, [`${label}, low`]: curve.low, [`${label}, high`]: curve.high };
+    curve.runs.forEach((of, i) => (values[named(last.groups[curve.group].runs[i])] = of));
     return Object.entries(values).flatMap(([heading, of]) =>
       of ? [[heading, new Map(curve.positions.map((at, i) => [at, of[i]]))]] : [],
     );
@@ -291,13 +319,7 @@ async function download(metric) {
   const cell = (value) => (value === null || value === undefined ? "" : `"${String(value).replaceAll('"', '""')}"`);
   const rows = [[axis, ...columns.map(([heading]) => heading)]];
   for (const at of positions) rows.push([at, ...columns.map(([, values]) => values.get(at))]);
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(
-    new Blob([rows.map((row) => `${row.map(cell).join(",")}\n`).join("")], { type: "text/csv" }),
-  );
-  link.download = `${metric}.csv`;
-  link.click();
-  URL.revokeObjectURL(link.href);
+  return rows.map((row) => `${row.map(cell).join(",")}\n`).join("");
 }
 
 function plot(metric, panel, isPinned) {
