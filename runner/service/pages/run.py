@@ -39,7 +39,7 @@ from runner.service.dependencies import (
 )
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import environment_of, last_results, result_of, run_page
-from runner.service.pages.rendering import Form, message_of, page
+from runner.service.pages.rendering import Form, message_of, page, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
 from runner.util.values import Json
@@ -112,11 +112,11 @@ def remove_run(
     try:
         if form.get("confirm", "").strip() != run.run_id:
             raise ConfigError(f"To remove the run and its recording for good, type its id, {run.run_id}.")
-        remove(plan(run, run.folder.parent))
+        remove(plan(run, settings.recordings[0]))
     except RunnerError as error:
         return _overview(request, run, jobs, settings, problem=message_of(error, request))
     catalogue.changed()
-    clean(run.folder.parent, [run.run_id])
+    clean(settings.recordings[0], [run.run_id])
     return RedirectResponse("/runs", HTTPStatus.SEE_OTHER)
 
 
@@ -181,7 +181,13 @@ def _overview(
     request: Request, run: Run, jobs: JobQueue, settings: ServiceSettings, problem: str = ""
 ) -> Response:
     """Return the first page of a run; `problem` is why a request was refused."""
-    values = {"status": _status(run, jobs, settings), "problem": problem, "max_note": MAX_NOTE}
+    removal = plan(run, settings.recordings[0]) if viewer_of(request).can_write else None
+    values = {
+        "status": _status(run, jobs, settings),
+        "problem": problem,
+        "max_note": MAX_NOTE,
+        "removal": removal,
+    }
     status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
     return run_page(request, run, "", "run_overview.html", values, status)
 

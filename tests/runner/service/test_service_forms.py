@@ -10,6 +10,7 @@ from submitted import ICY
 
 from runner.runs.resolve import find_run
 from runner.runs.run import label
+from runner.service.settings import ServiceSettings
 from tests.waiting import until
 
 
@@ -92,6 +93,14 @@ def test_a_run_is_removed_when_its_id_is_typed(client, recordings):
     assert (answer.status_code, answer.headers["location"]) == (303, "/runs")
     assert not run.folder.exists()
     assert "1 run" in page_of(client, "/runs")
+
+
+def test_a_run_of_a_folder_that_is_only_read_is_not_removed(connect, recordings, tmp_path):
+    run = find_run("first", recordings)
+    client = connect(ServiceSettings((tmp_path / "written", recordings), tokens=tmp_path / "tokens.json"))
+    answer = client.post("/runs/first/remove", data={"confirm": run.run_id}, headers=ACCEPT_HTML)
+    assert (answer.status_code, "stays" in answer.text) == (400, True)
+    assert run.recording.is_file()
 
 
 def test_a_report_is_downloaded_and_not_shown_as_a_page(client):
