@@ -35,8 +35,9 @@ def shortcomings(recording: Recording) -> list[str]:
     sentences, status = [], recording.status
     if status != "finished":
         recorded = "its loop is recorded up to its last step"
-        if is_whole(planned := recording.config.get("episodes"), 0, 2**63):
-            recorded = f"there are {recording.train.episodes.count():,} of {planned:,} training episodes"
+        if (planned := recording.config.get("episodes")) is not None:
+            of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
+            recorded = f"there are {recording.train.episodes.count():,}{of} training episodes"
         problem = "is still running" if status == "running" else f"did not finish ({status})"
         sentence = f"Run {recording.run_id} {problem}: {recorded}."
         if (error := recording.result.error or "").startswith(RECORDING_STOPPED):

@@ -243,7 +243,10 @@ class EpisodeParser(Parser[Part]):
             hint = nearest(text, [*columns, *AGGREGATES])
             if not self._is_inside and name in of_steps:
                 hint = f" Steps have it: any({text}), count({text})."
-            listed = ", ".join(columns) if self._is_inside else f"{', '.join(columns)}, or any(), count() ..."
+            listed = (
+                ", ".join(columns) if self._is_inside else f"{', '.join(columns)}, any(), count(), then()"
+            )
+            listed = re.sub(r"\breturn(?=_|\b)", "ret", listed)
             raise self.error(node, f"found {text}, expected one of {listed[:1000]}.{hint}")
         column = columns[name]
         part = Part(CONDITION if column in ENDS else NUMBER, quoted(column), label=column)

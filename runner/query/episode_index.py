@@ -93,6 +93,10 @@ class EpisodeIndex:
         _check(row, runs)
         run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
         with open_recording(run.recording) as recording:
+            if row["status"] == "finished" != recording.status:
+                raise RecordingError(
+                    f"{run.recording}: is cut off, though its run is finished; `dualtaxi verify` says where."
+                )
             shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
             actions = _names_of_actions(shape, recording)

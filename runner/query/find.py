@@ -35,7 +35,7 @@ from runner.runs.catalogue.filters import parse
 from runner.runs.run import recordings_folder
 from runner.util.extras import require
 from runner.util.humanize import UNKNOWN, counted
-from runner.util.values import Json
+from runner.util.values import Json, is_whole
 
 LIMIT: Final = 20
 PHASES: Final = ("train", "eval")
@@ -93,6 +93,8 @@ class Found:
                 f"No run has {self.expression!r} in its id, name, tags or note; a condition on the steps of "
                 f"episodes is such as any({self.expression.split()[0]})."
             )
+        if not self.runs:
+            return "No run was searched."
         verb = "matches" if self.count == 1 else "match"
         return f"{counted(self.count, 'episode')} of {counted(self.runs, 'run')} {verb}."
 
@@ -141,6 +143,8 @@ def find(
         RunnerError: an expression is wrong, with a mark at its place, or names what no run has.
         MissingExtra: DuckDB is not installed.
     """
+    if limit is not None and not is_whole(limit, 1, 2**53):
+        raise RunnerError(f"limit: found {limit!r}, expected a whole number from 1, or None for all.")
     if phase not in (None, *PHASES):
         raise RunnerError(f"phase: found {phase!r}, expected train or eval.")
     chosen, condition = parse(runs), expression.strip()
@@ -175,6 +179,10 @@ def _search(
             interrupt.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
             raise
         except search.errors as error:
+            if "KeyboardInterrupt" in str(error):  # Python raised it while it gave DuckDB rows
+                interrupted = KeyboardInterrupt()
+                interrupted.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
+                raise interrupted from None
             if not all(path.exists() for path in search.files.values()):
                 raise FileNotFoundError(str(error)) from error
             if "Out of Memory" in str(error):

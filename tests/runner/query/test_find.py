@@ -353,3 +353,21 @@ class Paying(gymnasium.Env):
 
     def step(self, action):
         return 1, self.reward, True, False, {}
+
+
+def test_a_recording_that_lost_its_end_is_left_out_and_named(tmp_path):
+    with runner.record(Paying(1.0), tmp_path, chunk_steps=256) as env:
+        for _ in range(1_000):
+            env.reset(seed=0)
+            env.step(0)
+    whole = env.run.recording.read_bytes()
+    env.run.recording.write_bytes(whole[: 2 * len(whole) // 3])
+    found = runner.find("length > 0", tmp_path)
+    assert found.count == 0
+    assert "is cut off, though its run is finished" in found.left_out[0]
+
+
+@pytest.mark.parametrize("limit", [0, -1, 1.5])
+def test_a_wrong_limit_is_refused_before_anything_is_read(tmp_path, limit):
+    with pytest.raises(RunnerError, match="limit: found"):
+        runner.find("length > 0", tmp_path, limit=limit)

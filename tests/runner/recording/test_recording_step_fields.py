@@ -40,7 +40,8 @@ def test_an_archive_keeps_it(name):
             topics=job.topics,
             layout=job,
             tabular=False,
-            can_train_again=True,
+            has_states=True,
+            spaces={"action": {"n": 1}},
             run=run,
         )
     )

@@ -316,7 +316,8 @@ async function table(metric) {
     );
   });
   const positions = [...new Set(curves.flatMap((curve) => curve.positions))].sort((one, other) => one - other);
-  const cell = (value) => (value === null || value === undefined ? "" : `"${String(value).replaceAll('"', '""')}"`);
+  const cell = (value) =>
+    typeof value === "string" ? `"${value.replaceAll('"', '""')}"` : value === null ? "" : String(value ?? "");
   const rows = [[axis, ...columns.map(([heading]) => heading)]];
   for (const at of positions) rows.push([at, ...columns.map(([, values]) => values.get(at))]);
   return rows.map((row) => `${row.map(cell).join(",")}\n`).join("");
