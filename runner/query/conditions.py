@@ -239,6 +239,8 @@ class EpisodeParser(Parser[Part]):
         plain = [column for column in facts.index if "(" not in column and column != "phase"]
         of_steps = {spelt(column): column for column in facts.steps}
         columns = of_steps if self._is_inside else {spelt(column): column for column in plain}
+        if self._is_inside and not columns:
+            raise self.error(node, f"found {text}, and the run has no steps")
         if name not in columns:
             hint = nearest(text, [*columns, *AGGREGATES])
             if not self._is_inside and name in of_steps:
