@@ -121,9 +121,10 @@ def test_clients_that_do_not_read_keep_neither_pages_nor_each_other_waiting(impa
     run = next(recordings.glob("*/recording.mcap")).parent.name
     request = f"GET /api/v1/runs/{run}/recording HTTP/1.1\r\nHost: localhost\r\n\r\n".encode()
     with contextlib.ExitStack() as unread:
-        slow = [unread.enter_context(socket.create_connection(("localhost", impatient))) for _ in range(100)]
-        for connection in slow:
-            connection.sendall(request)
+        slow = []
+        for _ in range(100):
+            slow.append(unread.enter_context(socket.create_connection(("localhost", impatient))))
+            slow[-1].sendall(request)  # at once, as the service closes connections that ask nothing
         assert httpx.get(f"http://localhost:{impatient}/runs", timeout=2).status_code == 200
         for connection in slow:
             connection.settimeout(5)
