@@ -79,7 +79,7 @@ def rerun_loop(
             reason = OUTSIDE
     except CannotRedo as error:
         return replace(checked, changes=start.changes, reason=str(error))
-    if reason or (is_doubted and (found.left_out or not found.sound)):  # the doubt may be of those left out
+    if reason or (is_doubted and (found.left_out or not found.sound)):  # it did not decide
         return replace(checked, changes=start.changes, reason=reason, difference=found.difference)
     return found
 

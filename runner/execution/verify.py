@@ -389,9 +389,9 @@ def _unusual(recording: Recording, phase: str, findings: Findings) -> Iterator[s
 
 
 def _unlikely(recording: Recording, phases: Mapping[str, Findings]) -> str:
-    """Return what a forger may have left: most episodes begin with a reset, some do not; empty if nothing.
+    """Return what a lost or forged reset would leave: an episode without one; empty if no episode is so.
 
-    A loop may step an environment on after the end of an episode, but hardly ever does.
+    A loop may also step its environment after the end of an episode, but few do.
     """
     for phase, findings in phases.items():
         if findings.begun_by_reset >= findings.begun_without > 0:

@@ -154,10 +154,10 @@ def find(
     folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
     question = condition, phase, sort
     try:
-        return _search(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
+        return _answer(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
     except FileNotFoundError:  # another search replaced an index, as its recording grows
         try:
-            return _search(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
+            return _answer(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
         except FileNotFoundError as error:
             raise RunnerError("find: a recording changed while it was read; search again.") from error
 
@@ -167,7 +167,7 @@ def are_words(expression: str) -> bool:
     return bool(_WORDS.fullmatch(expression)) and _OF_CONDITIONS.isdisjoint(expression.split())
 
 
-def _search(
+def _answer(
     runs: SelectedRuns, memory: int, question: tuple[str, str | None, str], expression: str, limit: int | None
 ) -> Found:
     search = _Search(runs, memory)

@@ -21,15 +21,8 @@ from runner.query.conditions import EpisodeParser
 from runner.query.views import SelectedRuns
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
+from runner.util.files import EPISODES, cache_folder
 from tests.runner.recording.making import LAKE, TAXIS, make_run
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="module")

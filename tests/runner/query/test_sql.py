@@ -25,16 +25,8 @@ from runner.query.chunks import opened_tables
 from runner.recording.reader import open_recording
 from runner.recording.record_store import RecordStore
 from runner.runs.resolve import find_run
-from runner.util.files import CACHE_VARIABLE
 from tests.runner.loops.making import make, play
 from tests.runner.recording.making import LAKE, TAXIS, make_run
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
-        yield
 
 
 @pytest.fixture(scope="module")
