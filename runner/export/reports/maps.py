@@ -118,9 +118,11 @@ def situation(mdp: Mdp, state: int, free: Sequence[int]) -> NDArray[np.bool_]:
 
 
 def situations(mdp: Mdp, state: int) -> list[Choice]:
-    """Return what may be chosen of a state with a scene, as in this one."""
+    """Return what may be chosen of a state with a scene, as in this one; nothing if that is ambiguous."""
     assert mdp.scene is not None
     names = [str(name).split(", ") for name in states_in_words(mdp)]
+    if any(len(texts) != len(mdp.scene["things"]) for texts in names):  # a label has a comma in it
+        return []
     parts = zip(mdp.scene["things"], zip(*names, strict=True), names[state], strict=True)
     return [Choice(thing["label"], list(dict.fromkeys(texts)), chosen) for thing, texts, chosen in parts]
 
