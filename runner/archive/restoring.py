@@ -22,7 +22,6 @@ from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import message_record
-from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.messages import QTable, encode_q_table
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reader import open_recording
@@ -32,6 +31,7 @@ from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
 from runner.util.arrays import Records
+from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import storage_errors
 from runner.util.values import Json
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Final, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -20,13 +20,10 @@ from pydantic import (
 
 from runner.config.schedules import Probability, StepSize
 from runner.config.values import ConfigSection, Count, FrozenMapping, Optional, frozen, plain, refusal
+from runner.util.codecs import CODECS, Compression
 from runner.util.packing import (
-    DEFAULT_LEVEL,
     MAX_CHUNK_STEPS,
-    MAX_LEVEL,
     MIN_CHUNK_STEPS,
-    MIN_LEVEL,
-    Compression,
     Index,
     Packing,
 )
@@ -168,6 +165,9 @@ class Snapshots(ConfigSection):
     )
 
 
+_LEVELS: Final = sorted(level for codec in CODECS.values() for level in codec.levels)
+
+
 class RecordingSection(ConfigSection):
     """The contents of the recording, and how it is packed."""
 
@@ -177,8 +177,8 @@ class RecordingSection(ConfigSection):
     compression: Compression = Field(
         default=Packing.compression, description="Compression of the chunks of a recording."
     )
-    level: Annotated[int, Field(ge=MIN_LEVEL, le=MAX_LEVEL)] | None = Field(
-        default_factory=lambda chosen: DEFAULT_LEVEL if chosen.get("compression") == "zstd" else None,
+    level: Annotated[int, Field(ge=_LEVELS[0], le=_LEVELS[-1])] | None = Field(
+        default_factory=lambda chosen: CODECS[chosen.get("compression", "none")].default_level,
         description="Level of zstd, from -7 (fast) to 19 (small); 3 unless given. Only with zstd.",
     )
     index: Index = Field(
@@ -203,14 +203,21 @@ class RecordingSection(ConfigSection):
     )
 
     @model_validator(mode="after")
-    def _level_goes_with_zstd(self) -> Self:
-        if self.level is None and self.compression == "zstd":
-            raise refusal(("level",), "found null, expected a whole number from -7 to 19: zstd has a level")
-        if self.level is not None and self.compression != "zstd":
-            message = (
-                f"found {self.level}, but compression is {self.compression}: only zstd has levels. Remove it"
+    def _level_is_of_the_codec(self) -> Self:
+        levels = CODECS[self.compression].levels
+        if self.level is None and levels:
+            raise refusal(
+                ("level",),
+                f"found null, expected a whole number from {levels[0]} to {levels[-1]}: "
+                f"{self.compression} has a level",
             )
-            raise refusal(("level",), message)
+        if self.level is not None and self.level not in levels:
+            with_levels = ", ".join(name for name, codec in CODECS.items() if codec.levels)
+            raise refusal(
+                ("level",),
+                f"found {self.level}, but compression is {self.compression}: only {with_levels} has levels. "
+                "Remove it",
+            )
         return self
 
     @property

@@ -16,14 +16,13 @@ from pathlib import Path
 from typing import Final
 
 from runner.config import ExperimentConfig
+from runner.util.codecs import CODECS
 
 CLUMSY_EPISODES: Final = 500
 CLUMSY, SKILLED = 0.5, 0.1
 """Typical length of an episode as a share of the step limit: at first and in trials, and later."""
 LEAST: Final = 1 / 6
 """The steps of an agent that learns quickly, as a share of the typical figure."""
-BYTES_PER_STEP: Final = {"zstd": 15, "lz4": 30, "none": 100}
-"""Measured bytes of a step by compression, without the message index."""
 INDEX_BYTES: Final = 16
 """Bytes of the message index for a step."""
 OTHER_BYTES: Final = 2
@@ -68,7 +67,11 @@ def bytes_per_step(config: ExperimentConfig) -> int:
     plan = config.recording
     if plan.steps == "none":
         return OTHER_BYTES
-    return BYTES_PER_STEP[plan.compression] + (INDEX_BYTES if plan.index == "message" else 0) + OTHER_BYTES
+    return (
+        CODECS[plan.compression].bytes_per_step
+        + (INDEX_BYTES if plan.index == "message" else 0)
+        + OTHER_BYTES
+    )
 
 
 def step_limit(config: ExperimentConfig) -> int | None:

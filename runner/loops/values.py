@@ -14,10 +14,10 @@ from gymnasium.error import ResetNeeded
 
 from runner.errors import ConfigError, RecordingError
 from runner.recording import schema
-from runner.recording.chunks import MAX_CHUNK_BYTES
 from runner.recording.gym_values import SCALARS, only_number
 from runner.recording.spaces import Value
 from runner.util.arrays import Array
+from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.jsonable import as_mapping
 from runner.util.values import is_utf8
 

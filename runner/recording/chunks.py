@@ -7,15 +7,11 @@ threads can encode while another one learns.
 from __future__ import annotations
 
 import struct
-import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import lz4.frame
 import numpy as np
-import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 
@@ -23,23 +19,17 @@ from runner.errors import RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.schema import ACTIONS, EXTRA, ROW_TOPICS, STEP, TOPIC_OF, Topic
 from runner.util.arrays import Unsigned
-from runner.util.packing import MAX_CHUNK_STEPS, MAX_LEVEL, Packing
+from runner.util.codecs import CODECS, MAX_CHUNK_BYTES, MCAP_CODECS, UNPACK_ERRORS
+from runner.util.packing import MAX_CHUNK_STEPS, Packing
 
-MAX_CHUNK_BYTES: Final = 64 << 20
-"""The largest chunk that is read, packed or unpacked; the recorder's are below 17 MB."""
 _PLAIN_BYTES: Final = 4 << 20
 """Chunks of up to this size are unpacked without checking their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
-_PICTURE_BYTES: Final = 1 << 13
-"""Steps of more bytes have pictures in their observations, or are as rare."""
 _MOSTLY_ZEROS: Final = 16
 """Blocks of actions that become this many times smaller are discrete: nearly all of their columns are 0."""
-_MAX_QUICK_LEVEL: Final = 4
-"""At higher levels a compressor takes megabytes, and is not kept."""
 _DATA_LENGTH: Final = struct.Struct("<Q")
-_MAX_NAME_BYTES: Final = 4
-"""The length of the longest name of a compression, `zstd`."""
+_MAX_NAME_BYTES: Final = max(map(len, MCAP_CODECS))
 
 Packed = Callable[[str, bytes | memoryview], bytes | memoryview | None]
 """Returns records packed with a compression, if they were packed before."""
@@ -87,18 +77,19 @@ def encode_chunk(
         offsets: where each begins in `records`.
         packed: may return the records packed; by default, and if it does not, they are packed here.
     """
-    name = "" if packing.compression == "none" else packing.compression
+    codec = CODECS[packing.compression]
+    name = codec.mcap_name.encode()
     width = len(records) // len(log_times) if topic.message is STEP and packing.values else 0
     size, crc = len(records), crc32(records)
-    data = (packed and packed(name, records)) or _compress(records, packing, width)
+    data = (packed and packed(codec.mcap_name, records)) or codec.pack(records, packing.level, width)
     if topic.message is ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
-        data = _compress(records, replace(packing, level=MAX_LEVEL), width)
+        data = codec.pack(records, max(codec.levels, default=0), width)
     start, end = int(log_times[0]), int(log_times[-1])
-    head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name.encode()
+    head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name
     head += _DATA_LENGTH.pack(len(data))
     record = b"".join((RECORD_HEAD.pack(Opcode.CHUNK, len(head) + len(data)), head, data))
     index = message_index(topic, log_times, offsets, packing.index == "message")
-    entry = ChunkEntry(0, len(record), size, start, end, topic.channel, name.encode(), len(log_times))
+    entry = ChunkEntry(0, len(record), size, start, end, topic.channel, name, len(log_times))
     return Chunk(record, index, entry)
 
 
@@ -114,42 +105,6 @@ def message_index(topic: Topic, log_times: Unsigned, offsets: Unsigned, indexed:
     entries[:, 0], entries[:, 1] = log_times[:count], offsets[:count]
     head = struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + entries.nbytes, topic.channel, entries.nbytes)
     return b"".join((head, entries.data))
-
-
-def _compress(records: bytes | memoryview, packing: Packing, width: int) -> bytes:
-    if packing.compression == "zstd":
-        parameters = _zstd_parameters(packing.level, bool(width), width > _PICTURE_BYTES)
-        if packing.level > _MAX_QUICK_LEVEL:
-            return zstandard.ZstdCompressor(compression_params=parameters).compress(records)
-        return _compressor(parameters, threading.get_ident()).compress(records)
-    if packing.compression == "lz4":
-        return bytes(lz4.frame.compress(records))
-    return bytes(records)
-
-
-@lru_cache(8)
-def _compressor(parameters: zstandard.ZstdCompressionParameters, _thread: int) -> zstandard.ZstdCompressor:
-    """Return the compressor of a thread; making one takes longer than compressing a small chunk."""
-    return zstandard.ZstdCompressor(compression_params=parameters)
-
-
-@cache
-def _zstd_parameters(level: int, has_arrays: bool, has_pictures: bool) -> zstandard.ZstdCompressionParameters:
-    """Return the level's parameters; for the quick ones with tables that suit fixed-width records.
-
-    The match is nearly always the record before: a table of 2**12 entries finds it, stays in the first-level
-    cache, and costs little to clear for each chunk. Matches of 4 bytes are worth having; but among arrays of
-    floats the quickest search finds as much. A stack of frames shares all but one with the record before,
-    which a longer search finds: a quarter less, in a tenth of the time that an emulator takes for a step.
-    """
-    if level not in (3, _MAX_QUICK_LEVEL):
-        return zstandard.ZstdCompressionParameters.from_level(level)
-    tables = {"hash_log": 12, "chain_log": 12, "min_match": 4}
-    if has_pictures:
-        tables |= {"strategy": zstandard.STRATEGY_LAZY, "search_log": 3, "min_match": 7}
-    elif has_arrays:
-        tables |= {"strategy": zstandard.STRATEGY_FAST, "min_match": 5}
-    return zstandard.ZstdCompressionParameters.from_level(level, **tables)
 
 
 @dataclass(frozen=True)
@@ -183,8 +138,8 @@ def chunk_head(body: bytes | memoryview, length: int, where: str) -> ChunkHead:
         data_at = at + _DATA_LENGTH.size
     except struct.error as error:
         raise RecordingError(f"{where}: the record cannot be read") from error
-    if name_length > _MAX_NAME_BYTES or name not in (b"zstd", b"lz4", b""):
-        raise RecordingError(f"{where}: found compression {name!r}, expected zstd, lz4 or none")
+    if name_length > _MAX_NAME_BYTES or name.decode("latin-1") not in MCAP_CODECS:
+        raise RecordingError(f"{where}: found compression {name!r}, expected one of {', '.join(CODECS)}")
     if packed != length - data_at or size > MAX_CHUNK_BYTES:
         raise RecordingError(
             f"{where}: declares {packed:,} bytes packed and {size:,} unpacked, "
@@ -260,23 +215,6 @@ def decompress(data: bytes | memoryview, compression: str, size: int, where: str
 def _unpack(data: bytes | memoryview, compression: str, size: int, where: str) -> tuple[bytes, bool]:
     """Return the first `size` bytes, or all if there are fewer, and whether there are more."""
     try:
-        if compression == "zstd":
-            return _unpack_zstd(data, size)
-        if compression == "lz4":
-            with lz4.frame.LZ4FrameDecompressor() as stream:
-                return stream.decompress(bytes(data), max_length=size), not stream.eof
-        return bytes(data[:size]), len(data) > size
-    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
+        return MCAP_CODECS[compression].unpack(data, size)
+    except UNPACK_ERRORS as error:
         raise RecordingError(f"{where}: the chunk cannot be decompressed ({error})") from error
-
-
-def _unpack_zstd(data: bytes | memoryview, size: int) -> tuple[bytes, bool]:
-    """Unpack a zstd frame.
-
-    One that declares its size is unpacked in one go: the size was compared first.
-    """
-    decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
-    if zstandard.frame_content_size(data) == size:
-        return decompressor.decompress(data), False
-    with decompressor.stream_reader(data) as stream:
-        return stream.read(size), bool(stream.read(1))

@@ -33,7 +33,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import CutOff, RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.chunks import CHUNK_HEAD, MAX_CHUNK_BYTES, ChunkEntry
+from runner.recording.chunks import CHUNK_HEAD, ChunkEntry
 from runner.recording.layout import Layout
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import (
@@ -59,6 +59,7 @@ from runner.recording.schema import (
     schema_id,
 )
 from runner.util.arrays import Records
+from runner.util.codecs import MAX_CHUNK_BYTES
 
 K = TypeVar("K")
 T = TypeVar("T")

@@ -19,7 +19,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import CutOff, OtherVersion, RecordingError
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, message_index
+from runner.recording.chunks import ChunkEntry, message_index
 from runner.recording.extras import ExtraNames
 from runner.recording.index import Index, beginning_of, check_beginning, checksum
 from runner.recording.layout import Layout
@@ -34,6 +34,7 @@ from runner.recording.records import (
     read_record,
     walk,
 )
+from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import open_regular
 
 

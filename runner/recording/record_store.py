@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import MAX_CHUNK_BYTES, ChunkEntry, first_channel, unpack_chunk
+from runner.recording.chunks import ChunkEntry, first_channel, unpack_chunk
 from runner.recording.index import read_index
 from runner.recording.records import (
     MAX_METADATA_BYTES,
@@ -29,6 +29,7 @@ from runner.recording.records import (
     RawRecord,
     read_record,
 )
+from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import open_regular
 
 N = TypeVar("N", MetadataRecord, AttachmentRecord)

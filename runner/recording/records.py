@@ -30,13 +30,13 @@ from runner.recording.blocks import (
     record_dtype,
 )
 from runner.recording.chunks import (
-    MAX_CHUNK_BYTES,
     Chunk,
     ChunkEntry,
     message_index,
     unpack_chunk,
 )
 from runner.util.arrays import Unsigned
+from runner.util.codecs import MAX_CHUNK_BYTES
 
 MAX_METADATA_BYTES: Final = 4 << 20
 """The largest metadata record that is read, config and provenance among them."""

@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype
-from runner.recording.chunks import MAX_CHUNK_BYTES, chunk_head
+from runner.recording.chunks import chunk_head
 from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
@@ -38,6 +38,7 @@ from runner.recording.records import (
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.writer import RecordingFile
+from runner.util.codecs import MAX_CHUNK_BYTES, MCAP_CODECS
 from runner.util.files import open_regular
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
@@ -282,7 +283,9 @@ def _recorded_counts(summary: Summary) -> dict[str, int]:
 _LIKE_A_CHUNK: Final = re.compile(
     rb"\x06(?=.{3}[\0-\x04]\0{4}"  # its length
     rb".{16}.{3}[\0-\x04]\0{4}"  # its times and its unpacked size
-    rb".{4}(?:\0{4}|\x03\0{3}lz4|\x04\0{3}zstd))",  # its checksum and compression
+    rb".{4}(?:"
+    + b"|".join(re.escape(len(name).to_bytes(4, "little") + name.encode()) for name in MCAP_CODECS)
+    + rb"))",  # its checksum and compression
     re.DOTALL,
 )
 _LIKE_BYTES: Final = 64

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, Literal
 
-Compression = Literal["zstd", "lz4", "none"]
+from runner.util.codecs import CODECS, Compression
+
 Index = Literal["message", "chunk"]
-MIN_LEVEL: Final = -7
-MAX_LEVEL: Final = 19
-DEFAULT_LEVEL: Final = 3
 MIN_CHUNK_STEPS: Final = 256
 MAX_CHUNK_STEPS: Final = 1 << 16
 
@@ -19,8 +17,8 @@ class Packing:
     """How a recording is packed."""
 
     compression: Compression = "zstd"
-    level: int = DEFAULT_LEVEL
-    """The level of zstd; the other codecs ignore it."""
+    level: int = CODECS["zstd"].default_level or 0
+    """The level of the compression; codecs without levels ignore it."""
     index: Index = "message"
     """Whether each message is indexed, or only each chunk."""
     chunk_steps: int = 1 << 14

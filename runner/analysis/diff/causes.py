@@ -197,7 +197,10 @@ def _exploration_text(left: _Side, right: _Side) -> str:
 
 def _draws_actions(a: Recording, b: Recording) -> bool:
     """Return whether either run draws the actions that do not explore from a learned policy."""
-    return "wolf_phc" in (a.config.get("algorithm"), b.config.get("algorithm"))
+    from runner.learning.algorithms import ALGORITHMS
+
+    names = (a.config.get("algorithm"), b.config.get("algorithm"))
+    return any(algorithm.draws_actions for name, algorithm in ALGORITHMS.items() if name in names)
 
 
 def _differ_by_exploration(left: _Side, right: _Side) -> bool:

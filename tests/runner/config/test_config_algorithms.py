@@ -8,7 +8,7 @@ import pytest
 
 from runner.config import from_mapping
 from runner.config.model import Algorithm
-from runner.learning.algorithms import ALGORITHMS
+from runner.learning.algorithms import ALGORITHMS, OF_SETTINGS
 
 TWO = {"episodes": 1, "tables": "per_agent", "rewards": "team"}
 
@@ -17,7 +17,8 @@ TWO = {"episodes": 1, "tables": "per_agent", "rewards": "team"}
 def test_every_algorithm_is_defined_and_survives_a_round_trip(algorithm):
     config = from_mapping(TWO | {"algorithm": algorithm})
     assert from_mapping(config.to_mapping()) == config
-    assert algorithm in ALGORITHMS
+    definition = ALGORITHMS[algorithm]
+    assert OF_SETTINGS[definition.settings] == definition, "settings of another algorithm: give it its own type"
 
 
 def test_a_section_is_present_only_with_its_algorithm():

@@ -12,7 +12,6 @@ from runner.config import ExperimentConfig, from_mapping, load
 from runner.config.schedules import Exponential, Linear, Piecewise
 from runner.config.sections import RandomTable, RunTable
 from runner.errors import ConfigError
-from runner.util.packing import DEFAULT_LEVEL
 
 
 @pytest.fixture
@@ -41,7 +40,7 @@ def test_a_file_needs_only_episodes(write):
     assert (config.log.every_steps, config.log.window, config.log.episodes) == (50_000, 50_000, 50)
     assert config.snapshots.every is None
     recording = config.recording
-    assert (recording.steps, recording.compression, recording.level) == ("all", "zstd", DEFAULT_LEVEL)
+    assert (recording.steps, recording.compression, recording.level) == ("all", "zstd", 3)
     assert (recording.index, recording.chunk_steps) == ("message", 16_384)
     assert set(dict(config.quirks).values()) == {False}
 
