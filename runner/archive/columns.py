@@ -47,6 +47,8 @@ class Table:
     """The topics of its messages: one, or those of training and of evaluation."""
     messages: tuple[ArchiveColumn, ...]
     """The columns of the messages, besides run, phase and position."""
+    gives_tables: bool = False
+    """Whether its rows are steps from which the Q-tables follow, so that no snapshot is stored."""
 
     @cached_property
     def columns(self) -> pa.Schema:
@@ -130,7 +132,8 @@ class Shape:
         for name, topic_names in layout.TOPICS.items():
             topics = tuple(topic for topic in self._topics if topic.name in topic_names)
             if topics and name != layout.EXTRAS:
-                tables[name] = Table(name, topics, tuple(self._columns_of(topics[0])))
+                gives_tables = name == layout.STEPS and schema.Q_TABLE_TOPIC in self._topics
+                tables[name] = Table(name, topics, tuple(self._columns_of(topics[0])), gives_tables)
             elif topics and self.extras:
                 space = {"type": "Dict", "spaces": self.extras[-1].columns}
                 columns = SpaceColumns(space, "values", self._where, "extra", "given").columns

@@ -111,7 +111,7 @@ class _Restorer:
     def _restore_table(self, table: Table) -> None:
         if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):
             return
-        if self._archive.can_train_again and table.name == layout.STEPS:
+        if table.gives_tables:
             self._restore_learning(table)
         else:
             for topic, records in self._records(table):

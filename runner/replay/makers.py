@@ -329,8 +329,6 @@ def _short(error: BaseException) -> str:
 
 def why_not_rerun(recording: Recording, trust: bool = False) -> str:
     """Return why the recorded actions cannot be repeated in the environment; empty if it can be tried."""
-    if recording.can_train_again:
-        return "The run was trained here: `dualtaxi verify` retrains it instead."
     if not recording.has_actions:
         return "No steps were recorded."
     if recording.lost:

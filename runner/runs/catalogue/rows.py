@@ -120,8 +120,9 @@ def _recorded(run: Run) -> Mapping[str, Any]:
     if run.status in ("running", "interrupted", "failed") and run.recording.exists():
         with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
             done = recording.done()
-            is_loop = not run.can_train_again and not done["eval_steps"]
-            return {**done, "recent_training": recording.train.recent_means()} if is_loop else done
+            if not done["eval_steps"] and not recording.train.has_metrics:
+                return {**done, "recent_training": recording.train.recent_means()}
+            return done
     return {}
 
 
