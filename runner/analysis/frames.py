@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,10 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
+from runner.recording import schema
 from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
-from runner.recording.schema import SCALAR_TOPIC
 from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.run import Run
@@ -42,21 +42,6 @@ if TYPE_CHECKING:
 
 Source = Run | Recording | str | os.PathLike[str]
 Phase = Literal["train", "eval"]
-
-_BEFORE: Final = ("step", "episode", "t", "environment", "state", "action", "next_state", "next_observation")
-_AFTER: Final = ("terminated", "truncated", "explored", "acted", "agents_terminated", "agents_truncated")
-"""The fields of a step that are columns before, and after, the columns of rewards."""
-_OF_EPISODE: Final = (
-    "episode",
-    "environment",
-    "length",
-    "penalties",
-    "success",
-    "terminated",
-    "truncated",
-    "first_step",
-    "last_step",
-)
 
 
 def evaluations(run: Source) -> pd.DataFrame:
@@ -91,8 +76,8 @@ def training(run: Source) -> pd.DataFrame:
 def episodes(run: Source, phase: Phase = "train", start: int = 0, stop: int | None = None) -> pd.DataFrame:
     """Return a row for each episode of a phase, number `start` up to `stop`.
 
-    Columns: episode, environment (where there are several), length, penalties, success, terminated,
-    truncated, first_step, last_step, `return.AGENT`, and a column for each event.
+    Columns: episode, environment (where there are several), first_step, last_step, length, penalties,
+    success, terminated, truncated, `return.AGENT`, and a column for each event.
 
     Raises:
         MissingExtra: pandas is not installed.
@@ -113,7 +98,7 @@ def steps(
     """Return a row for each step of a phase: of one episode, or number `start` up to `stop`.
 
     Columns: step, episode, t, environment (where there are several), state, action (joint), next_state,
-    `reward.AGENT`, terminated, truncated, explored (bit i: agent i); in spaces that are not `Discrete` action
+    `reward.AGENT`, explored (bit i: agent i), terminated, truncated; in spaces that are not `Discrete` action
     and next_observation, a column for each part of a `Dict`, with an array in a cell where a value is several
     numbers; `extra.NAME` for each value that a loop recorded with its steps, NaN where a step has none. All
     steps of a long run take some 70 bytes of memory each.
@@ -185,7 +170,8 @@ def episode_columns(
     """Return the columns of `episodes`, an array each."""
     records = recording.phase(phase).episodes.array(start, stop)
     names = records.dtype.names or ()
-    columns = _plain_columns(records, [name for name in _OF_EPISODE if name in names])
+    plain = [name for name in schema.EPISODE_COLUMNS if name in names and name not in ("returns", "events")]
+    columns = _plain_columns(records, plain)
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
     return columns | _by_name(records["events"], recording.environment["event_names"])
 
@@ -194,7 +180,7 @@ def logged_columns(recording: Recording) -> dict[str, Sequence[object]]:
     """Return the columns of `logged`, a list each."""
     names = ("phase", "step", "episode", "name", "value")
     columns: dict[str, list[object]] = {name: [] for name in names}
-    for scalar in recording.table(SCALAR_TOPIC).decoded():
+    for scalar in recording.table(schema.SCALAR_TOPIC).decoded():
         for name in names:
             columns[name].append(scalar[name])
     return dict(columns)
@@ -225,10 +211,12 @@ def step_columns(
     else:
         records = steps_of(recording, phase, episode)
     names = records.dtype.names or ()
-    before = _plain_columns(records, [name for name in _BEFORE if name in names])
-    columns = {path: part for name, values in before.items() for path, part in leaves(name, values)}
-    columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
-    columns |= _plain_columns(records, [name for name in _AFTER if name in names])
+    columns: dict[str, Array] = {}
+    for name in schema.STEP_COLUMNS:
+        if name == "rewards":
+            columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
+        elif name in names and name != "taken":
+            columns |= dict(leaves(name, _plain_columns(records, [name])[name]))
     extras = recording.phase(phase).extras.at(records["step"])
     return columns | {f"extra.{name}": filled(values) for name, values in extras.items()}
 

@@ -32,7 +32,6 @@ NUMBERS: Final[Mapping[int, str]] = {
     Pb.TYPE_BOOL: "?",
 }
 """The dtypes of numbers by their types."""
-_OF_STATES: Final = ("state", "action", "next_state", "explored")
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,7 @@ def over_states(spaces: Mapping[str, Any]) -> bool:
 
 def _with_values(message: MessageType, *values: Field) -> MessageType:
     """Return a message with values of spaces in place of states."""
-    left_out = {"observation", *_OF_STATES}
+    left_out = schema.OF_STATES | {"observation"}
     others = tuple(field for field in message.fields if field.name not in left_out)
     return replace(message, fields=(*values, *others))
 

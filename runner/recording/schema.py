@@ -89,6 +89,27 @@ AGENT_FIELDS: Final = _fields(11, acted=_FIXED32, agents_terminated=_FIXED32, ag
 ENVIRONMENT_OF_STEP: Final = Field(14, "environment", _FIXED32)
 TAKEN: Final = Field(15, "taken", _BOOL)
 """The first and the last field of a step where environments take turns."""
+OF_STATES: Final = frozenset({"state", "action", "next_state", "explored"})
+"""The fields of steps over states alone; `layout` puts values of other spaces in their place."""
+STEP_COLUMNS: Final = (
+    "step",
+    "episode",
+    "t",
+    "environment",
+    "taken",
+    "state",
+    "action",
+    "next_state",
+    "next_observation",
+    "rewards",
+    "explored",
+    "terminated",
+    "truncated",
+    "acted",
+    "agents_terminated",
+    "agents_truncated",
+)
+"""The fields that steps may have, in the order in which people read them."""
 EPISODE = MessageType(
     "Episode",
     (
@@ -109,6 +130,20 @@ EPISODE = MessageType(
 )
 ENVIRONMENT_OF_EPISODE: Final = Field(11, "environment", _FIXED32)
 """One more field of an episode where environments take turns."""
+EPISODE_COLUMNS: Final = (
+    "episode",
+    "environment",
+    "first_step",
+    "last_step",
+    "length",
+    "penalties",
+    "returns",
+    "success",
+    "terminated",
+    "truncated",
+    "events",
+)
+"""The fields that episodes may have, in the order in which people read them."""
 _TRAINING_SIDE = _fields(
     step=_SFIXED64,
     episode=_SFIXED64,

@@ -29,31 +29,21 @@ from runner.runs.branches import BranchOrigin
 
 Block = NDArray[np.void]
 
-FIELDS: Final = (
-    "episode",
-    "t",
-    "state",
-    "explored",
-    "action",
-    "next_state",
-    "rewards",
-    "terminated",
-    "truncated",
-)
-"""The fields of a step that are compared, in the order in which a step comes about."""
-_VALUE_FIELDS: Final = (
-    "episode",
-    "t",
-    "acted",
-    "action",
-    "next_observation",
-    "rewards",
-    "terminated",
-    "truncated",
-    "agents_terminated",
-    "agents_truncated",
-)
-"""The fields that are compared of a step in spaces that are not both `Discrete`."""
+_NOT_COMPARED: Final = ("step", "environment")
+_CHOICE: Final = ("explored", "acted")
+"""The fields that tell how an action came about: a difference there comes before that of the action."""
+
+
+def _as_they_come_about() -> tuple[str, ...]:
+    """Return the fields of steps of any kind that are compared, in the order in which a step comes about."""
+    names = [name for name in schema.STEP_COLUMNS if name not in _NOT_COMPARED + _CHOICE]
+    at = names.index("action")
+    return (*names[:at], *_CHOICE, *names[at:])
+
+
+_COMPARED: Final = _as_they_come_about()
+FIELDS: Final = tuple(name for name in _COMPARED if name in [field.name for field in schema.STEP.fields])
+"""The fields that are compared of steps of jobs."""
 _EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run
 _MAX_LETTERS: Final = 300
 """The longest text of a value of varying size."""
@@ -271,8 +261,7 @@ def _compared(a: Recording, b: Recording, phase: str) -> tuple[str, ...]:
     Whether an action was explored is unknown of a loop, and 0 in its steps.
     """
     ours, theirs = (recording.phase(phase).steps.row_dtype.names or () for recording in (a, b))
-    fields = ("taken", *(FIELDS if a.has_states else _VALUE_FIELDS))
-    return tuple(name for name in fields if name in ours and name in theirs and name != "explored")
+    return tuple(name for name in _COMPARED if name in ours and name in theirs and name != "explored")
 
 
 def _first_in_phase(a: Recording, b: Recording, phase: str) -> Divergence | None:

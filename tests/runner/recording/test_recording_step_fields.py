@@ -1,4 +1,4 @@
-"""A field of `Step` is compared, in data frames and archived: where one is forgotten, a test says where."""
+"""A field of `Step` is a column of archives, data frames and `diff`."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from runner.analysis import frames
-from runner.analysis.diff import divergence
 from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.archive.rows import batch_of, records_of
@@ -18,14 +16,9 @@ from runner.recording.layout import layout_of
 NAMES = [field.name for field in schema.STEP.fields]
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "step"])
-def test_diff_compares_it(name):
-    assert name in divergence.FIELDS
-
-
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "rewards"])
-def test_a_data_frame_has_it(name):
-    assert name in (*frames._BEFORE, *frames._AFTER)
+def test_each_field_has_a_place_among_the_columns_that_people_read():
+    fields = (*schema.STEP.fields, *schema.AGENT_FIELDS, schema.ENVIRONMENT_OF_STEP, schema.TAKEN)
+    assert {field.name for field in fields} | {"next_observation"} == set(schema.STEP_COLUMNS)
 
 
 @pytest.mark.parametrize("name", NAMES)
