@@ -255,24 +255,44 @@ def test_values_of_a_game_come_back(first, second):
             assert same(plain(space, row["next_observation"][agent]), after[agent])
 
 
-@pytest.mark.parametrize("shape", [(), (1,), (2, 3)])
-@pytest.mark.parametrize("code", DTYPES)
-def test_values_of_batches_come_back(code, shape, tmp_path):
-    space = numbers(code, shape)
-    space.seed(1)
-    seen = np.array([[space.sample() for _ in range(2)] for _ in range(7)], code)
-    rest = np.zeros((3, 2))
-    with runner.record_batches(
-        "any", tmp_path, observation_space=space, action_space=space, autoreset_mode="NextStep"
-    ) as rec:
-        rec.batch(seen[:4], seen[4:], rest, rest.astype(np.bool_))
-    with open_recording(rec.run.recording) as recording:
-        rows = list(recording.train.transitions())
-    after, taken = seen[1:4].reshape(-1, *shape), seen[4:].reshape(-1, *shape)
-    assert len(rows) == len(after)
+def stacked(space, values):
+    """Return values [T][N] of a space as arrays [T, N, ...], nested as the space."""
+    if isinstance(space, spaces.Dict):
+        return {
+            key: stacked(part, [[value[key] for value in row] for row in values])
+            for key, part in space.spaces.items()
+        }
+    if isinstance(space, spaces.Tuple):
+        return tuple(
+            stacked(part, [[value[i] for value in row] for row in values]) for i, part in enumerate(space)
+        )
+    return np.array(values, space.dtype)
+
+
+@settings(max_examples=60)
+@given(nested(LEAVES), nested(LEAVES))
+def test_values_of_batches_come_back(observation, action):
+    observation.seed(1)
+    action.seed(2)
+    seen = [[observation.sample() for _ in range(2)] for _ in range(4)]
+    taken = [[action.sample() for _ in range(2)] for _ in range(3)]
+    zeros = np.zeros((3, 2))
+    with tempfile.TemporaryDirectory() as folder:
+        with runner.record_batches(
+            "any", folder, observation_space=observation, action_space=action, autoreset_mode="NextStep"
+        ) as rec:
+            rec.batch(stacked(observation, seen), stacked(action, taken), zeros, zeros.astype(np.bool_))
+        with open_recording(rec.run.recording) as recording:
+            rows = list(recording.train.transitions())
+            in_states = recording.has_states
+    assert len(rows) == 6
     for number, row in enumerate(rows):
-        assert same(row["next_observation"], after[number])
-        assert same(row["action"], taken[number])
+        after, done = seen[1 + number // 2][number % 2], taken[number // 2][number % 2]
+        if in_states:
+            assert (row["action"], row["next_state"]) == (done - action.start, after - observation.start)
+            continue
+        assert same(plain(observation, row["next_observation"]), after)
+        assert same(plain(action, row["action"]), done)
 
 
 def test_the_action_of_an_agent_stands_by_its_name(tmp_path):
