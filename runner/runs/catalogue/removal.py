@@ -93,17 +93,17 @@ def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     Args:
         foreign: also remove foreign files in its folder.
     """
-    row = row_of(run, None) | {"root": root, "entry": run.folder.name}
-    return _removal(row, run.folder, _why_not_in(run, root) or _protected(run), foreign)
+    row = row_of(run, None)
+    return _removal(row, root, run.folder, _why_not_in(run, root) or _protected(run), foreign)
 
 
 def plan_row(row: IndexRow, foreign: bool = False) -> Removal:
     """Return the removal of a run by its row in the index, which is quicker for very many runs."""
     folder = Path(row["root"], row["entry"])
-    return _removal(row, folder, _linked(folder) or _unreadable(folder), foreign)
+    return _removal(row, folder.parent, folder, _linked(folder) or _unreadable(folder), foreign)
 
 
-def _removal(row: IndexRow, folder: Path, refusal: str, foreign: bool) -> Removal:
+def _removal(row: IndexRow, root: Path, folder: Path, refusal: str, foreign: bool) -> Removal:
     contents = Contents()
     if not refusal:
         try:
@@ -124,7 +124,7 @@ def _removal(row: IndexRow, folder: Path, refusal: str, foreign: bool) -> Remova
         created=moment(row),
         folder=folder,
         is_archived=bool(row["archive"]),
-        root=Path(row["root"]),
+        root=root,
         contents=contents,
         refusal=refusal,
     )
