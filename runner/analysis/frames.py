@@ -5,7 +5,7 @@
     run = runner.run("quick")
     runner.frames.evaluations(run).plot("episode", "success_percent")
 
-A run is a `Run`, an open `Recording`, or the path of a recording. pandas comes with the extra `frames`.
+A run is a `Run`, an open `Recording`, or the path of a run's folder or recording. pandas comes with the extra `frames`.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.turns import taken
 from runner.replay.steps import steps_of
+from runner.runs.listing import run_at
 from runner.runs.run import Run
 from runner.util.arrays import Array, leaves
 from runner.util.extras import require
@@ -231,7 +232,8 @@ def _opened(run: Source) -> Iterator[Recording]:
     if isinstance(run, Recording):
         yield run
         return
-    with open_recording(at_hand(run).recording if isinstance(run, Run) else Path(run)) as recording:
+    run = run if isinstance(run, Run) else run_at(Path(run))
+    with open_recording(at_hand(run).recording) as recording:
         yield recording
 
 

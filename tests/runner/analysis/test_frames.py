@@ -100,6 +100,7 @@ def test_a_run_may_be_a_path_or_open(run):
     expected = frames.evaluations(run)
     assert frames.evaluations(run.recording).equals(expected)
     assert frames.evaluations(str(run.recording)).equals(expected)
+    assert frames.evaluations(run.folder).equals(expected)
     with runner.open_recording(run.recording) as recording:
         assert frames.evaluations(recording).equals(expected)
         assert recording.file.finished  # and still open
