@@ -5,7 +5,8 @@
     run = runner.run("quick")
     runner.frames.evaluations(run).plot("episode", "success_percent")
 
-A run is a `Run`, an open `Recording`, or the path of a run's folder or recording. pandas comes with the extra `frames`.
+A run is a `Run`, an open `Recording`, or the path of a run's folder or recording. pandas comes with the extra
+`frames`.
 """
 
 from __future__ import annotations

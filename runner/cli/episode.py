@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,13 +30,19 @@ if TYPE_CHECKING:
 
 
 class ShownEpisode:
-    """One episode of an open recording, read as it is needed; the title is the first line of each frame."""
+    """One episode of an open recording from step `at.t` on; the title is the first line of each frame.
+
+    Raises:
+        NotInRecording: the episode ends before that step.
+    """
 
     def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
         require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._number = recording, at.phase, at.number_in(recording)
         self._length = len(recording.phase(self._phase).episode(self._number))
-        self._title = title
+        if at.t > self._length:
+            raise at.no_step(recording, self._length, at.t)
+        self._first, self._title = at.t, title
 
     def steps(self) -> Iterator[dict[str, object]]:
         """Yield each step as JSON: with names where the environment's table has them.
@@ -45,7 +52,7 @@ class ShownEpisode:
         recording, agents = self._recording, self._recording.agents
         describe = _named(recording) if recording.tabular else _valued(recording, self._phase)
         reset = reset_of(recording, self._phase, self._number)
-        for row in transitions_of(recording, self._phase, self._number):
+        for row in islice(transitions_of(recording, self._phase, self._number), self._first, None):
             yield {
                 "t": int(row["t"]),
                 **({"reset": reset.arguments} if reset is not None and not row["t"] else {}),
@@ -56,7 +63,7 @@ class ShownEpisode:
             }
 
     def frames(self) -> Iterator[Text]:
-        """Yield a frame of the first state, and one after each step."""
+        """Yield a frame of the state before the first step, and one after each step."""
         from rich.text import Text
 
         draw = _state_drawer(self._recording)
@@ -64,7 +71,8 @@ class ShownEpisode:
         start = "the start" + (
             f", reset with {reset.in_words}" if reset is not None and reset.in_words else ""
         )
-        for moment in moments_of(self._recording, self._phase, self._number):
+        moments = moments_of(self._recording, self._phase, self._number)
+        for moment in islice(moments, self._first, None):
             step = f"\nstep {moment.t:,} of {self._length:,}\n\n"
             yield Text.assemble(
                 (self._title, "bold"), step, draw(moment.observation), _in_words(moment) or start

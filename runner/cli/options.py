@@ -21,8 +21,10 @@ from runner.cli.parameter_types import (
     NUMBERS,
     RANGES,
     SETTING,
+    STEP,
     TARGET,
     TRIAL,
+    TRIAL_FROM_STEP,
     ConfigName,
     RunName,
     RunOrFilter,
@@ -179,12 +181,23 @@ def require_one(*names: str) -> None:
 
 @record
 def episode_options(
-    episode: EpisodeRef | None = episode_option,
-    trial: EpisodeRef | None = trial_option,
+    episode: EpisodeRef | None = option(
+        "--episode",
+        type=STEP,
+        metavar="EPISODE[:T]",
+        help="An episode, from its step T on: N of training, counted from 0, eval:N:TRIAL, step:N, typical, "
+        "best, worst or last.",
+    ),
+    trial: EpisodeRef | None = option(
+        "--eval",
+        type=TRIAL_FROM_STEP,
+        metavar="N:TRIAL[:T]",
+        help="A trial, counted from 0, of the evaluation after N training episodes, from its step T on.",
+    ),
     best: bool = option("--best", is_flag=True, help="The episode of the highest return."),
     worst: bool = option("--worst", is_flag=True, help="The episode of the lowest return."),
 ) -> EpisodeRef:
-    """Return the episode that the options name; without any, a typical one."""
+    """Return the episode that the options name, and its first step; without any, a typical episode."""
     require_one(*EPISODE_OPTIONS)
     from runner.analysis.episodes import EpisodeRef
 

@@ -178,6 +178,13 @@ def _episode(text: str) -> EpisodeRef:
     return episode
 
 
+def _trial(text: str) -> EpisodeRef:
+    try:
+        return _step(f"eval:{text}")
+    except RunnerError:
+        raise ValueError(text) from None
+
+
 def _target(text: str) -> tuple[str, float]:
     from runner.analysis.series import parse_target  # loads NumPy
 
@@ -201,6 +208,7 @@ EPISODE: Final = Parsed(
     "episode", "N, train:N, eval:N:TRIAL, typical, best, worst or last, without a step", _episode
 )
 TRIAL: Final = Parsed("N:TRIAL", "N:TRIAL, such as 3000:0", lambda text: _episode(f"eval:{text}"))
+TRIAL_FROM_STEP: Final = Parsed("N:TRIAL", "N:TRIAL or N:TRIAL:T, such as 3000:0", _trial)
 RANGES: Final = Parsed("ranges", "START..STOP or N, such as 0..20,49980..50000", ranges_in)
 NUMBERS: Final = Parsed(
     "numbers", "numbers such as 1000,49000", lambda text: tuple(map(whole_number, text.split(",")))

@@ -44,6 +44,8 @@ class Shot:
 
     heading: str
     pictures: Pictures
+    first: int = 0
+    """The step at which the film begins."""
 
 
 def write_film(
@@ -116,6 +118,8 @@ def captioned(shot: Shot, width: int | None) -> Iterator[Pixels]:
 
     ground: Image.Image | None = None
     for picture in shot.pictures:
+        if picture.t < shot.first and not picture.note:
+            continue
         if ground is None:
             size = _size(picture.pixels.shape[1], picture.pixels.shape[0], width)
             frame_width = max(size[0], _LEAST_WIDTH)

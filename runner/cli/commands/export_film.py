@@ -85,6 +85,7 @@ def command(
     Examples:
       dualtaxi export film @latest
       dualtaxi export film k3v9m2xq --eval 3000:7 -o trial.gif
+      dualtaxi export film k3v9m2xq --episode 812:57
       dualtaxi export film k3v9m2xq --grid 3x3 -o nine.webm --fps 60
     """
     require_one(*EPISODE_OPTIONS, "grid")
@@ -108,14 +109,16 @@ def command(
         def shots() -> Iterator[film.Shot]:
             for one in shown:
                 opened.append(Pictures(recording, one.phase, one.number_in(recording), trust))
-                yield film.Shot(f"{run.title}: {one.title}", opened[-1])
+                yield film.Shot(f"{run.title}: {one.title}", opened[-1], one.t)
 
         lengths = [len(recording.phase(one.phase).episode(one.number_in(recording))) for one in shown]
+        if shown[0].t > lengths[0]:
+            raise shown[0].no_step(recording, lengths[0], shown[0].t)
         longest = (
             max(lengths) if whole or not grid else min(max(lengths), int(GRID_LENGTHS * median(lengths)))
         )
         cut = sum(length > longest for length in lengths)
-        frames = sum(min(length, longest) + 1 for length in lengths)
+        frames = sum(min(length, longest) + 1 for length in lengths) - shown[0].t
         with count_line("frames", frames) as progress, new_file(path, to.force) as temporary:
             if grid:
                 made = film.write_grid(temporary, shots(), grid[1], speed, width, progress, longest + 1)

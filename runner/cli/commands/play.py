@@ -75,6 +75,7 @@ def play_command(
       dualtaxi play @latest
       dualtaxi play k3v9m2xq --eval 3000:7 --speed 10
       dualtaxi play k3v9m2xq --best
+      dualtaxi play k3v9m2xq --episode 812:57
       dualtaxi play k3v9m2xq --episode 0 | less
     """
     from runner.cli.episode import ShownEpisode

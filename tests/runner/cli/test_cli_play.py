@@ -81,9 +81,10 @@ def test_a_trial_of_an_evaluation(recorded, recorded_run, trial, number):
         (["--eval", "x"], "expected N:TRIAL"),
         (["--eval", "3:x"], "expected N:TRIAL"),
         (
-            ["--episode", "1:5"],
-            "expected N, train:N, eval:N:TRIAL, typical, best, worst or last, without a step",
+            ["--episode", "1:x"],
+            "expected EPISODE:T such as 120:5, step:N, or eval:N:TRIAL:T",
         ),
+        (["--episode", "1:5000"], "steps, from 0; found no step 5,000"),
         (["--episode", "30"], "no training episode 30"),
         (["--episode", "-1"], "--episode"),
         (["--speed", "0"], "--speed"),
@@ -95,6 +96,14 @@ def test_missing_episodes_are_refused(recorded, words, message):
     result = recorded("play", "tiny", *words)
     assert result.exit_code == 2
     assert message in result.stderr
+
+
+@pytest.mark.parametrize("words", [("--episode", "7:3"), ("--eval", "20:3:2")])
+def test_an_episode_is_played_from_a_step_on(recorded, words):
+    episode, _, step = words[1].rpartition(":")
+    whole = recorded("play", "tiny", words[0], episode, "--json").stdout.splitlines()
+    assert recorded("play", "tiny", *words, "--json").stdout.splitlines() == whole[int(step) :]
+    assert recorded("play", "tiny", *words).stdout.count("\nstep ") == len(whole) + 1 - int(step)
 
 
 def test_the_best_and_the_worst_trial(recorded, recorded_run):
