@@ -15,7 +15,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -40,6 +40,7 @@ from runner.runs.listing import run_at
 from runner.runs.run import Run, recordings_folder
 from runner.runs.trust_marks import marking_nothing
 from runner.util.files import storage_errors
+from runner.util.humanize import counted, number
 from runner.util.jsonable import as_json
 from runner.util.processes import report_progress
 from runner.util.values import checked_run_name
@@ -60,6 +61,18 @@ class BranchOutcome:
     end: str
     """`terminated` or `truncated`; else why the episode was not played to its end."""
 
+    @property
+    def returns_in_words(self) -> str:
+        """The return, of several agents each with its name."""
+        several = len(self.returns) > 1
+        return ", ".join(
+            f"{agent} {number(value)}" if several else number(value) for agent, value in self.returns.items()
+        )
+
+    def __str__(self) -> str:
+        """Return a sentence without its end: `return 12 in 40 steps, terminated`."""
+        return f"return {self.returns_in_words} in {counted(self.length, 'step')}, {self.end}"
+
 
 @dataclass(frozen=True)
 class Branch:
@@ -75,17 +88,19 @@ class Branch:
 
 
 @dataclass(frozen=True)
-class _Task:
-    """What to branch, and how."""
+class EpisodeBranch:
+    """How an episode of a loop is branched; the arguments of `branch`."""
 
     at: EpisodeRef
-    action: Value
-    policy: str
-    seed: int
-    name: str | None
-    max_steps: int
-    trust: bool
-    user_folder: Path
+    action: Value = None
+    policy: str = "recorded"
+    seed: int = 0
+    name: str | None = None
+    max_steps: int = MAX_STEPS
+    trust: bool = False
+    run_id: str | None = None
+    """The id of the new run, from `new_run_id`."""
+    user_folder: Path = field(default_factory=Path.cwd)
     """Where the module of a policy is looked for."""
 
 
@@ -142,12 +157,9 @@ def branch(
         RunnerError: see `branch_training`.
         StorageError: the folder of the new run cannot be written.
     """
+    at = EpisodeRef.parse(at)
+    refuse_misfits(run, at, overrides, episodes, policy, seed, max_steps)
     if run.can_train_again:
-        if (policy, seed, max_steps) != ("recorded", 0, MAX_STEPS):
-            raise ConfigError(
-                f"run {run.run_id} was trained here, and a branch of it is trained as its "
-                "configuration says: policy, seed and max_steps are for loops."
-            )
         return branch_training(
             run,
             at=at,
@@ -159,7 +171,31 @@ def branch(
             report=lambda progress: report(progress.train_steps),
             stop=stop,
         )
-    at = EpisodeRef.parse(at)
+    task = EpisodeBranch(at, action, policy, seed, name, max_steps, trust)
+    return branch_episode(run, task, recordings_folder(recordings), report)
+
+
+def refuse_misfits(
+    run: Run,
+    at: EpisodeRef,
+    overrides: Sequence[str],
+    episodes: int | None,
+    policy: str,
+    seed: int,
+    max_steps: int,
+) -> None:
+    """Refuse arguments of `branch` that do not fit the run.
+
+    Raises:
+        ConfigError: one does not.
+    """
+    if run.can_train_again:
+        if (policy, seed, max_steps) != ("recorded", 0, MAX_STEPS):
+            raise ConfigError(
+                f"run {run.run_id} was trained here, and a branch of it is trained as its "
+                "configuration says: policy, seed and max_steps are for loops."
+            )
+        return
     if at.word == STEP:
         raise ConfigError(
             f"at: found the number {at.t:,} of a step, expected EPISODE:T: the steps of a loop are "
@@ -176,8 +212,18 @@ def branch(
         )
     if max_steps < 1:
         raise ConfigError(f"max_steps: found {max_steps}, expected 1 or more")
-    task = _Task(at, action, policy, seed, checked_run_name(name), max_steps, trust, Path.cwd())
-    folder = recordings_folder(recordings).absolute()
+
+
+def branch_episode(
+    run: Run, task: EpisodeBranch, recordings: Path, report: Callable[[int], None] = lambda _: None
+) -> Branch:
+    """Play an episode of a loop on from a step, and record that as a run in a folder: see `branch`.
+
+    Raises:
+        ConfigError, CannotRedo, RecordingError, StorageError: as `branch`.
+    """
+    checked_run_name(task.name)
+    folder = recordings.absolute()
     with storage_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
         staging = tempfile.TemporaryDirectory(prefix=".branch-", dir=folder)  # hidden: no run is listed there
@@ -196,6 +242,11 @@ def branch(
         return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped), is_recorded)
 
 
+def default_name(recording: Recording) -> str:
+    """Return the name of a branch of an episode that is not given one."""
+    return f"{recording.name[:90]}.branch"
+
+
 def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> BranchOutcome:
     """Return where an episode led; `otherwise` is its end if it has none."""
     returns, length, end = [0.0] * len(recording.agents), 0, otherwise
@@ -209,7 +260,7 @@ def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> 
 # --- in the child process -----------------------------------------------------------------------------
 
 
-def _record_branch(path: Path, folder: Path, task: _Task) -> None:
+def _record_branch(path: Path, folder: Path, task: EpisodeBranch) -> None:
     """Record a branch; report the steps taken, then what `branch` returns."""
     os.chdir(task.user_folder)
     with open_recording(path) as recording:
@@ -230,7 +281,7 @@ class _Player:
     origin: BranchOrigin
     is_recorded_action: bool
 
-    def __init__(self, recording: Recording, folder: Path, task: _Task) -> None:
+    def __init__(self, recording: Recording, folder: Path, task: EpisodeBranch) -> None:
         self._recording, self._folder, self._task = recording, folder, task
         self._at = task.at.resolved(recording)
         self.phase, self.episode = self._at.phase, self._at.number_in(recording)
@@ -267,10 +318,11 @@ class _Player:
             stepper.env = record_alone(
                 env,
                 self._folder,
-                name=task.name or f"{recording.name[:90]}.branch",
+                name=task.name or default_name(recording),
                 seed=recording.seed,
                 config={**(settings if isinstance(settings, Mapping) else {}), "origin": self.origin},
                 make=maker.make if is_trusted and maker.make else None,
+                run_id=task.run_id,
             )
             self.rec = stepper.env
         self.rec._enter(self.phase)

@@ -210,7 +210,7 @@ def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
 
 
 def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
-    from runner.debugging.branch import RAN_OUT, BranchOutcome
+    from runner.debugging.branch import RAN_OUT
 
     if branch.outcome.end == RAN_OUT:
         say(
@@ -222,15 +222,10 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
         print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both)
         return
 
-    def returns(outcome: BranchOutcome) -> str:
-        several = len(outcome.returns) > 1
-        return ", ".join(
-            f"{agent} {number(value)}" if several else number(value)
-            for agent, value in outcome.returns.items()
-        )
-
     outcomes = (("parent", parent.run_id, branch.parent), ("branch", branch.run.run_id, branch.outcome))
-    played = [(name, run, returns(each), f"{each.length:,}", each.end) for name, run, each in outcomes]
+    played = [
+        (name, run, each.returns_in_words, f"{each.length:,}", each.end) for name, run, each in outcomes
+    ]
     grid = grid_table(Grid(("", "run", "return", "length", "end"), played))
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
     draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))

@@ -9,20 +9,22 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final, ParamSpec
+from typing import Final, Literal, ParamSpec
 
 from pydantic import BaseModel, Field
 
+from runner.analysis.episodes import EpisodeRef
 from runner.config import from_text
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import MAX_BYTES
 from runner.config.problems import refuse
 from runner.environments.loading import load_mdp
-from runner.errors import ConfigError, RunnerError
+from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import branch_job, branch_name
 from runner.execution.estimate import estimate, step_limit
 from runner.execution.initial_tables import resolve_initial_q
 from runner.recording.reader import open_recording
+from runner.replay.makers import why_not_rerun
 from runner.replay.trust import require_listed
 from runner.runs.run import Run
 from runner.service.errors import Busy
@@ -33,6 +35,7 @@ from runner.sweep.loading import from_text as sweep_from_text
 from runner.sweep.search import Search, require_optuna
 from runner.util.humanize import size
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
+from runner.util.values import checked_run_name
 
 Args = ParamSpec("Args")
 PROCESSES: Final = 2
@@ -77,7 +80,7 @@ def _check_config(text: str, source: str, document: Document, recordings: Path) 
         config = resolve_initial_q(config, recordings)
     limit, seeds = step_limit(config), len(config.seeds)
     size = estimate(config, limit).typical_bytes * seeds if limit else 0
-    return CheckedJob("config", config.name, seeds, size, config.to_mapping())
+    return CheckedJob("config", config.name, seeds, size, config.to_mapping(), config.seeds)
 
 
 @contextlib.contextmanager
@@ -125,25 +128,48 @@ def is_path(name: str) -> bool:
 
 
 class BranchQuestion(BaseModel, extra="forbid", frozen=True):
-    """A change of a training step; the fields are the arguments of `runner.branch`."""
+    """A change of a recorded step; the fields are the arguments of `runner.branch`."""
 
-    at: str | int = Field(description="The first step that may differ: `EPISODE:T`, `step:N` or its number.")
+    at: str | int = Field(
+        description="The first step that may differ: `EPISODE:T`; of training also `step:N` or its number; "
+        "of an evaluation of a loop `eval:N:TRIAL:T`."
+    )
     action: str | int | dict[str, str | int] | None = Field(
         default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
     )
-    overrides: tuple[str, ...] = Field(default=(), description="`KEY=VALUE` each, as for `--set`.")
-    episodes: int | None = Field(default=None, description="Training episodes in all.")
+    overrides: tuple[str, ...] = Field(
+        default=(), description="Of training: `KEY=VALUE` each, as for `--set`."
+    )
+    episodes: int | None = Field(default=None, description="Of training: episodes in all.")
+    policy: Literal["recorded", "random", "constant"] = Field(
+        default="recorded", description="Of a loop: what acts after the step."
+    )
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Of a loop: the seed of the random policy.")
     name: str | None = Field(default=None, description="Name of the new run; `NAME.branch` by default.")
 
 
 def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
-    """Return the job of a branch of a run."""
+    """Return the job of a branch of a run; the environment of a loop is not made."""
+    from runner.debugging.branch import MAX_STEPS, default_name, refuse_misfits  # slow to import
+
+    at = EpisodeRef.parse(question.at)
+    refuse_misfits(run, at, question.overrides, question.episodes, question.policy, question.seed, MAX_STEPS)
     with open_recording(run.recording) as recording:
-        recording.require_job("a branch of training", "`dualtaxi branch` plays an episode of a loop on.")
-        job, _ = branch_job(recording, question.at, question.action, question.overrides, question.episodes)
-        limit = recording.mdp.step_limit
-    size = estimate(job.config, limit).typical_bytes if limit else 0
-    return CheckedJob("branch", branch_name(run, question.name), 1, size, job.config.to_mapping())
+        if run.can_train_again:
+            job, _ = branch_job(recording, at, question.action, question.overrides, question.episodes)
+            limit = recording.mdp.step_limit
+            size = estimate(job.config, limit).typical_bytes if limit else 0
+            name, config = branch_name(run, question.name), job.config
+            return CheckedJob("branch", name, 1, size, config.to_mapping(), config.seeds)
+        step = at.resolved(recording)
+        length = len(recording.phase(step.phase).episode(step.number_in(recording)))
+        if step.t >= length:
+            raise step.no_step(recording, length, step.t)
+        if reason := why_not_rerun(recording):
+            raise CannotRedo(reason)
+        name = checked_run_name(question.name) or default_name(recording)
+    values = {"run": run.run_id, **question.model_dump(mode="json"), "at": str(step)}
+    return CheckedJob("episode", name, 1, 0, values, (0,))
 
 
 class JobChecker:

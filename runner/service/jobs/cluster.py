@@ -11,7 +11,6 @@ from typing import Any, Final
 from runner.client.jobs import JobEvent, LogEvent, StateEvent
 from runner.errors import RunnerError
 from runner.service.jobs.channel import JobChannel, JobSpec
-from runner.service.jobs.store import WITHOUT_RUNS
 from runner.util.extras import require
 from runner.util.processes import OWN_ONLY
 
@@ -42,7 +41,7 @@ def do_on_cluster(spec: JobSpec, address: str, channel: JobChannel) -> StateEven
                 client.stop_job(job.submission_id)
         submission = client.submit_job(
             entrypoint=f"{COMMAND} {shlex.quote(folder)}",
-            entrypoint_num_cpus=0 if spec.job.kind in WITHOUT_RUNS else 1,
+            entrypoint_num_cpus=1 if spec.job.run_ids else 0,
             runtime_env={"env_vars": {OWN_ONLY: "1", "RAY_JOB_STOP_WAIT_TIME_S": str(CLOSE_SECONDS)}},
             metadata={"folder": folder},
         )

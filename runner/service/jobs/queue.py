@@ -11,7 +11,7 @@ from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
 from runner.service.jobs.checking import JobChecker
-from runner.service.jobs.store import WITHOUT_RUNS, CheckedJob, JobStore, QueuedJob, now
+from runner.service.jobs.store import CheckedJob, JobStore, QueuedJob, now
 from runner.service.jobs.workers import WorkerPool
 from runner.util.humanize import size
 
@@ -132,7 +132,7 @@ class JobQueue:
 
     def _usable_workers(self, checked: CheckedJob) -> int:
         """Return the most workers that a job can use; a cluster has its own for the runs of a job."""
-        if checked.kind not in WITHOUT_RUNS or self.pool.ray is not None:
+        if checked.seeds or self.pool.ray is not None:
             return 1
         return min(checked.runs, self.pool.size)
 

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from pydantic import TypeAdapter
 
 from runner.client.jobs import OVER, JobEvent, JobProgress, LogEvent, RunEvent, StateEvent
-from runner.config import from_mapping
 from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
@@ -35,9 +34,7 @@ from runner.util.files import replacing, storage_errors
 if TYPE_CHECKING:
     from filelock import FileLock
 
-Kind = Literal["config", "sweep", "branch", "explain"]
-WITHOUT_RUNS: Final = ("sweep", "explain")
-"""Kinds of jobs that are no runs, of seeds, but tasks for several workers."""
+Kind = Literal["config", "sweep", "branch", "episode", "explain"]
 State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
 
 FOLDER: Final = ".jobs"
@@ -63,7 +60,10 @@ class CheckedJob:
     bytes: int
     """The estimated size of its recordings; 0 if unknown."""
     values: dict[str, object]
-    """The configuration, or the sweep, every value present."""
+    """The configuration, the sweep or the question, every value present."""
+    seeds: tuple[int, ...] = ()
+    """The seeds of the runs that it makes one after the other; none of a sweep and an explanation, whose runs
+    are tasks for several workers."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class QueuedJob:
     retry: bool = False
     """Whether to repeat failed runs of a sweep."""
     run_ids: dict[int, str] = field(default_factory=dict)
-    """The ids of a configuration's runs by seed, in order: reserved before a run is made, so that no run is
+    """The ids of its runs by seed, in order: reserved before a run is made, so that no run is
     started twice."""
     begun: int = 0
     """How many of these runs were started."""
@@ -175,8 +175,7 @@ class JobStore:
                     f"{unfinished:,} jobs are unfinished, the maximum; wait until one of them is over."
                 )
             number = max(self._jobs, default=0) + 1
-            seeds = () if checked.kind in WITHOUT_RUNS else from_mapping(checked.values).seeds
-            run_ids = {seed: new_run_id(self.recordings) for seed in seeds}
+            run_ids = {seed: new_run_id(self.recordings) for seed in checked.seeds}
             job = QueuedJob(number, checked.kind, checked.name, checked.runs, now(), workers, run_ids=run_ids)
             try:
                 with storage_errors(self.path(number), "free some disk"):

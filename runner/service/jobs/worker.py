@@ -10,7 +10,6 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
 
-from runner.archive.places import at_hand
 from runner.client.jobs import EventData, LogEvent, RunEvent, RunProgress, StateEvent
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
@@ -20,10 +19,10 @@ from runner.execution.resume import resume
 from runner.execution.session import Progress, evaluation_brief, run_job
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
-from runner.runs.resolve import run_of_id
 from runner.runs.run import Run, create_run
 from runner.service.jobs.channel import REPORT_SECONDS, JobChannel, JobSpec, wait_for_owners
 from runner.service.jobs.cluster import do_on_cluster
+from runner.service.jobs.episodes import parent_in, run_episode_job
 from runner.service.jobs.explanations import run_explain_job
 from runner.service.jobs.sweeps import run_sweep_job
 from runner.service.processes import lower_priority
@@ -66,13 +65,15 @@ def do_job(spec: JobSpec, channel: JobChannel) -> StateEvent:
     """Do what is left of a job, and return its outcome; a worker and the option --job call this."""
     try:
         with announced(lambda: channel.send(LogEvent(MESSAGE))):
-            run = {"sweep": run_sweep_job, "explain": run_explain_job}.get(spec.job.kind, run_config_job)
-            run(spec, channel)
+            _DOING.get(spec.job.kind, run_config_job)(spec, channel)
         return StateEvent("finished")
     except (RunnerError, OSError, KeyboardInterrupt) as error:
         if channel.stop():  # whatever else was the matter, the next worker meets it again
             return StateEvent("interrupted")
         return StateEvent("failed", as_utf8(without_folders(full_message(error), spec.recordings)))
+
+
+_DOING: Final = {"sweep": run_sweep_job, "explain": run_explain_job, "episode": run_episode_job}
 
 
 def run_config_job(spec: JobSpec, channel: JobChannel) -> None:
@@ -96,7 +97,7 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
         run = resume(run, spec.job.accept_changes, reporter.report, channel.stop)
     else:
         job = Job(config, seed)
-        parent = _parent_of(job, spec.recordings) if spec.job.kind == "branch" else None
+        parent = parent_in(spec, job.config.branches[-1].run) if spec.job.kind == "branch" else None
         run = create_run(spec.recordings, config, seed, spec.job.name, spec.job.run_ids[seed], parent)
         reporter = Reporter(channel, run.run_id, config, seed)
         if parent is None:
@@ -106,15 +107,6 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
                 run = train_branch(recording, job, run, reporter.report, channel.stop)
     reporter.end()
     return run.status
-
-
-def _parent_of(job: Job, recordings: Path) -> Run:
-    """Return the run that a branch changes, which must still be there."""
-    run_id = job.config.branches[-1].run
-    parent = run_of_id(run_id, recordings)
-    if parent is None:
-        raise RunnerError(f"run {run_id}, the parent of this branch, is no longer there.")
-    return at_hand(parent)
 
 
 def _existing_run(folder: Path) -> Run | None:

@@ -1,17 +1,20 @@
-"""Branching the training of a run at one of its steps: a form, which queues a job."""
+"""Branching a run at one of its steps: a form, which queues a job."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from runner.environments.naming import numbered_actions
 from runner.errors import RunnerError
-from runner.recording.reader import open_recording
+from runner.recording.reader import Recording, open_recording
+from runner.replay.makers import why_not_rerun
 from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
 from runner.service.dependencies import JobsOf, RecordedRun
@@ -19,6 +22,8 @@ from runner.service.jobs.checking import BranchQuestion
 from runner.service.pages.frame import run_page
 from runner.service.pages.rendering import Form, message_of, number_in, to_job
 
+MAX_CHOICES: Final = 200
+"""More actions are typed, not listed."""
 router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
 
 
@@ -42,24 +47,49 @@ async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -
 def _question(given: Mapping[str, str]) -> BranchQuestion:
     """Return the branch that the fields of the form describe."""
     prefix = "action."
-    own: dict[str, str | int] = {
+    actions: dict[str, str | int] = {
         name.removeprefix(prefix): text for name, text in given.items() if name.startswith(prefix) and text
     }
-    return BranchQuestion(
-        at=given.get("at", ""),
-        action=own or None,
-        overrides=tuple(filter(None, map(str.strip, given.get("overrides", "").splitlines()))),
-        episodes=number_in(given, "episodes"),
-        name=given.get("name") or None,
-    )
+    fields = {
+        "at": given.get("at", ""),
+        "action": actions.get("", actions or None),
+        "overrides": tuple(filter(None, map(str.strip, given.get("overrides", "").splitlines()))),
+        "episodes": number_in(given, "episodes"),
+        "policy": given.get("policy") or "recorded",
+        "seed": number_in(given, "seed") or 0,
+        "name": given.get("name") or None,
+    }
+    try:
+        return BranchQuestion.model_validate(fields)
+    except ValidationError as error:  # the form itself offers nothing else
+        raise RequestValidationError(error.errors()) from error
 
 
 def _page(request: Request, run: Run, fields: Mapping[str, str], problem: str = "") -> Response:
-    """Return the form with the fields as they were sent, and the names of each agent's own actions."""
+    """Return the form with the fields as they were sent, or why an episode of a loop cannot be played on."""
+    phase = "eval" if fields.get("at", "").startswith("eval:") else "train"
     with open_recording(run.recording) as recording:
-        recording.require_job("a branch of training", "`dualtaxi branch` plays an episode of a loop on.")
-        mdp = recording.mdp
-    actions = dict(zip(mdp.agents, numbered_actions(mdp), strict=True))
-    values = {"form": fields, "actions": actions, "problem": problem}
+        values = {
+            "form": fields,
+            "problem": problem,
+            "actions": _choices(recording, phase),
+            "max_choices": MAX_CHOICES,
+            "is_trained": recording.can_train_again,
+            "refusal": "" if recording.can_train_again else why_not_rerun(recording),
+        }
     status = HTTPStatus.UNPROCESSABLE_ENTITY if problem else HTTPStatus.OK
     return run_page(request, run, "replay", "run_branch.html", values, status)
+
+
+def _choices(recording: Recording, phase: str) -> dict[str, list[str]]:
+    """Return the actions of each agent, in a space that is not discrete none; of one agent alone by ""."""
+    if recording.can_train_again:
+        return dict(zip(recording.mdp.agents, numbered_actions(recording.mdp), strict=True))
+    space, steps = recording.spaces["action"], recording.phase(phase)
+    is_of_agents = "acted" in (steps.steps.row_dtype.names or ())
+    choices = {}
+    for agent, part in (space["spaces"] if is_of_agents else {"": space}).items():
+        first, count = part.get("start", 0), part["n"] if part["type"] == "Discrete" else 0
+        numbers = map(str, range(first, first + count)) if count <= MAX_CHOICES else ()
+        choices[agent] = list(steps.action_names(agent) or numbers)
+    return choices

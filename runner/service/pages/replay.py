@@ -257,6 +257,9 @@ def _values(
         "source": f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
         "environments": environments,
         "what_if": f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
+        "branch": ""
+        if is_job and at.after is not None
+        else f"/runs/{run.run_id}/branch?at={at.episode_text}",
         "branches": branches,
         "marks": [mark for mark in run.marks if EpisodeRef.parse(mark.at).episode_path == at.episode_path],
     }

@@ -241,7 +241,8 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
         return dict(result_of(metric, last) for metric in METRICS if not metric.per_agent)
     results = last_results(run)
     recent = results.recent_training or RecentTraining(episodes=0)
-    episodes = f"the last {recent.episodes:,} training episodes"
+    count = "" if recent.episodes == 1 else f"{recent.episodes:,} "
+    episodes = f"the last {count}training episode{'s' if count else ''}"
     evaluation = results.last_evaluation or EvaluationMetrics()
     measures = {
         **dict(result_of(metric, evaluation) for metric in METRICS),

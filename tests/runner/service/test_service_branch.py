@@ -1,4 +1,4 @@
-"""Branches of training over HTTP: jobs of the queue, whose runs are those that the command records."""
+"""Branches over HTTP: jobs of the queue, whose runs are those that the command records."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ import shutil
 import time
 from contextlib import closing
 
+import gymnasium
 import pytest
 
 import runner
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
+from runner.service.jobs.channel import JobChannel, JobSpec
 from runner.service.jobs.checking import BranchQuestion, check_branch
+from runner.service.jobs.episodes import run_episode_job
 from runner.service.jobs.store import JobStore
 from runner.service.settings import ServiceSettings
 
@@ -57,7 +60,7 @@ def test_a_branch_is_queued_and_is_what_the_command_records(client, recordings, 
         ({"at": "20:1", "episodes": 3}, 422, "expected more than 20"),
         ({"at": "20:1", "episodes": 0}, 422, "episodes"),
         ({"at": "x"}, 400, "EPISODE:T"),
-        ({"at": "20:1", "policy": "random"}, 422, "policy"),
+        ({"at": "20:1", "policy": "random"}, 422, "policy, seed and max_steps are for loops"),
         ({}, 422, "at"),
     ],
 )
@@ -68,12 +71,97 @@ def test_what_is_wrong_is_refused_before_it_is_queued(client, sent, status, mess
     assert client.get("/api/v1/jobs").json()["total"] == 0
 
 
-def test_a_loop_is_refused(loops_client, loops):
-    name = runner.runs.listing.list_runs(loops)[0].run_id
-    own = {"Origin": str(loops_client.base_url)}
-    answer = loops_client.post(f"/api/v1/runs/{name}/branch", json={"at": "0:0"}, headers=own)
-    assert answer.status_code == 400
-    assert "dualtaxi branch" in answer.json()["error"]["message"]
+@pytest.fixture
+def loop(recordings):
+    """Return a run of somebody's own loop among the recordings, of two episodes."""
+    with runner.record(gymnasium.make("CartPole-v1"), recordings, name="pole") as rec:
+        for seed in range(2):
+            rec.reset(seed=seed)
+            for step in range(9):
+                rec.step(step % 2)
+    return rec.run
+
+
+def test_an_episode_of_a_loop_is_played_on_as_by_the_command(client, loop, recordings, tmp_path):
+    sent = {"at": "1:4", "action": "right", "policy": "random", "seed": 3, "name": "pushed"}
+    answer = client.post(f"/api/v1/runs/{loop.run_id}/branch", json=sent)
+    assert answer.status_code == 201, answer.text
+    job = finished(client, answer.json()["number"])
+    assert (job["state"], job["kind"], job["name"], job["error"]) == ("finished", "episode", "pushed", "")
+    (begun,) = job["begun"]
+    own = find_run(begun["run_id"], recordings)
+    expected = runner.branch(
+        loop, at="1:4", action="right", policy="random", seed=3, recordings=tmp_path / "own"
+    ).run
+    assert own.summary.content_digest == expected.summary.content_digest
+    assert own.name == "pushed"
+
+
+def test_a_resumed_job_plays_an_episode_on_only_once(connect, loop, recordings, tmp_path):
+    with closing(JobStore(recordings)) as store:
+        job = store.add(check_branch(loop, BranchQuestion(at="1:4", action="1")), "")
+    settings = ServiceSettings(recordings=(recordings,), tokens=tmp_path / "tokens.json")
+    client = connect(settings)
+    (begun,) = finished(client, job.number)["begun"]
+    before = len(list_runs(recordings))
+    spec = JobSpec(recordings / ".jobs" / str(job.number), client.app.state.jobs.store.job(job.number))
+    events = []
+    run_episode_job(spec, JobChannel(events.append, lambda: False))
+    assert [event.run_id for event in events] == [begun["run_id"]]
+    assert len(list_runs(recordings)) == before
+
+
+@pytest.mark.parametrize(
+    ("sent", "status", "message"),
+    [
+        ({"at": "2:0"}, 404, "training episode 2"),
+        ({"at": "1:9"}, 404, "has 9 steps, from 0; found no step 9"),
+        ({"at": "step:3"}, 422, "expected EPISODE:T"),
+        ({"at": "1:4", "overrides": ["lr=3"]}, 422, "overrides and episodes are for runs that were trained"),
+        ({"at": "1:4", "policy": "agent:act"}, 422, "policy"),
+        ({"at": "1:4", "name": "-"}, 422, "name"),
+    ],
+)
+def test_what_is_wrong_for_a_loop_is_refused_before_it_is_queued(client, loop, sent, status, message):
+    answer = client.post(f"/api/v1/runs/{loop.run_id}/branch", json=sent)
+    assert answer.status_code == status, answer.text
+    assert message in answer.json()["error"]["message"]
+    assert client.get("/api/v1/jobs").json()["total"] == 0
+
+
+def test_an_action_that_the_space_has_not_fails_the_job(client, loop, recordings):
+    answer = client.post(f"/api/v1/runs/{loop.run_id}/branch", json={"at": "1:4", "action": "up"})
+    job = finished(client, answer.json()["number"])
+    assert (job["state"], job["begun"]) == ("failed", [])
+    assert "found 'up'" in job["error"]
+    assert not list(recordings.glob(".branch-*"))
+
+
+def test_the_replay_of_a_loop_leads_to_the_form_which_queues_the_job(client, loop):
+    replay = client.get(f"/runs/{loop.run_id}/replay/train/1?t=4")
+    (address,) = re.findall(r'data-to-branch href="([^"]+)"', replay.text)
+    assert address.endswith("?at=1:4")
+    form = client.get(address)
+    assert ">right</option>" in form.text
+    sent = {"at": "1:4", "action.": "right", "policy": "constant", "seed": "x"}
+    refused = client.post(f"/runs/{loop.run_id}/branch", data=sent)
+    assert refused.status_code == 422
+    assert "<option selected>right</option>" in refused.text
+    crafted = client.post(f"/runs/{loop.run_id}/branch", data=sent | {"seed": "", "policy": "agent:act"})
+    assert crafted.status_code == 422
+    queued = client.post(f"/runs/{loop.run_id}/branch", data=sent | {"seed": ""}, follow_redirects=False)
+    assert queued.status_code == 303, queued.text
+    assert finished(client, queued.headers["location"].rpartition("/")[2])["state"] == "finished"
+
+
+def test_a_loop_that_another_user_recorded_has_no_form_and_no_job(client, loop):
+    (loop.folder / "trust.json").unlink()
+    page = client.get(f"/runs/{loop.run_id}/branch?at=1:4")
+    assert "was not recorded by the user who runs this server" in page.text
+    assert "<form class" not in page.text
+    answer = client.post(f"/api/v1/runs/{loop.run_id}/branch", json={"at": "1:4"})
+    assert answer.status_code >= 400
+    assert client.get("/api/v1/jobs").json()["total"] == 0
 
 
 def test_the_replay_leads_to_the_form_which_queues_the_branch(client):

@@ -420,4 +420,4 @@ def jobs_of(client):
 
 
 def one_seed(seed=0):
-    return CheckedJob("config", "icy", 1, 0, from_mapping(CONFIG | {"seeds": [seed]}).to_mapping())
+    return CheckedJob("config", "icy", 1, 0, from_mapping(CONFIG | {"seeds": [seed]}).to_mapping(), (seed,))

@@ -19,7 +19,7 @@ SWEEP = {"parameters": {"limit": [1.5, float("inf")]}}
 
 
 def added(store, name="tiny"):
-    return store.add(CheckedJob("config", name, 1, 0, CONFIG), "episodes: 3\n")
+    return store.add(CheckedJob("config", name, 1, 0, CONFIG, (0,)), "episodes: 3\n")
 
 
 def texts(events):
