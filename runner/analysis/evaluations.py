@@ -274,15 +274,16 @@ def loop_summary(recording: Recording) -> Summary:
 
 
 def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False) -> dict[str, list[str]]:
-    """Return position and metrics of evaluations as text, by heading, without metrics that no record has.
+    """Return position and metrics of evaluations as text, by heading, without metrics unknown of a loop.
 
     Narrow columns join the values of several agents: `-800.0/-812.5`.
     """
     columns = {"episode": [f"{record.episode:,}" for record in records]}
-    if records[0].training is None:  # of training here, the table's explanation states the trials
+    is_job = records[0].training is not None
+    if not is_job:  # of a job, the table's explanation states the trials
         columns["trials"] = [f"{record.trials:,}" for record in records]
     for metric in METRICS:
-        if all(record.value(metric.name) is None for record in records):
+        if not is_job and all(record.value(metric.name) is None for record in records):
             continue
         values = [record.values[metric.name] for record in records]
         texts = [list(map(humanize.number, by_agent.values())) for by_agent in values]
@@ -295,7 +296,7 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
 
 
 def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord]) -> Section:
-    """Return evaluations of a recording, one at least, as a table, without metrics that none has."""
+    """Return evaluations of a recording, one at least, as a table, without metrics unknown of a loop."""
     columns = list(metric_columns(records).items())
     for name in recording.environment["event_names"]:
         agent, dot, _ = name.rpartition(".")
