@@ -61,7 +61,7 @@ def when(
       visits[S], visits[S, A]         training steps that began in S, with action A
       step, episode                   numbers of the training step and of its episode
       reward, epsilon                 of the training step
-      q.taxi_1[S, A], reward.taxi_1   those of one agent, where each has its own table
+      q.taxi_1[S, A], reward.taxi_1   the same of one agent, if each has a table of its own
       and or not < <= > >= == !=      comparisons can be chained
       + - * / // % max() min() abs()  arithmetic
 

@@ -34,7 +34,7 @@ def why(
     ),
     agent: str | None = view_input(
         "agent",
-        "The agent whose Q-table it is in, where each has its own.",
+        "The agent, if each agent has a Q-table of its own.",
         metavar="NAME",
         label="Agent",
         choices=lambda recording: recording.agents,

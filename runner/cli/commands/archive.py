@@ -28,7 +28,7 @@ def archive_command(
     to: str | None = option(
         "--to",
         metavar="DIR|URL",
-        help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to them]",
+        help="A folder, or s3://BUCKET/PREFIX.  [default: $DUALTAXI_ARCHIVE, or `archive` next to the runs]",
     ),
     remove: bool = option(
         "--remove",
@@ -139,9 +139,8 @@ def import_command(
     """Import FILE, a recording from elsewhere, into the folder of runs.
 
     FILE was written by `dualtaxi export mcap`, or is any recording. Every byte is checked before the run
-    appears; a damaged or inconsistent file is refused, and nothing is written. A run that is there already
-    with the same content or more is left as it is; an interrupted one that FILE continues takes over its
-    content.
+    appears; a damaged or inconsistent file is refused, and nothing is written. A run that is
+    here already with the same content or more stays as it is; an interrupted run is completed from FILE.
 
     Examples:
       dualtaxi import quick-k3v9m2xq.mcap

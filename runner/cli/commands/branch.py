@@ -88,8 +88,8 @@ def branch_command(
     With --action all, and at a trial of an evaluation, nothing is trained: the episode is played on from the
     step with each joint action, or with those that --action selects, by the tables of that moment.
 
-    For a loop, an episode is played on from the step. Its environment is made again and brought there by the
-    recorded reset and actions, compared with the recording on the way. What acts then is --policy: the
+    For a loop, an episode is played on from the step. The environment is made again and takes the recorded
+    reset and actions up to the step; each result is compared with the recording. Then --policy acts: the
     recorded actions, until they run out; random ones; the same action every time; or a function of yours,
     from an observation to an action. An action is a number or a name, numbers separated by commas, or JSON
     where the space is a Dict or Tuple.

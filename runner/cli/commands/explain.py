@@ -72,15 +72,15 @@ def explain_command(
     as_json: bool = json_option,
     recordings: Path | None = recordings_option,
 ) -> None:
-    """Find which settings make the difference between A and B: mixtures of them are trained.
+    """Train mixtures of A and B to find which settings make the difference.
 
     A and B are runs, or configurations: files, or names of shipped ones. The same seeds and draws are
     trained with the settings of A and of B mixed: all mixtures of up to 8 settings; of up to 12, those that
     delta debugging needs. Shown are the share of each setting, which settings need each other, the smallest
     set that makes the difference, and the first step that the strongest setting changed.
 
-    Nothing is recorded but two short runs, to show that step. What was trained is kept: interrupted, the
-    same command continues, and more --seeds train only those that are new.
+    Two short runs are recorded, to show the first step that differs. All results are kept: after an
+    interruption the same command continues, and with more --seeds it trains only the new ones.
 
     Examples:
       dualtaxi explain tutorial_cooperative tutorial_text_cooperative --at 5000 --dry-run

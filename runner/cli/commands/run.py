@@ -47,9 +47,8 @@ def run_command(
     other or in parallel with --workers; the recordings are the same. Ctrl-C ends a run properly and keeps
     what it recorded; a second Ctrl-C kills it.
 
-    Steps and disk are estimated first, from an agent that learns quickly to a slow one, of which evaluation
-    trials and the first 500 training episodes last half the step limit, and later ones a tenth; "at most" is
-    all of the limit.
+    Steps and disk are estimated first, for a quick and for a slow learner. A slow one takes half the step
+    limit in trials and in its first 500 training episodes, then a tenth; "at most" assumes the whole limit.
 
     --json prints one line for each run.
 

@@ -34,7 +34,7 @@ def serve_command(
         "--allow-host",
         multiple=True,
         metavar="NAME",
-        help="A host name to accept requests for, such as that of a proxy; may be repeated.",
+        help="A host name to accept requests for, such as the proxy's; may be repeated.",
     ),
     proxies: tuple[str, ...] = option(
         "--proxy", multiple=True, metavar="ADDRESS", help="Trust X-Forwarded-* headers from this proxy."

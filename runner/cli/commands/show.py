@@ -67,8 +67,8 @@ def show_command(
     results of a loop: its last evaluation, the means of its last 100 training episodes and the last values it
     logged; `extras` the names of the values that it recorded with its steps; `first_resets` the seed and the
     options of the first reset of each phase; `checkpoints` those of its agent; `marks` the marks at its
-    steps; `processes` those that recorded it together; `origin` what it was branched from; and `branches`
-    its branches by run id.
+    steps; `processes` the processes that recorded it together; `origin` the run and step that it was branched
+    from; and `branches` its branches by run id.
 
     Examples:
       dualtaxi show @latest

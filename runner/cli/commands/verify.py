@@ -50,18 +50,19 @@ def verify_command(
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
     A run that was trained here is retrained in memory, with the environment in the recording, and compared.
-    With --rerun it is retrained with the installed environment, and compared with how the recording
-    describes its environment: scene and names.
+    --rerun retrains it with the installed environment, whose scene and names are compared with the recorded
+    ones, too.
 
     A loop's environment is rerun, in a process with limits: it takes the recorded resets and actions, and
     every observation, reward and end is compared. Of a run that you did not record, only listed environments
     are made, unless you say --trust. --no-rerun checks the file only.
 
-    The verdict is "reproduced" if everything compared is equal, and states what was retrained or rerun;
-    "consistent" if only the file was checked, with the reason why its environment cannot be rerun;
-    "interrupted" if the run did not end, and all up to its end is equal, or consistent; "differs", with the
-    first difference and what has changed since: packages, processor, code; or "damaged" if the bytes of the
-    file are wrong, or its parts contradict each other.
+    Verdicts:
+      reproduced   all that was retrained or rerun is equal
+      consistent   only the file was checked; the reason is stated
+      interrupted  the run did not finish; all that it recorded holds
+      differs      from the stated step on; packages or code that changed are named
+      damaged      bytes are wrong, or parts of the file contradict each other
 
     Exit code 1 if it differs or is damaged; with --rerun also if it cannot be rerun.
 
