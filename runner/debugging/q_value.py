@@ -180,7 +180,7 @@ def _parts_of(found: Why) -> list[Section]:
     left_out = (
         f"{without:,} of {len(found.episodes):,} stretches of episodes have no weight and are left out."
     )
-    return [
+    sections = [
         Section(
             "The sum",
             [off, EXPLANATION, *([found.note] if found.note else [])],
@@ -189,13 +189,13 @@ def _parts_of(found: Why) -> list[Section]:
             caption=KEY,
         ),
         Section("The steps that add or take most", none, listed),
-        Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]),
-        Section(
-            "By episode",
-            [left_out] if without else [],
-            [Grid(("episodes", *columns), [(_episodes(part), *cells(part)) for part in episodes])],
-        ),
     ]
+    if rewards:
+        sections.append(Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]))
+    if episodes:
+        by_episode = Grid(("episodes", *columns), [(_episodes(part), *cells(part)) for part in episodes])
+        sections.append(Section("By episode", [left_out] if without else [], [by_episode]))
+    return sections
 
 
 def _episodes(part: EpisodesPart) -> str:

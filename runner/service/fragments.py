@@ -32,7 +32,7 @@ from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if_in
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
-from runner.errors import ConfigError, RecordingError, shortened
+from runner.errors import ConfigError, RecordingError, RunnerError, shortened
 from runner.export.encoded import picture_note
 from runner.export.plots.curves import Plot
 from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
@@ -212,9 +212,17 @@ def distributions(path: Path, axis: str) -> bytes:
 
 
 def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
-    """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty."""
+    """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty.
+
+    Where nobody asked for scores, a reason why the runs cannot be compared is an answer, not an error.
+    """
     table = parse_table(scores, TABLE_NAME) if scores.strip() else None
-    comparison = compare_algorithms(series_of(paths, axis_of(axis)), table)
+    try:
+        comparison = compare_algorithms(series_of(paths, axis_of(axis)), table)
+    except RunnerError as error:
+        if table is not None:
+            raise
+        return f'<p class="hint">{escape(str(error).removeprefix("normalise: "))}</p>'.encode()
     shown = partials()
     plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(comparison)]
     html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, tasks_legend(comparison))]
