@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import sys
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
@@ -73,7 +74,7 @@ def sql_command(
 
     if parquet is not None:
         require_new(parquet, force)
-    with _told_how_far():
+    with _without_pandas(), _told_how_far():
         with stage_line("reading") as report:
             result = sql(
                 query, recordings=recordings, runs=runs, timeout=timeout, memory=memory, report=report
@@ -97,6 +98,25 @@ def sql_command(
             if len(shown) > _SHOWN:
                 say(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
     _say_left_out(result.left_out)
+
+
+class _NoPandas:
+    """Finds no pandas."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name=name)
+
+
+@contextlib.contextmanager
+def _without_pandas() -> Iterator[None]:
+    """Keep Arrow from loading pandas, which takes as long as a query, only to see whether it is there."""
+    sys.meta_path.insert(0, _NoPandas)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(_NoPandas)
 
 
 @contextlib.contextmanager
@@ -165,7 +185,7 @@ def find_command(
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query.find import find
 
-    with _told_how_far(), stage_line("reading") as report:
+    with _without_pandas(), _told_how_far(), stage_line("reading") as report:
         found = find(
             expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )
