@@ -39,6 +39,8 @@ MAX_TREE: Final = 300
 _MAX_VALUES: Final = 1000
 """Contents that are asked for by their digests, and names that are offered."""
 _NEWEST: Final = Sql("created DESC, id, root")
+_ALL_NEWEST: Final = Sql("+created DESC, id, root")
+"""The same for all rows: SQLite reads them as they lie, and sorts them, in a fifth of the time."""
 _AMONG: Final = "IN (SELECT value FROM json_each(?))"
 """The condition on a column to have one of the values in a JSON list."""
 
@@ -69,7 +71,7 @@ class CatalogueIndex:
             columns: the stored columns that are needed; all by default.
         """
         self._check_settings(chosen)
-        return _as_rows(self._query(", ".join(columns), chosen, _ordered(*order, _NEWEST)))
+        return _as_rows(self._query(", ".join(columns), chosen, _ordered(*order, _ALL_NEWEST)))
 
     def count(self, chosen: Filter = ANY_RUN) -> int:
         """Return how many rows match a filter."""
