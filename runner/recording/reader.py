@@ -94,6 +94,8 @@ class Recording(RunDescription):
     def close(self) -> None:
         """Close the file."""
         self.file.close()
+        for phase in schema.PHASES:  # which know this recording: it would stay in memory for a while
+            vars(self).pop(phase, None)
 
     def table(self, topic: Topic | str) -> TopicChunks:
         """Return the messages of a topic, given by itself or by its name.

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import gc
 import json
 import os
 import resource
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import pytest
@@ -187,3 +189,16 @@ def test_a_recording_is_never_overwritten(tmp_path):
     with pytest.raises(StorageError, match="cannot be created"):
         run_job(Job(config, 0), run)
     assert run.recording.read_bytes() == b"precious"
+
+
+def test_a_closed_recording_leaves_memory_at_once(tmp_path):
+    run = make_run(tmp_path, LAKE)
+    gc.disable()
+    try:
+        with open_recording(run.recording) as recording:
+            assert recording.train.steps.total()
+            seen = weakref.ref(recording)
+        del recording
+        assert seen() is None
+    finally:
+        gc.enable()
