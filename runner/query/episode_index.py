@@ -2,6 +2,7 @@
 
     episodes/RUN-HEX.parquet     a row for each episode: its columns, and of its steps the counts of flags,
                                  events and actions, and least, greatest and last numbers
+    episodes/packs/HEX.parquet   the rows of some sixty of these files, to open one instead
 
 It is made from the run's own tables when it is first asked for. HEX has hashes of the recording's path and
 state, and of the facts in the file's metadata. An index of another state is not found.
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -36,6 +37,10 @@ from runner.util.files import EPISODES, cache_folder, remove_oldest, replacing, 
 
 MAX_FILES: Final = 20_000
 _VERSION: Final = 2
+_PACKED: Final = 64
+"""The files that a pack has in the mean."""
+_LEAST: Final = 8
+"""The fewest files for which a pack is made, or read."""
 _HEX: Final = 16
 """The digits of each hash in a name."""
 _MAX_COLUMNS: Final = 64
@@ -58,8 +63,10 @@ class EpisodeIndex:
         self.folder = cache_folder() / EPISODES
         self._connection = connection
         with storage_errors(self.folder):
-            self.folder.mkdir(parents=True, exist_ok=True)
+            (self.folder / "packs").mkdir(parents=True, exist_ok=True)
             self._files = {path.stem[:-_HEX]: path for path in self.folder.glob("*-*.parquet")}
+        self.read = set[Path]()
+        """The files that were asked for, and those in a pack with them."""
         self._of_runs = defaultdict[str, list[Path]](list)
         for stem, path in self._files.items():
             self._of_runs[stem[:-_HEX]].append(path)
@@ -79,12 +86,47 @@ class EpisodeIndex:
         if stem not in self._files:
             for older in self._of_runs[start]:  # a search that reads it now begins again
                 older.unlink(missing_ok=True)
+                self._files.pop(older.stem[:-_HEX], None)
             self._files[stem] = self._make(row, runs, stem)
+        self.read.add(self._files[stem])
         return self._files[stem]
 
     def trim(self) -> None:
         """Remove the oldest files beyond the limit."""
         remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
+
+    def packs(self, files: Set[Path]) -> Iterator[tuple[Path, list[Path]]]:
+        """Yield packs of files with the same facts, each with all files that are in it.
+
+        The files, by their age, are cut where a name says so. Thus a pack is made once, and a new file, which
+        comes last, changes none. It is named by its files and their times. Packs of other files are removed.
+        """
+        kind, group = kind_of(next(iter(files))), list[tuple[int, str]]()
+        folder, kept = self.folder / "packs", set[Path]()
+        alike = [path for path in self._files.values() if kind_of(path) == kind]
+        for changed, path in sorted((path.stat().st_mtime_ns, str(path)) for path in alike):
+            group.append((changed, path))
+            if int(Path(path).stem[-2 * _HEX : -_HEX], 16) % _PACKED:
+                continue
+            packed, pack = [Path(path) for _, path in group], folder / f"{kind}-{_hash(group)}.parquet"
+            group.clear()
+            kept.add(pack)
+            if len(files & set(packed)) >= _LEAST:
+                self.read.update(packed)
+                if not pack.exists():
+                    self._pack(packed, pack)
+                yield pack, packed
+        for other in folder.glob(f"{kind}-*"):
+            if other not in kept:
+                other.unlink(missing_ok=True)
+
+    def _pack(self, files: Sequence[Path], pack: Path) -> None:
+        with storage_errors(pack), replacing(pack) as fresh:
+            self._connection.execute(
+                "COPY (SELECT file_index::BIGINT AS part, file_row_number AS row, * FROM "
+                f"read_parquet([{', '.join(literal(str(path)) for path in files)}])) TO "
+                f"{literal(str(fresh))} (FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 30720)"
+            )
 
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""

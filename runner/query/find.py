@@ -183,11 +183,11 @@ def _answer(
                 interrupted = KeyboardInterrupt()
                 interrupted.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
                 raise interrupted from None
-            if not all(path.exists() for path in search.files.values()):
+            if not all(path.exists() for path in search.index.read):
                 raise FileNotFoundError(str(error)) from error
             if "Out of Memory" in str(error):
                 raise RunnerError(f"find: needs more than {memory:,} MB of memory.") from error
-            for path in search.files.values():
+            for path in search.index.read:
                 path.unlink(missing_ok=True)
             raise RunnerError(
                 f"find: {error}\nThe index of these runs was removed: the next search makes it again."
@@ -208,9 +208,9 @@ class _Search:
         self.connection = duckdb.connect(
             ":memory:", config=SETTINGS | {"memory_limit": f"{memory}MB"} | _OPEN
         )
-        self._index = EpisodeIndex(self.connection)
-        self._sql(f"SET allowed_directories = [{literal(str(self._index.folder))}]")
-        self._sql(f"SET temp_directory = {literal(str(self._index.folder / 'spilled'))}")
+        self.index = EpisodeIndex(self.connection)
+        self._sql(f"SET allowed_directories = [{literal(str(self.index.folder))}]")
+        self._sql(f"SET temp_directory = {literal(str(self.index.folder / 'spilled'))}")
         self._sql(f"SET max_temp_directory_size = '{_MAX_SPILLED}'")
         self._sql("SET enable_external_access = false")
         self._sql("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
@@ -226,12 +226,12 @@ class _Search:
         kinds: dict[str, list[int]] = {}
         for k, row in enumerate(self.runs.rows):
             try:
-                self.files[k] = self._index.file(row, self.runs)
+                self.files[k] = self.index.file(row, self.runs)
                 kinds.setdefault(kind_of(self.files[k]), []).append(k)
             except RunnerError as error:
                 if not any(key.startswith(f"{row['id']} ") for key in self.runs.left_out):
                     self.runs.leave_out("find", row, error)
-        self._index.trim()
+        self.index.trim()
         wrong = []
         for numbers in kinds.values():
             facts = facts_of(self.files[numbers[0]])
@@ -250,11 +250,28 @@ class _Search:
         """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
         where, key, aggregates, _ = first
         is_open = f"{where} IS NULL OR {key} IS NULL" if aggregates else "FALSE"
-        self._sql(
-            f"INSERT INTO hits SELECT ($runs)[file_index::BIGINT + 1], file_row_number, {key}, {is_open} "
-            f"FROM read_parquet($files) WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}",
-            {"files": [str(self.files[k]) for k in numbers], "runs": numbers},
-        )
+        runs = {self.files[k]: k for k in numbers}
+        packs = list(self.index.packs(runs.keys()))
+        loose = runs.keys() - {path for _, packed in packs for path in packed}
+        for files, part, row in (
+            ([(path, [path]) for path in loose], "0", "file_row_number"),
+            (packs, "part", "row"),
+        ):
+            parts = [
+                (file, part, runs[path])
+                for file, (_, packed) in enumerate(files)
+                for part, path in enumerate(packed)
+                if path in runs
+            ]
+            if parts:
+                self._sql(
+                    f"INSERT INTO hits SELECT run, {row}, {key}, {is_open} FROM read_parquet($files) "
+                    "JOIN (SELECT unnest($of) AS of, unnest($at) AS at_part, unnest($runs) AS run) "
+                    f"ON of = file_index AND at_part = {part} "
+                    f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}",
+                    {"files": [str(path) for path, _ in files]}
+                    | dict(zip(("of", "at", "runs"), map(list, zip(*parts, strict=True)), strict=True)),
+                )
         opened = self._sql("SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run")
         for (k,) in opened:
             with self.runs.reading("find", self.runs.rows[k]):
@@ -295,8 +312,9 @@ class _Search:
             by_run[k].append(row)
         hits_by_place: dict[tuple[int, int], Hit] = {}
         for k, wanted in by_run.items():
-            shown = ["at", *(name for name in facts_of(self.files[k]).index if "(" not in name)]
-            values = pq.read_table(self.files[k], columns=shown).take(wanted).to_pylist()
+            with pq.ParquetFile(self.files[k]) as file:
+                plain = [name for name in file.schema_arrow.names if "(" not in name]
+                values = file.read(plain, use_threads=False).take(wanted).to_pylist()
             run = self.runs.rows[k]
             marks = read_marks(Path(run["root"], run["entry"])).marks
             hits_by_place |= {

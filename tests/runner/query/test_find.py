@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 
 import gymnasium
@@ -17,6 +18,7 @@ import runner
 from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.errors import RunnerError
+from runner.query import episode_index
 from runner.query.conditions import EpisodeParser
 from runner.query.views import SelectedRuns
 from runner.recording.reader import open_recording
@@ -305,11 +307,25 @@ def test_the_command(folder):
 
 def test_a_damaged_index_is_made_again(folder):
     before = runner.find("length > 20", folder)
-    for file in (cache_folder() / EPISODES).iterdir():
+    for file in (cache_folder() / EPISODES).glob("*.parquet"):
         file.write_bytes(file.read_bytes()[:40] + b"?")
     with pytest.raises(RunnerError, match="the next search makes it again"):
         runner.find("length > 20", folder)
     assert runner.find("length > 20", folder) == before
+
+
+def test_a_damaged_index_in_a_pack_is_made_again(folder, monkeypatch):
+    shutil.rmtree(cache_folder() / EPISODES)
+    before = runner.find("length > 20", folder, runs="pole")
+    (file,) = (cache_folder() / EPISODES).glob(f"{before.hits[0].run_id}-*")
+    other = file.with_name(f"other-{'1' * 32}{file.stem[-16:]}.parquet")
+    other.write_bytes(b"?")
+    os.utime(other, (0, 0))
+    monkeypatch.setattr(episode_index, "_LEAST", 1)
+    monkeypatch.setattr(episode_index, "_PACKED", int(file.stem[-32:-16], 16))  # it ends a pack of both
+    with pytest.raises(RunnerError, match="the next search makes it again"):
+        runner.find("length > 20", folder, runs="pole")
+    assert runner.find("length > 20", folder, runs="pole") == before
 
 
 def test_a_return_that_is_no_number_matches_no_comparison(tmp_path):
@@ -364,3 +380,31 @@ def test_a_recording_that_lost_its_end_is_left_out_and_named(tmp_path):
 def test_a_wrong_limit_is_refused_before_anything_is_read(tmp_path, limit):
     with pytest.raises(RunnerError, match="limit: found"):
         runner.find("length > 0", tmp_path, limit=limit)
+
+
+def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch):
+    run = find_run("pole", folder)
+    for k in range(20):
+        place = tmp_path / f"run{k:05d}"
+        shutil.copytree(run.folder, place)
+        facts = json.loads((place / "run.json").read_text()) | {"run_id": place.name, "name": f"pole{k % 2}"}
+        (place / "run.json").write_text(json.dumps(facts))
+    shutil.rmtree(cache_folder() / EPISODES)
+    monkeypatch.setattr(episode_index, "_LEAST", 3)
+    expressions = ("length > 20 and any(action == 1)", "then(action == 1, action == 0, within=1)")
+
+    def hits():
+        found = [runner.find(expression, tmp_path, sort="-ret", limit=None) for expression in expressions]
+        some = runner.find(expressions[0], tmp_path, runs='name == "pole1"')
+        return *found, some
+
+    monkeypatch.setattr(episode_index, "_PACKED", 1 << 70)
+    loose = hits()
+    assert all(found.count for found in loose)
+    for size in (1, 7):
+        monkeypatch.setattr(episode_index, "_PACKED", size)
+        for _ in range(2):
+            assert hits() == loose
+    assert list((cache_folder() / EPISODES / "packs").iterdir())
+    shutil.rmtree(tmp_path / "run00011")
+    assert [found.runs for found in hits()] == [19, 19, 9]
