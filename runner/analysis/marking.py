@@ -31,28 +31,33 @@ def mark(run: Run, at: StepLike, text: str = "", *, tags: Iterable[str] = ()) ->
             too many marks.
         StorageError: the run's folder cannot be written.
     """
+    (made,) = mark_steps(run, [at], text, tags=tags)
+    return made
+
+
+def mark_steps(
+    run: Run, steps: Iterable[StepLike], text: str = "", *, tags: Iterable[str] = ()
+) -> list[Mark]:
+    """Mark steps of a run with the same text; arguments and errors as for `mark`."""
     run.require_folder()
     with open_recording(at_hand(run).recording) as recording:
-        step, episode = _existing(recording, EpisodeRef.parse(at))
+        existing = [_existing(recording, EpisodeRef.parse(at)) for at in steps]
     created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    values = {
-        "at": str(step),
-        "episode": episode,
-        "text": text.strip(),
-        "tags": sorted(set(tags)),
-        "created": created,
-    }
+    values = {"text": text.strip(), "tags": sorted(set(tags)), "created": created}
     if not is_utf8(text):
         raise RunnerError(f"text: found {text[:100]!r}, expected text in UTF-8.")
     try:
-        made = stored_as(Mark, values, "mark")
+        marks = [
+            stored_as(Mark, {"at": str(step), "episode": episode} | values, "mark")
+            for step, episode in existing
+        ]
     except RecordingError as error:
         raise RunnerError(
             f"{error} A text has at most {MAX_MARK_TEXT:,} characters; a mark at most {MAX_TAGS} tags of "
             f"{TAG_EXPECTED}."
         ) from error
-    change_marks(run.folder, lambda marks: marks.merged([made]))
-    return made
+    change_marks(run.folder, lambda before: before.merged(marks))
+    return marks
 
 
 def unmark(run: Run, *ids: str) -> None:

@@ -14,7 +14,7 @@ import contextlib
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from runner.analysis.episodes import EpisodeRef
+from runner.analysis.marking import mark_steps
 from runner.analysis.sections import Grid
 from runner.errors import RunnerError
 from runner.query.conditions import ENDS, EpisodeParser, Facts
@@ -32,6 +33,7 @@ from runner.query.views import SelectedRuns
 from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
+from runner.runs.listing import listed_run
 from runner.runs.run import recordings_folder
 from runner.util.extras import require
 from runner.util.humanize import UNKNOWN, counted
@@ -84,6 +86,22 @@ class Found:
     """The number of runs that were searched."""
     left_out: list[str]
     """Sentences on the runs that could not be searched."""
+    folders: dict[str, Path]
+    """The folders of the runs with hits, by id."""
+
+    def mark(self, text: str = "", *, tags: Iterable[str] = ()) -> int:
+        """Mark the first step of each hit, and return how many were marked.
+
+        A hit with a mark of this text is left as it is. Arguments and errors as for `runner.mark`.
+        """
+        steps = defaultdict[str, list[str]](list)
+        for hit in self.hits:
+            if text.strip() not in hit.marks:
+                steps[hit.run_id].append(f"{hit.at}:0")
+        tags = list(tags)
+        return sum(
+            len(mark_steps(listed_run(self.folders[run], run), steps[run], text, tags=tags)) for run in steps
+        )
 
     @property
     def sentence(self) -> str:
@@ -112,7 +130,9 @@ class Found:
 
     def as_json(self) -> Json:
         """Return the result as JSON can hold it."""
-        return {**vars(self), "hits": list(map(vars, self.hits))}
+        values = vars(self) | {"hits": list(map(vars, self.hits))}
+        del values["folders"]
+        return values
 
 
 def find(
@@ -153,13 +173,12 @@ def find(
         chosen = chosen.also(words) if words is not None else chosen
     folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
     question = condition, phase, sort
-    try:
-        return _answer(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
-    except FileNotFoundError:  # another search replaced an index, as its recording grows
-        try:
+    for _ in range(2):
+        with contextlib.suppress(
+            FileNotFoundError
+        ):  # another search replaced an index, as its recording grows
             return _answer(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
-        except FileNotFoundError as error:
-            raise RunnerError("find: a recording changed while it was read; search again.") from error
+    raise RunnerError("find: a recording changed while it was read; search again.")
 
 
 def are_words(expression: str) -> bool:
@@ -321,7 +340,10 @@ class _Search:
                 (k, row): _hit(run, of_row, marks) for row, of_row in zip(wanted, values, strict=True)
             }
         hits = [hits_by_place[k, row] for k, row in places]
-        return Found(expression, hits, count, len(searched), list(self.runs.left_out.values()))
+        folders = {
+            row["id"]: Path(row["root"], row["entry"]) for row in map(self.runs.rows.__getitem__, by_run)
+        }
+        return Found(expression, hits, count, len(searched), list(self.runs.left_out.values()), folders)
 
     def _sql(self, query: str, values: Mapping[str, object] | None = None) -> list[Any]:
         rows: list[Any] = self.connection.execute(query, values).fetchall()

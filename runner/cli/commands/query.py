@@ -20,7 +20,7 @@ from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
 from runner.util.extras import require
-from runner.util.humanize import size
+from runner.util.humanize import counted, size
 
 _SHOWN: Final = 1000
 """The most rows of a table."""
@@ -153,6 +153,10 @@ def find_command(
         help="Sort by a number, such as ret, or -ret from the highest.",
     ),
     limit: int = limit_option(20),
+    mark: str | None = option(
+        "--mark", metavar="TEXT", help="Mark the first step of the episodes shown, as `dualtaxi mark` does."
+    ),
+    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="A tag of these marks."),
     as_json: bool = json_option,
     recordings: tuple[Path, ...] = folders_option,
 ) -> None:
@@ -181,6 +185,7 @@ def find_command(
       dualtaxi find 'any(action == "north + east") and success' --phase eval --sort length
       dualtaxi find 'max(next_observation[2]) > 0.2' --runs 'environment == "CartPole-v1"'
       dualtaxi find 'then(pickup, drop_off, within=5)' --sort -ret --json
+      dualtaxi find 'min(reward) < -15' --mark expensive --tag look-again
     """
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query.find import find
@@ -189,12 +194,15 @@ def find_command(
         found = find(
             expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )
+    marked = found.mark(mark or "", tags=tags) if mark is not None or tags else None
     if as_json:
-        print_json(found.as_json())
+        print_json(found.as_json() | ({} if marked is None else {"marked": marked}))
     else:
         if found.hits:
             draw(grid_table(found.grid, shrinking=console().is_terminal))
         say(found.sentence)
         if len(found.hits) < found.count:
             say(f"Shown are the first {len(found.hits):,}; --limit 0 shows all.")
+        if marked is not None:
+            say(f"Marked {counted(marked, 'episode')}; {len(found.hits) - marked:,} had this mark.")
     _say_left_out(found.left_out)

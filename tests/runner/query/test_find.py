@@ -382,6 +382,23 @@ def test_a_wrong_limit_is_refused_before_anything_is_read(tmp_path, limit):
         runner.find("length > 0", tmp_path, limit=limit)
 
 
+def test_hits_are_marked(tmp_path, folder):
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    words = ["find", "length > 20 and success", "--limit", "3", "--recordings", str(tmp_path), "--json"]
+    marking = [*words, "--mark", "odd", "--tag", "b", "--tag", "a"]
+    hits = json.loads(CliRunner().invoke(cli, words).stdout)["hits"]
+    answers = [json.loads(CliRunner().invoke(cli, marking).stdout) for _ in range(2)]
+    assert [answer["marked"] for answer in answers] == [3, 0]
+    (run_id,) = {hit["run_id"] for hit in hits}
+    marks = [mark for mark in find_run(run_id, tmp_path).marks if mark.text == "odd"]
+    assert sorted(mark.at for mark in marks) == sorted(f"{hit['at']}:0" for hit in hits)
+    assert {mark.tags for mark in marks} == {("a", "b")}
+    assert runner.find("length > 20 and success", tmp_path, limit=4).mark("odd") == 1
+    wrong = CliRunner().invoke(cli, [*words, "--tag", "no tag!"])
+    assert wrong.exit_code == 2
+    assert "tags" in wrong.output
+
+
 def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch):
     run = find_run("pole", folder)
     for k in range(20):
