@@ -15,7 +15,7 @@ import os
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -86,7 +86,7 @@ class Found:
     """The number of runs that were searched."""
     left_out: list[str]
     """Sentences on the runs that could not be searched."""
-    folders: dict[str, Path]
+    folders: dict[str, Path] = field(default_factory=dict)
     """The folders of the runs with hits, by id."""
 
     def mark(self, text: str = "", *, tags: Iterable[str] = ()) -> int:
