@@ -126,7 +126,7 @@ class Found:
             events = ", ".join(f"{name} {hit.events[name]:,}" for name in most)
             numbers = UNKNOWN if hit.ret is None else f"{hit.ret:,.6g}", f"{hit.length:,}"
             rows.append((hit.run_id, hit.name, hit.at, *numbers, hit.ended, events, ", ".join(hit.marks)))
-        return Grid(headings, rows, links=[hit.replay for hit in self.hits])
+        return Grid(headings, rows)
 
     def as_json(self) -> Json:
         """Return the result as JSON can hold it."""

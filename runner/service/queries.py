@@ -15,6 +15,7 @@ from runner.analysis.sections import Grid
 from runner.errors import RunnerError
 from runner.query.text import cell_of
 from runner.service import computed
+from runner.service.addresses import link
 from runner.service.dependencies import ProcessesOf, SettingsOf, json_response
 from runner.service.pages.rendering import message_of, page
 from runner.service.problems import error_docs
@@ -82,7 +83,9 @@ async def find_page(request: Request, search: SearchOf) -> Response:
         if search.expression.strip():
             from runner.query.find import Found  # needs the extra
 
-            shown["found"] = TypeAdapter(Found).validate_json(await _found(request, search))
+            found = TypeAdapter(Found).validate_json(await _found(request, search))
+            kept = link("", search.model_dump()).removeprefix("?")
+            shown |= {"found": found, "links": [link(hit.replay, {"found": kept}) for hit in found.hits]}
     except RunnerError as error:
         shown["problem"] = message_of(error, request)
     status = HTTPStatus.BAD_REQUEST if shown["problem"] else HTTPStatus.OK

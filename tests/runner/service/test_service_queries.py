@@ -59,7 +59,7 @@ def test_the_route_finds_episodes(client, recordings):
     assert answer == found.as_json()
     text = client.get("/find", params=search).text
     for hit in found.hits:
-        assert f'<a href="{hit.replay}">' in text
+        assert f'<a href="{hit.replay}?found=expression%3D' in text
         assert client.get(hit.replay).status_code == 200
     assert found.sentence in text
     find_run("second", recordings).recording.write_bytes(b"nothing")
@@ -120,3 +120,18 @@ def test_a_step_is_marked_by_a_key(page, recordings):
     link = browser.find_element(By.CSS_SELECTOR, "[data-mark='2']")
     browser.execute_script("arguments[0].click()", link)
     wait(browser, lambda: browser.find_element(By.CSS_SELECTOR, ".count").text.startswith("step 2 of"))
+
+
+def test_hits_are_played_one_after_the_other(page, recordings):
+    first, second, _ = (
+        hit.replay for hit in runner.find("length > 1", recordings, sort="length", limit=3).hits
+    )
+    browser = page("/find?expression=length+>+1&sort=length&limit=3")
+    link = browser.find_element(By.CSS_SELECTOR, f'a[href^="{first}?"]')
+    browser.get(link.get_attribute("href"))
+    wait(browser, lambda: "Hit 1 of 3" in browser.find_element(By.CSS_SELECTOR, "[data-hits]").text)
+    browser.execute_script("document.querySelector('.play').click()")
+    wait(browser, lambda: f"{second}?" in browser.current_url)
+    wait(browser, lambda: "Hit 2 of 3" in browser.find_element(By.CSS_SELECTOR, "[data-hits]").text)
+    wait(browser, lambda: "?t=" in browser.current_url and "&found=" in browser.current_url)
+    assert browser.find_element(By.LINK_TEXT, "‹ Previous hit").get_attribute("href").count(first)

@@ -1,4 +1,5 @@
 // The replay of an episode: its parts are requested as they are needed, and the address names the step.
+import { request } from "./api.js";
 import { onKeys, partAt } from "./parts.js";
 import { picturesOf } from "./pictures.js";
 
@@ -7,7 +8,11 @@ const root = document.querySelector("[data-part]"),
 const [toRerun, toWhatIf, toBranch, toMark] = ["rerun", "what-if", "branch", "mark"].map((name) =>
   root.querySelector(`[data-to-${name}]`),
 );
-let writing = null;
+const asked = new URLSearchParams(location.search),
+  search = asked.get("found"), // whose hits are played one after the other
+  kept = search ? `found=${encodeURIComponent(search)}` : "";
+let writing = null,
+  onward = null;
 
 // Browsers limit how often the address may change, so a playing replay does not write every step.
 function moved(k) {
@@ -16,7 +21,8 @@ function moved(k) {
   if (toBranch) toBranch.href = toBranch.href.replace(/[0-9]+$/, Math.min(k, replay.length - 1));
   if (toMark) toMark.value = toMark.value.replace(/[0-9]+$/, k);
   clearTimeout(writing);
-  writing = setTimeout(() => history.replaceState(null, "", `?t=${k}`), 150);
+  if (onward && replay.timer && k === replay.length) return location.assign(`${onward}?${kept}&play=1`);
+  writing = setTimeout(() => history.replaceState(null, "", `?t=${k}${kept && `&${kept}`}`), 150);
 }
 
 const at = Number(root.dataset.at),
@@ -57,3 +63,21 @@ document.addEventListener("keydown", (event) => {
   replay.pause();
   toMark.form.elements.text.focus();
 });
+
+// The hits of a search: the one before and the one after this episode, which is played next.
+if (search) {
+  const hits = (await request(`/api/v1/find?${search}`)).hits.map((hit) => hit.replay),
+    here = hits.indexOf(source.replace("/api/v1", "")),
+    place = root.querySelector("[data-hits]");
+  const linked = (text, address) => {
+    const link = document.createElement("a");
+    link.textContent = text;
+    link.href = address;
+    place.append(link, " ");
+  };
+  if (here > 0) linked("‹ Previous hit", `${hits[here - 1]}?${kept}`);
+  linked(here < 0 ? "All hits" : `Hit ${here + 1} of ${hits.length}`, `/find?${search}`);
+  if (here + 1 < hits.length) linked("Next hit ›", `${(onward = hits[here + 1])}?${kept}`);
+  place.hidden = false;
+  if (asked.has("play")) replay.play();
+}
