@@ -74,7 +74,7 @@ class Batches:
 
         They are `WHOLE` ones if they vary in size.
         """
-        stored = self._chunks_of(topic)
+        stored = self.chunks_of(topic)
         if stored is None:
             return
         if not self.shape.dtypes[topic].hasobject:
@@ -90,7 +90,7 @@ class Batches:
             if messages:
                 yield self._records_of(topic, messages)
 
-    def _chunks_of(self, topic: Topic) -> TopicChunks | None:
+    def chunks_of(self, topic: Topic) -> TopicChunks | None:
         """Return the chunks of a topic; None for a layout of extras without any."""
         if topic.message is not schema.EXTRA:
             return self._recording.table(topic)

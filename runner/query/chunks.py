@@ -173,9 +173,10 @@ def _count_chunks(recording: Recording, table: Table) -> int:
 def _chunks_of_recording(
     recording: Recording, batches: Batches, table: Table, condition: Condition
 ) -> Iterator[Chunks]:
-    for topic in table.topics:
-        known = _known_of(recording, recording.table(topic), condition)
-        yield Chunks(known, partial(_read_records, batches, table, topic))
+    for topic in batches.shape.topics_of(table):
+        if (chunks := batches.chunks_of(topic)) is not None:
+            known = _known_of(recording, chunks, condition)
+            yield Chunks(known, partial(_read_records, batches, table, topic))
 
 
 def _read_records(

@@ -15,13 +15,14 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from blake3 import blake3
 
 from runner.analysis.evaluations import Evaluation, evaluations_of
+from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.archive.columns import Shape
 from runner.archive.places import at_hand
@@ -35,8 +36,11 @@ from runner.runs.listing import listed_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 from runner.util.files import EPISODES, cache_folder, remove_oldest, replacing, storage_errors
 
+if TYPE_CHECKING:
+    from runner.query.chunks import Relation
+
 MAX_FILES: Final = 20_000
-_VERSION: Final = 2
+_VERSION: Final = 3
 _PACKED: Final = 64
 """The files that a pack has in the mean."""
 _LEAST: Final = 8
@@ -130,7 +134,7 @@ class EpisodeIndex:
 
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""
-        views = {name: runs.table(name, [row]) for name in ("episodes", "steps")}
+        episodes, own_steps = (runs.table(name, [row]) for name in ("episodes", "steps"))
         runs.left_out.pop(f"{row['id']} steps", None)  # a run need not have steps
         _check(row, runs)
         run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
@@ -142,9 +146,12 @@ class EpisodeIndex:
             shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
             actions = _names_of_actions(shape, recording)
-        for name, view in (*views.items(), ("evaluations", evaluations)):
-            self._connection.register(name, view)
-        episodes, steps = (view.schema for view in views.values())
+        self._connection.register("episodes", episodes)
+        self._connection.register("evaluations", evaluations)
+        steps = register_steps(
+            self._connection, own_steps, runs.table("extras", [row]) if shape.extras else None
+        )
+        episodes = episodes.schema
         plain = [name for name in episodes.names if name in _PLAIN or name.startswith(("return_", "n_"))]
         if shape.mdp is not None and shape.mdp.success_events:
             plain.append("success")
@@ -186,6 +193,27 @@ def kind_of(path: Path) -> str:
 def facts_of(path: Path) -> Facts:
     """Return what the episodes and steps of the run of an index have."""
     return Facts(**json.loads(pq.read_schema(path).metadata[b"facts"]))
+
+
+def register_steps(connection: Any, steps: Relation, extras: Relation | None) -> pa.Schema:
+    """Register the view `steps` with columns for extras, and return its columns.
+
+    An extra that a step lacks is NULL, a flag false. The extras of a vector, which are for all its
+    environments together, are left out.
+    """
+    connection.register("own_steps", steps)
+    joined, columns, more = "", "own_steps.*", []
+    if extras is not None and "environment" not in steps.schema.names:
+        connection.register("extras", extras)
+        joined = "LEFT JOIN extras USING (phase, step)"
+        more = [column for column in extras.schema if column.name.startswith(layout.EXTRA_PREFIX)]
+        for column in more:
+            name = f"extras.{quoted(column.name)}"
+            if pa.types.is_boolean(column.type):
+                name = f"coalesce({name}, FALSE) AS {quoted(column.name)}"
+            columns += f", {name}"
+    connection.execute(f"CREATE OR REPLACE TEMP VIEW steps AS SELECT {columns} FROM own_steps {joined}")
+    return pa.schema([*steps.schema, *more])
 
 
 def with_steps(

@@ -27,7 +27,7 @@ from runner.analysis.marking import mark_steps
 from runner.analysis.sections import Grid
 from runner.errors import RunnerError
 from runner.query.conditions import ENDS, EpisodeParser, Facts
-from runner.query.episode_index import EpisodeIndex, facts_of, kind_of, literal, with_steps
+from runner.query.episode_index import EpisodeIndex, facts_of, kind_of, literal, register_steps, with_steps
 from runner.query.sql import MEMORY_MB, SETTINGS
 from runner.query.views import SelectedRuns
 from runner.recording.marks import Mark, read_marks
@@ -314,8 +314,10 @@ class _Search:
         among = f"step BETWEEN {low} AND {high}"
         if "environment" not in steps.schema.names and len(episodes) <= _MAX_LISTED:
             among += f" AND episode IN ({', '.join(map(str, episodes))})"
-        self.connection.register("steps", steps)
-        rows = with_steps(chosen, steps.schema, aggregates, windows, among)
+        needs_extras = any('"extra_' in sql for sql in (*aggregates.values(), *windows.values()))
+        extras = self.runs.table("extras", [row]) if needs_extras else None
+        columns = register_steps(self.connection, steps, extras)
+        rows = with_steps(chosen, columns, aggregates, windows, among)
         self._sql(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM ({rows}) WHERE {where}")
 
     def found(self, expression: str, limit: int | None) -> Found:

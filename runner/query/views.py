@@ -1,7 +1,7 @@
 """The views of a query: the tables of the selected runs as one, with a column for the run.
 
-Steps, episodes and scalars are read while the query runs, in the columns and chunks that it needs. A column
-that a run does not have is null in its rows. The other views are small.
+Steps, extras, episodes and scalars are read while the query runs, in the columns and chunks that it needs. A
+column that a run does not have is null in its rows. The other views are small.
 """
 
 from __future__ import annotations
@@ -37,7 +37,12 @@ from runner.util.values import flatten
 if TYPE_CHECKING:
     from runner.query.chunks import Condition, Relation, RunTables
 
-TABLES: Final = {"steps": layout.STEPS, "episodes": layout.EPISODES, "scalars": layout.SCALARS}
+TABLES: Final = {
+    "steps": layout.STEPS,
+    "extras": layout.EXTRAS,
+    "episodes": layout.EPISODES,
+    "scalars": layout.SCALARS,
+}
 """The views of tables, which may be long."""
 VIEWS: Final = ("runs", "evaluations", "marks", *TABLES)
 _MOMENT: Final = pa.timestamp("ms", tz="UTC")
@@ -202,7 +207,7 @@ def _batches_of(
     of_events = _columns_of_events(tables.shape) if masks else []
     is_turn = ["taken"] if "taken" in table.columns.names else []  # else it is no step of its environment
     for chunks in tables.chunks(table, condition):
-        read = list(dict.fromkeys([*stored, *is_turn, *of_events]))
+        read = list(dict.fromkeys([*stored, *is_turn, *of_events])) or ["position"]  # to count the rows
         for batch in chunks.read(condition.may_hold(chunks.known), read):
             rows = batch.filter(batch["taken"]) if is_turn else batch
             own = {name: rows[name] for name in stored}

@@ -55,6 +55,7 @@ def sql_command(
       evaluations  a row for each evaluation: mean_return, success_percent, mean_length, ...
       episodes     a row for each episode that ended: phase, episode, length, return, n_EVENT, ...
       steps        a row for each step: phase, step, episode, t, state, action, reward, observation_0, ...
+      extras       a row for each step with values of a loop's own: phase, step, extra_NAME
       scalars      a row for each value that a loop logged: phase, step, episode, name, value
       marks        a row for each mark: ref, phase, episode, t, text, tags
 
@@ -174,7 +175,8 @@ def find_command(
 
     Of a step, in these functions: reward, t, state, next_state, next_observation[0], action, which is
     compared with its name or number; events such as collision, taxi_1.pickup, or pickup for any agent;
-    explored. They are the columns of steps that `dualtaxi sql` has.
+    explored; extra.NAME, a value that the loop recorded with the step. They are the columns of steps and
+    extras that `dualtaxi sql` has.
 
     An index of episodes in the cache answers most of it; it is made when a run is first searched. Only the
     steps of episodes that the index cannot decide are read. Runs without a column that the expression names

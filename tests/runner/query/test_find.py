@@ -349,19 +349,21 @@ def test_conditions_on_ends_are_no_words_and_words_that_no_run_has_are_named(tmp
 
 
 class Paying(gymnasium.Env):
-    """Ends with its first step, and pays."""
+    """Ends with its first step, or a later one, and pays."""
 
     observation_space = action_space = gymnasium.spaces.Discrete(2)
 
-    def __init__(self, reward):
-        self.reward = reward
+    def __init__(self, reward, length=1):
+        self.reward, self.length = reward, length
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
+        self.t = 0
         return 0, {}
 
     def step(self, action):
-        return 1, self.reward, True, False, {}
+        self.t += 1
+        return 1, self.reward, self.t == self.length, False, {}
 
 
 def test_a_recording_that_lost_its_end_is_left_out_and_named(tmp_path):
@@ -380,6 +382,41 @@ def test_a_recording_that_lost_its_end_is_left_out_and_named(tmp_path):
 def test_a_wrong_limit_is_refused_before_anything_is_read(tmp_path, limit):
     with pytest.raises(RunnerError, match="limit: found"):
         runner.find("length > 0", tmp_path, limit=limit)
+
+
+def test_extras_are_searched(tmp_path):
+    losses, agreed = {}, {}
+    with runner.record(Paying(1.0, length=6), tmp_path, name="learner") as env:
+        for episode in range(40):
+            env.reset(seed=episode)
+            for t in range(6):
+                env.step(0)
+                if (episode + t) % 3:
+                    losses.setdefault(episode, {})[t] = episode * (t + 1) % 7 / 2
+                    agreed.setdefault(episode, {})[t] = t > 3
+                    env.note_step(
+                        loss=losses[episode][t], agreed=agreed[episode][t], word="w", q=np.arange(2.0) + t
+                    )
+    expected = {
+        "any(extra.loss > 2.4)": [k for k in losses if max(losses[k].values()) > 2.4],
+        "count(extra.agreed) == 2": [k for k in agreed if sum(agreed[k].values()) == 2],
+        "then(extra.loss >= 2, extra.agreed, within=1)": [
+            k for k in losses if any(losses[k].get(t, 0) >= 2 and agreed[k].get(t + 1, 0) for t in range(6))
+        ],
+        "max(extra.q[1]) < 6": [k for k in losses if 5 not in losses[k]],
+    }
+    for expression, episodes in expected.items():
+        found = runner.find(expression, tmp_path, limit=None)
+        assert [int(hit.at) for hit in found.hits] == episodes, expression
+        assert 0 < len(episodes) < 40
+    with pytest.raises(RunnerError, match="Did you mean 'extra_loss'"):
+        runner.find("any(extra.los > 1)", tmp_path)
+    with pytest.raises(RunnerError, match=r"found extra\.word"):
+        runner.find("any(extra.word == 1)", tmp_path)
+    query = "SELECT count(*) AS n, max(extra_loss) AS loss FROM steps JOIN extras USING (run, phase, step)"
+    (row,) = runner.sql(query, recordings=tmp_path).arrow().to_pylist()
+    assert row["n"] == sum(map(len, losses.values()))
+    assert row["loss"] == 3
 
 
 def test_hits_are_marked(tmp_path, folder):

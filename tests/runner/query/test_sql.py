@@ -87,6 +87,12 @@ def test_steps_are_those_of_the_recording(folder, name):
     assert row["r"] == pytest.approx(reward)
 
 
+@pytest.mark.parametrize("view", ["steps", "episodes", "runs", "marks"])
+def test_rows_are_counted_without_their_columns(folder, view):
+    (row,) = rows(folder, f"SELECT count(*) AS n FROM {view}")
+    assert row["n"] == len(rows(folder, f"SELECT * FROM {view}"))
+
+
 def test_columns_of_all_runs_are_united_and_null_where_a_run_has_none(folder):
     cart = run_id(folder, "CartPole-v1")
     (row,) = rows(folder, f"SELECT * FROM steps WHERE run = '{cart}' AND step = 7")
@@ -259,6 +265,7 @@ def test_archives_are_read_where_they_are(folder, tmp_path, read):
         "SELECT run, phase, count(*) n, sum(reward) r, max(t) t FROM steps GROUP BY ALL ORDER BY ALL",
         "SELECT * EXCLUDE (run) FROM steps WHERE episode = 5 ORDER BY ALL",
         "SELECT * FROM episodes ORDER BY ALL",
+        "SELECT run, count(*) FROM steps GROUP BY ALL ORDER BY ALL",
     )
     before = [rows(copied, query) for query in queries]
     for name in ("taxis", "CartPole-v1", "RoomsText", "vector"):
