@@ -168,8 +168,8 @@ def sql(
 ) -> QueryResult:
     """Ask the recorded runs in SQL; return the rows, which are read as they are asked for.
 
-    The views are `runs`, `episodes`, `evaluations`, `scalars`, `steps`, `extras` and `marks`; each has a column
-    `run`.
+    The views are `runs`, `episodes`, `evaluations`, `scalars`, `steps`, `extras` and `marks`; each has a
+    column `run`.
 
     Args:
         query: one SELECT in the SQL of DuckDB.
