@@ -91,8 +91,14 @@ Q_TABLE_COLUMNS: Final = pa.schema(
 )
 
 LEFT_OUT_IF_EMPTY: Final = {
-    *("clock.parquet", "host.parquet", "console.parquet", "checkpoints.parquet"),
-    *(RESET_OPTIONS, "reset_states.parquet", EXTRA_COLUMNS, EXTRAS),
+    "clock.parquet",
+    "host.parquet",
+    "console.parquet",
+    "checkpoints.parquet",
+    RESET_OPTIONS,
+    "reset_states.parquet",
+    EXTRA_COLUMNS,
+    EXTRAS,
 }
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"

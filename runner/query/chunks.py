@@ -44,8 +44,12 @@ _COMPARED: Final = ("phase", "position", "step", "episode")
 _ROWS: Final = 1 << 14
 _BUFFER: Final = 1 << 16
 _NOT_NEEDED: Final = frozenset(layout.TOPICS) - {layout.EXTRA_COLUMNS} | {
-    *(layout.Q_TABLES, layout.CONTENTS, layout.RUN),
-    *(layout.TRANSITIONS, layout.STATES, layout.ACTIONS),
+    layout.Q_TABLES,
+    layout.CONTENTS,
+    layout.RUN,
+    layout.TRANSITIONS,
+    layout.STATES,
+    layout.ACTIONS,
 }
 """Files of an archive that its tables are read without."""
 
