@@ -205,13 +205,13 @@ class RecordingSection(ConfigSection):
     @model_validator(mode="after")
     def _level_is_of_the_codec(self) -> Self:
         levels = CODECS[self.compression].levels
-        if self.level is None and levels:
+        if levels and self.level not in levels:
             raise refusal(
                 ("level",),
-                f"found null, expected a whole number from {levels[0]} to {levels[-1]}: "
+                f"found {'null' if self.level is None else self.level}, expected a whole number from {levels[0]} to {levels[-1]}: "
                 f"{self.compression} has a level",
             )
-        if self.level is not None and self.level not in levels:
+        if self.level is not None and not levels:
             with_levels = ", ".join(name for name, codec in CODECS.items() if codec.levels)
             raise refusal(
                 ("level",),
