@@ -206,9 +206,10 @@ class RecordingSection(ConfigSection):
     def _level_is_of_the_codec(self) -> Self:
         levels = CODECS[self.compression].levels
         if levels and self.level not in levels:
+            found = "null" if self.level is None else self.level
             raise refusal(
                 ("level",),
-                f"found {'null' if self.level is None else self.level}, expected a whole number from {levels[0]} to {levels[-1]}: "
+                f"found {found}, expected a whole number from {levels[0]} to {levels[-1]}: "
                 f"{self.compression} has a level",
             )
         if self.level is not None and not levels:
