@@ -20,7 +20,7 @@ from runner.drawing import palette
 from runner.drawing.raster import Pixels, font, shortened, wrapped
 from runner.environments.naming import spoken
 from runner.export.encoder import LOSSLESS, Encoder, encoder, frames_of
-from runner.export.pictures import EpisodePicture, Pictures
+from runner.export.pictures import EpisodePicture, Pictures, PictureSource
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -31,6 +31,9 @@ MAX_WIDTH: Final = 1280
 """Larger pictures, and grids, are reduced to this width."""
 MAX_HEIGHT: Final = 2048
 """The largest height of a picture."""
+_SCENE_FPS: Final = 4.0
+"""Frames per second of a drawn scene, whose steps are large."""
+_FPS: Final = 30.0
 _LEAST_WIDTH: Final = 160
 """Frames are at least this wide, for their text."""
 _MARGIN: Final = 12
@@ -46,6 +49,11 @@ class Shot:
     pictures: Pictures
     first: int = 0
     """The step at which the film begins."""
+
+
+def usual_speed(source: PictureSource) -> float:
+    """Return the frames per second of a film whose pictures are made from a source."""
+    return _SCENE_FPS if source is PictureSource.SCENE else _FPS
 
 
 def write_film(

@@ -25,6 +25,7 @@ from runner.analysis.compare.moments import moment_of
 from runner.analysis.compare.score_table import MIN_MAX, parse_table
 from runner.analysis.compare.statistics import require_scipy
 from runner.analysis.compare.tasks import compare_algorithms
+from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluation_records, training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
@@ -37,7 +38,11 @@ from runner.analysis.series import (
     series_of,
     values_left_out,
 )
+from runner.archive.places import default_target
 from runner.errors import RunnerError
+from runner.export.encoder import FORMATS
+from runner.export.film import Shot, usual_speed, write_film
+from runner.export.pictures import Pictures
 from runner.export.plots.curves import curves_sheet
 from runner.export.plots.image import svg_file
 from runner.export.plots.style import CurveStyle
@@ -267,6 +272,29 @@ def installed_file(path: Path, name: str) -> bytes:
 def report(path: Path) -> bytes:
     """Return the report of a run, a page without links to others."""
     return render_report([path])[0].encode()
+
+
+def film(run: Run, step: EpisodeRef, ending: str) -> bytes:
+    """Return the film of an episode from a step on; the ending of its file, such as `.mp4`, is its format."""
+    if ending not in FORMATS:
+        raise RunnerError(f"format: found {ending[:20]!r}, expected one of {', '.join(FORMATS)}.")
+    with tempfile.TemporaryDirectory() as folder, open_recording(run.recording) as recording:
+        file = Path(folder, f"film{ending}")
+        shown = step.resolved(recording)
+        pictures = Pictures(recording, shown.phase, shown.number_in(recording))
+        if shown.t > pictures.steps:
+            raise shown.no_step(recording, pictures.steps, shown.t)
+        shot = Shot(f"{run.title}: {shown.title}", pictures, shown.t)
+        write_film(file, shot, usual_speed(pictures.source), None, lambda _: None)
+        return file.read_bytes()
+
+
+def archive(run: Run, remove: bool) -> None:
+    """Archive a run as `dualtaxi archive` does; `remove` its recording once the archive was compared."""
+    require("pyarrow", extra="archive", purpose="an archive")
+    from runner.archive.runs import archive_run
+
+    archive_run(run, default_target(run.folder.parent), remove)
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

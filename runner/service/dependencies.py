@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
@@ -17,7 +18,7 @@ from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
-from runner.service.errors import Busy
+from runner.service.errors import Busy, Refused
 from runner.service.jobs.queue import JobQueue
 from runner.service.pictures import PictureStreams
 from runner.service.processes import ProcessPool
@@ -89,6 +90,19 @@ def recorded_run(run: FoundRun) -> Run:
 
 
 RecordedRun = Annotated[Run, Depends(recorded_run)]
+
+
+def require_written(run: Run, recordings: Path, act: str) -> None:
+    """Refuse to change a run outside the folder that the service writes to; `act` is a verb.
+
+    Raises:
+        Refused: the run is in another folder.
+    """
+    if run.folder.resolve().parent != recordings.resolve():
+        raise Refused(
+            HTTPStatus.CONFLICT,
+            f"run {run.run_id} is in a folder that this service only reads; {act} it where it was recorded.",
+        )
 
 
 def opened_recording(run: RecordedRun) -> Iterator[Recording]:

@@ -10,6 +10,7 @@ from typing import Final
 
 from platformdirs import user_config_path
 
+from runner.archive.places import default_target
 from runner.errors import RunnerError
 from runner.util.files import cache_folder
 
@@ -107,7 +108,8 @@ class ServiceSettings:
 
     def without_folders(self, text: str) -> str:
         """Return a message with paths relative to the service's folders."""
-        return without_folders(text, *self.recordings, self.tokens.parent, cache_folder())
+        archives = Path(default_target(self.recordings[0]))
+        return without_folders(text, *self.recordings, archives, self.tokens.parent, cache_folder())
 
     def log_fields(self) -> dict[str, object]:
         """Return what is logged of the settings when the service starts."""

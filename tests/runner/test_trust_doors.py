@@ -380,6 +380,8 @@ FILLED = {
 """Parameters of routes: None for the id of a run."""
 BODIES = {
     "POST /runs/{run}/branch": {"at": "0:1", "action": "0"},
+    "POST /runs/{run}/archive": {},
+    "POST /runs/{run}/film": {},
     "POST /runs/{run}/labels": {},
     "POST /runs/{run}/marks": {"at": "0:1"},
     "DELETE /runs/{run}/marks/{name}": {},

@@ -33,9 +33,6 @@ if TYPE_CHECKING:
 
 GRID_LENGTHS = 2
 """A grid ends after this many times the median length of its episodes; a failed trial is far longer."""
-_SCENE_FPS = 4.0
-"""Frames per second of a drawn scene, whose steps are large."""
-_FPS = 30.0
 _MAX_GIF_FPS = 50
 """A GIF counts in hundredths of a second, and players show one of them too slowly."""
 
@@ -93,15 +90,14 @@ def command(
         raise click.UsageError("--whole is for a grid: the film of one episode is always whole.")
     from runner.export import film
     from runner.export.encoder import format_of
-    from runner.export.pictures import Pictures, PictureSource, source_of
+    from runner.export.pictures import Pictures, source_of
 
     with opened_run(run_name, to.recordings) as (run, recording):
         path = to.path(run.file_stem)
         format_of(path)
         require_new(path, to.force)
         shown = _ranked(recording, grid) if grid else [chosen.resolved(recording)]
-        is_scene = source_of(recording, shown[0].phase, trust)[0] is PictureSource.SCENE
-        speed = fps or (_SCENE_FPS if is_scene else _FPS)
+        speed = fps or film.usual_speed(source_of(recording, shown[0].phase, trust)[0])
         if path.suffix.lower() == ".gif" and speed > _MAX_GIF_FPS:
             raise click.UsageError(f"--fps: found {speed:g}, expected at most {_MAX_GIF_FPS} of a GIF.")
         opened: list[Pictures] = []

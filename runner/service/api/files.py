@@ -156,7 +156,7 @@ async def replay(
 )
 async def report(run: RecordedRun, compute: ComputationOf) -> Response:
     """Return what `dualtaxi report` writes, as a download."""
-    return _attachment(await compute(computed.report, run.recording), f"{run.file_stem}.html")
+    return attachment(await compute(computed.report, run.recording), f"{run.file_stem}.html")
 
 
 @router.get(
@@ -174,10 +174,10 @@ async def installed(
             f"no installed package adds an export {name!r}; `dualtaxi export --help` lists them."
         )
     body = await compute(computed.installed_file, run.recording, name, alone=True)
-    return _attachment(body, f"{run.file_stem}{installed_export(name).ending}")
+    return attachment(body, f"{run.file_stem}{installed_export(name).ending}")
 
 
-def _attachment(body: bytes, name: str) -> Response:
+def attachment(body: bytes, name: str) -> Response:
     """Return a file to be saved under a name, which a browser never shows as a page of the service."""
     headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
     return Response(body, media_type=MEDIA, headers=headers)

@@ -10,8 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from runner.config.document import write_yaml
 from runner.runs.run import Run
 from runner.service.api.jobs import JobResponse, created
-from runner.service.dependencies import JobsOf, RecordedRun
-from runner.service.errors import Refused
+from runner.service.dependencies import JobsOf, RecordedRun, require_written
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
@@ -56,11 +55,7 @@ async def queue_explanation(jobs: JobQueue, question: ExplainQuestion) -> Queued
 
 async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> QueuedJob:
     """Check a branch of training, and queue it."""
-    if run.folder.resolve().parent != jobs.recordings.resolve():  # where jobs would not find it
-        raise Refused(
-            HTTPStatus.CONFLICT,
-            f"run {run.run_id} is in a folder that this service only reads; branch it where it was recorded.",
-        )
+    require_written(run, jobs.recordings, "branch")
     return await _queue(jobs, await jobs.checker.call(f"run {run.run_id}", check_branch, run, question))
 
 

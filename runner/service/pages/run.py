@@ -13,11 +13,14 @@ from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
+from runner.analysis.episodes import TYPICAL, EpisodeRef
 from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
+from runner.export.encoder import FORMATS
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
@@ -25,7 +28,8 @@ from runner.recording.run_file import EvaluationMetrics, RecentTraining, has_env
 from runner.runs.catalogue.removal import clean, plan, remove
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
-from runner.service import fragments
+from runner.service import computed, fragments
+from runner.service.api.files import attachment
 from runner.service.api.reading import AxisName
 from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
@@ -34,8 +38,10 @@ from runner.service.dependencies import (
     FoundRun,
     JobsOf,
     OpenRecording,
+    ProcessesOf,
     RecordedRun,
     SettingsOf,
+    require_written,
 )
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import environment_of, last_results, result_of, run_page
@@ -120,6 +126,42 @@ def remove_run(
     return RedirectResponse("/runs", HTTPStatus.SEE_OTHER)
 
 
+@router.post("/archive")
+async def archive(
+    request: Request,
+    run: FoundRun,
+    form: Form,
+    jobs: JobsOf,
+    catalogue: CatalogueOf,
+    settings: SettingsOf,
+    processes: ProcessesOf,
+) -> Response:
+    """Archive a run, and remove its recording if the form says so."""
+    try:
+        require_written(run, settings.recordings[0], "archive")
+        await processes(computed.archive, run, "remove" in form)
+    except RunnerError as error:
+        problem = message_of(error, request)
+        return await run_in_threadpool(_overview, request, run, jobs, settings, problem)
+    catalogue.changed()
+    return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
+
+
+@router.post("/film")
+async def film(
+    request: Request, run: RecordedRun, form: Form, jobs: JobsOf, settings: SettingsOf, compute: ComputationOf
+) -> Response:
+    """Return a film of an episode as a download."""
+    ending = form.get("ending", "")
+    try:
+        step = EpisodeRef.parse(form.get("at", "").strip() or TYPICAL)
+        body = await compute(computed.film, run, step, ending, alone=True)
+    except RunnerError as error:
+        problem = message_of(error, request)
+        return await run_in_threadpool(_overview, request, run, jobs, settings, problem)
+    return attachment(body, f"{run.file_stem}{ending}")
+
+
 @router.get("/status")
 def status(
     request: Request,
@@ -187,6 +229,7 @@ def _overview(
         "problem": problem,
         "max_note": MAX_NOTE,
         "removal": removal,
+        "film_endings": tuple(FORMATS),
     }
     status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
     return run_page(request, run, "", "run_overview.html", values, status)

@@ -137,6 +137,27 @@ def test_charts_are_pinned_hidden_and_downloaded(page, tmp_path):
         browser.execute_script("localStorage.clear()")
 
 
+def test_a_run_is_filmed_and_archived_from_its_page(page, folder, tmp_path):
+    browser = page("/runs/second")
+    behavior = {"behavior": "allow", "downloadPath": str(tmp_path)}
+    browser.execute_cdp_cmd("Browser.setDownloadBehavior", behavior)
+
+    def press(section, tag):
+        browser.execute_script("arguments[0].click()", section.find_element(By.TAG_NAME, tag))
+
+    sections = {each.text: each for each in browser.find_elements(By.TAG_NAME, "details")}
+    film, archive = sections["Make a film"], sections["Archive this run"]
+    press(film, "summary")
+    film.find_element(By.NAME, "at").send_keys("best")
+    Select(film.find_element(By.NAME, "ending")).select_by_visible_text("GIF")
+    press(film, "button")
+    file = wait(browser, lambda: [*tmp_path.glob("*.gif")])[0]
+    assert file.read_bytes().startswith(b"GIF8")
+    press(archive, "button")
+    wait(browser, lambda: "It has an archive" in browser.page_source)
+    assert (folder.parent / "archive" / find_run("second", folder).run_id).is_dir()
+
+
 def test_what_was_learned_is_shown_in_a_situation_that_is_chosen(page):
     browser = page("/runs/first/learned")
     fields = browser.find_elements(By.NAME, "state")

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 
+import gymnasium
+import pytest
 from checked_pages import ACCEPT_HTML, page_of
 from submitted import ICY
 
+import runner
+from runner.analysis.episodes import EpisodeRef
+from runner.archive.runs import restore_run
+from runner.errors import MissingExtra
+from runner.export.encoder import frames_of
 from runner.runs.resolve import find_run
 from runner.runs.run import label
+from runner.service import computed
 from runner.service.settings import ServiceSettings
 from tests.waiting import until
 
@@ -50,7 +59,10 @@ def test_mistakes_are_shown_at_their_lines(client):
 
 
 def test_a_form_of_another_site_is_refused(client):
-    for address in ("/submit", "/runs/first/labels", "/runs/first/remove", "/queue/1/cancel"):
+    for act in ("labels", "remove", "archive", "film"):
+        answer = client.post(f"/runs/first/{act}", data={}, headers={"Origin": "http://evil.example"})
+        assert answer.status_code == 403
+    for address in ("/submit", "/queue/1/cancel"):
         answer = client.post(address, data={"text": "name: x"}, headers={"Origin": "http://evil.example"})
         assert answer.status_code == 403
 
@@ -100,7 +112,76 @@ def test_a_run_of_a_folder_that_is_only_read_is_not_removed(connect, recordings,
     client = connect(ServiceSettings((tmp_path / "written", recordings), tokens=tmp_path / "tokens.json"))
     answer = client.post("/runs/first/remove", data={"confirm": run.run_id}, headers=ACCEPT_HTML)
     assert (answer.status_code, "stays" in answer.text) == (400, True)
+    answer = client.post("/runs/first/archive", data={"remove": "yes"}, headers=ACCEPT_HTML)
+    assert (answer.status_code, "archive it where it was recorded" in answer.text) == (400, True)
     assert run.recording.is_file()
+    assert not (recordings.parent / "archive").exists()
+
+
+def test_a_run_is_archived_and_its_recording_removed_when_the_form_says_so(client, recordings):
+    run = find_run("first", recordings)
+    digest = run.summary.content_digest
+    assert client.post("/runs/first/archive", data={}, follow_redirects=False).status_code == 303
+    assert run.recording.is_file()
+    assert "It has an archive" in page_of(client, "/runs/first")
+    assert (
+        client.post("/runs/first/archive", data={"remove": "yes"}, follow_redirects=False).status_code == 303
+    )
+    assert not run.recording.exists()
+    page = page_of(client, "/runs/first")
+    assert f"dualtaxi restore {run.run_id}" in page
+    assert "archived" in page_of(client, "/runs")
+    assert page_of(client, "/runs/first/replay/train/0"), "its archive is read"
+    answer = client.post("/runs/first/archive", data={}, headers=ACCEPT_HTML)
+    assert (answer.status_code, "is archived already" in answer.text) == (400, True)
+    assert str(recordings.parent) not in answer.text
+    assert restore_run(find_run("first", recordings)).summary.content_digest == digest
+
+
+def test_a_run_that_is_recorded_right_now_is_not_archived(client, recordings):
+    with runner.record(gymnasium.make("CartPole-v1"), recordings, name="going") as env:
+        env.reset(seed=0)
+        answer = client.post("/runs/going/archive", data={}, headers=ACCEPT_HTML)
+        assert (answer.status_code, "is running" in answer.text) == (400, True)
+        assert "It can be archived when it has ended" in page_of(client, "/runs/going")
+        env.step(0)
+
+
+@pytest.mark.parametrize(("at", "ending"), [("", ".gif"), ("best", ".webm"), ("3:2", ".mp4")])
+def test_a_film_of_an_episode_is_downloaded(client, recordings, tmp_path, at, ending):
+    answer = client.post("/runs/first/film", data={"at": at, "ending": ending})
+    assert answer.status_code == 200, answer.text
+    name = f"{find_run('first', recordings).file_stem}{ending}"
+    assert answer.headers["content-disposition"] == f"attachment; filename*=utf-8''{name}"
+    film = tmp_path / name
+    film.write_bytes(answer.content)
+    assert len(list(frames_of(film))) > 1
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"at": "nothing"}, "expected EPISODE:T"),
+        ({"at": "999999"}, "episode"),
+        ({"at": "0:999999"}, "step"),
+        ({"ending": ".exe"}, "expected one of .mp4"),
+        ({"ending": "/../x.mp4"}, "expected one of .mp4"),
+    ],
+)
+def test_a_film_that_cannot_be_made_is_refused_on_the_page(client, fields, reason):
+    answer = client.post("/runs/first/film", data={"ending": ".gif"} | fields, headers=ACCEPT_HTML)
+    assert (answer.status_code, reason in answer.text) == (400, True), answer.text
+    assert "<h1" in answer.text
+
+
+def test_an_archive_and_a_film_name_the_extra_that_they_lack(recordings, monkeypatch):
+    run = find_run("first", recordings)
+    for module in ("pyarrow", "av"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtra, match=r"an archive needs pyarrow.*\[archive\]"):
+        computed.archive(run, remove=False)
+    with pytest.raises(MissingExtra, match=r"a film needs .*\[film\]"):
+        computed.film(run, EpisodeRef.parse("best"), ".gif")
 
 
 def test_a_report_is_downloaded_and_not_shown_as_a_page(client):
