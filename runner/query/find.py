@@ -60,6 +60,9 @@ class Hit:
     name: str
     at: str
     """The episode as other commands take it: `812`, or `eval:3000:17`."""
+    phase: str
+    episode: int
+    """Its number in the phase."""
     ret: float | None
     """The sum of all rewards; None if it is not a number."""
     length: int
@@ -115,6 +118,14 @@ class Found:
             return "No run was searched."
         verb = "matches" if self.count == 1 else "match"
         return f"{counted(self.count, 'episode')} of {counted(self.runs, 'run')} {verb}."
+
+    @property
+    def episodes(self) -> dict[tuple[str, str], list[int]]:
+        """The numbers of the episodes of the hits, by run and phase."""
+        episodes = defaultdict[tuple[str, str], list[int]](list)
+        for hit in self.hits:
+            episodes[hit.run_id, hit.phase].append(hit.episode)
+        return dict(episodes)
 
     @property
     def grid(self) -> Grid:
@@ -354,17 +365,18 @@ class _Search:
 
 def _hit(run: IndexRow, row: Json, marks: Sequence[Mark]) -> Hit:
     """Return the episode of a row in the index of a run, which has these marks."""
-    place = row["phase"], row["episode"]
     return Hit(
         run_id=run["id"],
         name=run["name"],
         at=row["at"],
+        phase=row["phase"],
+        episode=row["episode"],
         replay=f"/runs/{run['id']}/replay/{EpisodeRef.parse(row['at']).episode_path}",
         ret=row["return"],
         length=row["length"],
         ended=next((name for name in ENDS if row.get(name)), "reset"),
         events={name[2:]: n for name, n in row.items() if name.startswith("n_") and n},
-        marks=[mark.text for mark in marks if (mark.phase, mark.episode) == place],
+        marks=[mark.text for mark in marks if (mark.phase, mark.episode) == (row["phase"], row["episode"])],
     )
 
 

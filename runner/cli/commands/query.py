@@ -158,6 +158,12 @@ def find_command(
         "--mark", metavar="TEXT", help="Mark the first step of the episodes shown, as `dualtaxi mark` does."
     ),
     tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="A tag of these marks."),
+    quiet: bool = option(
+        "-q",
+        "--quiet",
+        is_flag=True,
+        help="Print a line RUN PHASE EPISODES for each run, for other commands.",
+    ),
     as_json: bool = json_option,
     recordings: tuple[Path, ...] = folders_option,
 ) -> None:
@@ -188,7 +194,10 @@ def find_command(
       dualtaxi find 'max(next_observation[2]) > 0.2' --runs 'environment == "CartPole-v1"'
       dualtaxi find 'then(pickup, drop_off, within=5)' --sort -ret --json
       dualtaxi find 'min(reward) < -15' --mark expensive --tag look-again
+      dualtaxi find 'ret > 15' --quiet | while read run phase episodes; do
+          dualtaxi export minari $run --phase $phase --episodes $episodes; done
     """
+    require_one("as_json", "quiet")
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query.find import find
 
@@ -200,7 +209,10 @@ def find_command(
     if as_json:
         print_json(found.as_json() | ({} if marked is None else {"marked": marked}))
     else:
-        if found.hits:
+        if quiet:
+            for (run, of_phase), episodes in found.episodes.items():
+                echo(f"{run} {of_phase} {','.join(map(str, episodes))}")
+        elif found.hits:
             draw(grid_table(found.grid, shrinking=console().is_terminal))
         say(found.sentence)
         if len(found.hits) < found.count:

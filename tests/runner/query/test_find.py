@@ -419,6 +419,25 @@ def test_extras_are_searched(tmp_path):
     assert row["loss"] == 3
 
 
+def test_hits_are_exported(tmp_path, folder):
+    words = ["length > 20 and length < 30", "--limit", "0", "--recordings", str(folder)]
+    result = CliRunner().invoke(cli, ["find", "--quiet", *words])
+    lines = [line.split() for line in result.stdout.splitlines()]
+    found = runner.find(words[0], folder, limit=None)
+    hits = {(hit.run_id, hit.phase, str(hit.episode)) for hit in found.hits}
+    assert {(run, phase, n) for run, phase, numbers in lines for n in numbers.split(",")} == hits
+    for k, (run, phase, episodes) in enumerate(lines):
+        table = str(tmp_path / str(k))
+        selected = ["--phase", phase, "--episodes", episodes, "-o", table, "--recordings", str(folder)]
+        result = CliRunner().invoke(cli, ["export", "parquet", run, *selected])
+        assert result.exit_code == 0, result.output
+        exported = pq.read_table(f"{table}/episodes.parquet")
+        assert len(exported) == len(episodes.split(","))
+        assert all(20 < length < 30 for length in exported["length"].to_pylist())
+    both = CliRunner().invoke(cli, ["find", "--quiet", "--json", *words])
+    assert both.exit_code == 2
+
+
 def test_hits_are_marked(tmp_path, folder):
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     words = ["find", "length > 20 and success", "--limit", "3", "--recordings", str(tmp_path), "--json"]
