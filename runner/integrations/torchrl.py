@@ -13,10 +13,7 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any, Final, Unpack
 
-import numpy as np
-from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from numpy.typing import NDArray
 
 from runner.errors import ConfigError
 from runner.integrations.libraries import require_tested
@@ -36,6 +33,7 @@ from runner.util.jsonable import as_mapping
 
 require_tested("torchrl", "torchrl", ("0.14", "0.14"))
 
+import torch  # noqa: E402
 from torchrl.data import Categorical, OneHot  # noqa: E402
 from torchrl.envs import GymWrapper, TransformedEnv  # noqa: E402
 from torchrl.record.loggers import Logger as _Logger  # noqa: E402
@@ -159,10 +157,11 @@ def recorded(
             "actions. The steps of Gymnasium environments can: record these before the collector is made, by "
             'env = runner.integrations.torchrl.record(env, steps="actions")'
         )
+    spec = env.action_spec_unbatched
     rec = record_batches(
         _name_of(env),
         recordings,
-        action_space=_action_space(env),
+        action_space=spec.space if isinstance(spec, OneHot | Categorical) else None,
         autoreset_mode="SameStep",
         **options,
     )
@@ -179,45 +178,37 @@ def _recorded(collector: Any, env: Any, rec: RecordedBatches) -> Iterator[Any]:
 
 def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, env: Any) -> None:
     """Record the steps of a batch, [*environments, time]; the carrier has the observations that follow."""
-    number, axes = env.batch_size.numel(), len(env.batch_size)
-
-    def by_time(values: object) -> NDArray[Any]:
-        """Return a tensor [*environments, time, ...] as a copy [time, environments, ...]."""
-        array = np.array(as_array(values))
-        array = array.reshape(number, -1, *array.shape[axes + 1 :])
-        return np.ascontiguousarray(array.swapaxes(0, 1))
-
-    after = data["next"]
-    rewards = by_time(after["reward"])
+    number = env.batch_size.numel()
+    data = data.reshape(number, -1).transpose(0, 1)
+    after, done = data["next"], data["next", "done"]
+    rewards, actions = after["reward"], as_array(data[env.action_key])
     if rewards.shape[2:] != (1,):
-        raise ConfigError(f"found rewards of shape {rewards.shape[2:]}, expected one for each environment")
-    observations, finals = {}, {}
-    for key in env.observation_spec.keys(include_nested=True, leaves_only=True):
-        name = key if isinstance(key, str) else "/".join(key)
-        finals[name] = by_time(after[key])
-        last = finals[name][-1:]
-        if carrier is not None and (following := carrier.get(key, None)) is not None:
-            last = np.array(as_array(following)).reshape(last.shape)  # after a reset, if the episode ended
-        observations[name] = np.concatenate([by_time(data[key]), last])
-    actions = by_time(data[env.action_key])
+        raise ConfigError(
+            f"found rewards of shape {tuple(rewards.shape[2:])}, expected one for each environment"
+        )
+    keys = list(env.observation_spec.keys(include_nested=True, leaves_only=True))
+    finals = after.select(*keys)
+    last = finals[-1:]
+    if carrier is not None:  # its observations are those after a reset, if the episode ended
+        last = last.update(carrier.select(*keys, strict=False).reshape(1, number))
     if isinstance(env.action_spec_unbatched, OneHot):
         actions = actions.argmax(-1)
-    done = after["done"]
     terminated = after.get("terminated", done)
     truncated = after.get("truncated", done & ~terminated)
     rec.batch(
-        _alone(observations),
+        _by_name(torch.cat([data.select(*keys), last])),
         actions,
         rewards[..., 0],
-        by_time(terminated)[..., 0],
-        by_time(truncated)[..., 0],
-        final_observations=_alone(finals),
+        terminated[..., 0],
+        truncated[..., 0],
+        final_observations=_by_name(finals),
     )
 
 
-def _alone(values: dict[str, NDArray[Any]]) -> object:
+def _by_name(observations: Any) -> object:
     """Return the only observation, or all by name."""
-    return values if len(values) > 1 else next(iter(values.values()))
+    by_name = dict(observations.flatten_keys("/").items())
+    return by_name if len(by_name) > 1 else next(iter(by_name.values()))
 
 
 def _name_of(env: object) -> str:
@@ -231,14 +222,6 @@ def _name_of(env: object) -> str:
             break
     name = getattr(env, "env_name", None)
     return name if isinstance(name, str) and name else type(env).__name__
-
-
-def _action_space(env: Any) -> Any:
-    """Return the space of discrete actions; None where the space follows from the first batch."""
-    spec = env.action_spec_unbatched
-    if isinstance(spec, OneHot | Categorical):
-        return spaces.Discrete(int(spec.space.n))
-    return None
 
 
 class Logger(_Logger):  # type: ignore[misc]
