@@ -28,6 +28,7 @@ Result = TypeVar("Result")
 PRELOADED: Final = (
     "duckdb",
     "gymnasium",
+    "numpy.ma",
     "pygame",
     "runner.analysis.diff",
     "runner.analysis.qtable",
@@ -48,7 +49,8 @@ PRELOADED: Final = (
 )
 """Modules that every process has from its start, where processes can be forked; those that are installed.
 
-Most environments draw by pygame, whose import takes as long as all else until their first picture.
+Most environments draw by pygame, whose import takes as long as all else until their first picture. NumPy
+loads `numpy.ma` only when a process needs it, as nearly all of these do.
 """
 
 
