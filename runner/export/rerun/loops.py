@@ -167,38 +167,26 @@ class LoopTracks:
     def _extra(
         self, phase: str, member: Member, name: str, values: MaskedArray, times: Times
     ) -> Iterator[Track]:
-        """Yield a value that the loop recorded with steps: as lines, or as bars if it is many numbers."""
+        """Yield a value that the loop recorded with steps: as lines, as bars if it is long, or as text."""
         is_given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
         quantity = f"extra/{entity_name(name)}"
-        if values.dtype.hasobject:
-            yield from self._objects(phase, member, name, values.data[is_given], times["step"][is_given])
-            return
-        numbers = values.data.reshape(len(values), -1).astype(np.float64)
-        if numbers.shape[1] <= MAX_BARS:
+        if not values.dtype.hasobject and values.data[0].size <= MAX_BARS:
             # A gap in the line where the value was not recorded
-            numbers = np.where(is_given[:, np.newaxis], numbers, np.nan)
+            numbers = values.data.reshape(len(values), -1).astype(np.float64)
+            numbers[~is_given] = np.nan
             names = [f"{name}[{i}]" for i in range(numbers.shape[1])]
             yield self._line(phase, member, quantity, times, numbers, names)
-        elif is_given.any():
-            bars = zip(times["step"][is_given].tolist(), map(rr.BarChart, numbers[is_given]), strict=True)
-            view = TrackView("bars", f"{member.name} {name}".strip(), rrb.BarChartView)
-            yield rows_of(self._entity(phase, member.name, quantity), list(bars), view)
-
-    def _objects(self, phase: str, member: Member, name: str, values: Array, steps: Array) -> Iterator[Track]:
-        """Yield texts as documents, and arrays of varying length as bars."""
-        entity = self._entity(phase, member.name, f"extra/{entity_name(name)}")
-        title, placed = f"{member.name} {name}".strip(), [*zip(steps.tolist(), values.tolist(), strict=True)]
-        if texts := [
-            (step, rr.TextDocument(text.encode(errors="replace").decode()))
-            for step, text in placed
-            if isinstance(text, str)
-        ]:
+            return
+        texts: list[Row] = []
+        bars: list[Row] = []
+        for step, value in zip(times["step"][is_given].tolist(), values.data[is_given], strict=True):
+            if isinstance(value, str):
+                texts.append((step, rr.TextDocument(value.encode(errors="replace").decode())))
+            elif value.size:
+                bars.append((step, rr.BarChart(value.ravel().astype(np.float64))))
+        entity, title = self._entity(phase, member.name, quantity), f"{member.name} {name}".strip()
+        if texts:
             yield rows_of(entity, texts, TrackView("texts", title, rrb.TextDocumentView))
-        bars = [
-            (step, rr.BarChart(array.ravel().astype(np.float64)))
-            for step, array in placed
-            if not isinstance(array, str) and array.size
-        ]
         if bars:
             yield rows_of(entity, bars, TrackView("bars", title, rrb.BarChartView))
 
@@ -249,12 +237,7 @@ class LoopTracks:
                 if self._is_later(phase, environment, step) or not is_each_step:
                     yield environment, (step, _picture(frame["data"]))
 
-    def drawn_frames(self) -> Iterator[Track]:
-        """Yield pictures of the selected episodes, as far as the environment draws them."""
-        for phase, episodes in self._selection.drawn.items():
-            yield from self._drawn_frames(phase, episodes)
-
-    def _drawn_frames(self, phase: str, episodes: Sequence[int]) -> Iterator[Track]:
+    def drawn_frames(self, phase: str, episodes: Sequence[int]) -> Iterator[Track]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
         recording = self._recording
         sources = {number: pictures.source_of(recording, phase, self._trust, number) for number in episodes}

@@ -47,7 +47,7 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
         _evaluation_lines(evaluations, learners, events),
         _episode_lines(recording, reports, learners, events),
     ):
-        phase, name = path.split("/", maxsplit=1)[0], path.rsplit("/", maxsplit=1)[-1]
+        phase, *_, name = path.split("/")
         width = 1.2 if phase == "train" else 2.2
         colours = phase_colours(phase, len(names), source.tint)
         if name in SCHEDULES:

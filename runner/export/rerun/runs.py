@@ -109,7 +109,8 @@ class RunReader:
                 yield from cleared([f"{path}/{part}" for part in parts], stops)
                 covered += stretches
         if self._loop:
-            yield from self._loop.drawn_frames()
+            for phase, episodes in self._selection.drawn.items():
+                yield from self._loop.drawn_frames(phase, episodes)
         else:
             yield from self._notice(sorted(covered))
 
