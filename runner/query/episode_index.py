@@ -203,7 +203,7 @@ def register_steps(connection: Any, steps: Relation, extras: Relation | None) ->
     """
     connection.register("own_steps", steps)
     joined, columns, more = "", "own_steps.*", []
-    if extras is not None and "environment" not in steps.schema.names:
+    if extras is not None and "step" in steps.schema.names and "environment" not in steps.schema.names:
         connection.register("extras", extras)
         joined = "LEFT JOIN extras USING (phase, step)"
         more = [column for column in extras.schema if column.name.startswith(layout.EXTRA_PREFIX)]

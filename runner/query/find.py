@@ -288,19 +288,19 @@ class _Search:
             (packs, "part", "row"),
         ):
             parts = [
-                (file, part, runs[path])
+                (file, member, runs[path])
                 for file, (_, packed) in enumerate(files)
-                for part, path in enumerate(packed)
+                for member, path in enumerate(packed)
                 if path in runs
             ]
             if parts:
                 self._sql(
                     f"INSERT INTO hits SELECT run, {row}, {key}, {is_open} FROM read_parquet($files) "
-                    "JOIN (SELECT unnest($of) AS of, unnest($at) AS at_part, unnest($runs) AS run) "
-                    f"ON of = file_index AND at_part = {part} "
+                    "JOIN (SELECT unnest($of) AS of, unnest($members) AS member, unnest($runs) AS run) "
+                    f"ON of = file_index AND member = {part} "
                     f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}",
                     {"files": [str(path) for path, _ in files]}
-                    | dict(zip(("of", "at", "runs"), map(list, zip(*parts, strict=True)), strict=True)),
+                    | dict(zip(("of", "members", "runs"), map(list, zip(*parts, strict=True)), strict=True)),
                 )
         opened = self._sql("SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run")
         for (k,) in opened:

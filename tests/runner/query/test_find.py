@@ -409,6 +409,13 @@ def test_extras_are_searched(tmp_path):
         found = runner.find(expression, tmp_path, limit=None)
         assert [int(hit.at) for hit in found.hits] == episodes, expression
         assert 0 < len(episodes) < 40
+    with runner.record(Paying(1.0), tmp_path, name="stepless", steps="actions") as env:
+        env.reset(seed=0)
+        env.step(0)
+        env.note_step(loss=9.0)
+    found = runner.find("any(extra.loss > 2.4)", tmp_path, limit=None)
+    assert found.count == len(expected["any(extra.loss > 2.4)"])
+    assert "the run has no steps" in found.left_out[0]
     with pytest.raises(RunnerError, match="Did you mean 'extra_loss'"):
         runner.find("any(extra.los > 1)", tmp_path)
     with pytest.raises(RunnerError, match=r"found extra\.word"):
