@@ -141,7 +141,7 @@ def redrawn(
 
 def paint_observation(recording: Recording, seen: Iterator[Seen]) -> Painted:
     """Show the image in each observation; if the first was lost, the second in its place."""
-    values, lost = Values(recording.spaces["observation"], "observation"), 0
+    values, lost = Values(recording), 0
     for observation, _ in seen:
         if observation is None:
             lost = 1
@@ -157,7 +157,7 @@ def paint_values(recording: Recording, phase: str, episode: int, seen: Iterator[
     The steps are read once more before, for the scales.
     """
     learners = recording.agents
-    values = Values(recording.spaces["observation"], "state" if recording.has_states else "observation")
+    values = Values(recording, "state" if recording.has_states else "observation")
     names = [*values.names, *([f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"])]
     unknown, unpaid = np.full(len(values.names), np.nan), np.full(len(learners), np.nan)
 

@@ -191,7 +191,7 @@ def source_of_recorded(recording: Recording, phase: str, episode: int | None) ->
     framed = environments_with_frames(recording, phase)
     if framed and (episode is None or recording.phase(phase).episode(episode).place in framed):
         return PictureSource.RECORDED
-    has_image = Values(recording.spaces["observation"], "observation").image is not None
+    has_image = Values(recording).image is not None
     return PictureSource.OBSERVATION if has_image else PictureSource.VALUES
 
 
@@ -260,7 +260,7 @@ def describer(recording: Recording, phase: str) -> Callable[[Step], tuple[str, s
 
         return describe
     in_words = step_actions_in_words(recording, phase)
-    texts = Values(recording.spaces["observation"], "observation")
+    texts = Values(recording)
 
     def describe_values(row: Step) -> tuple[str, str]:
         words = ", ".join(f"{spoken(agent)} {action}".lstrip() for agent, action in in_words(row).items())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from runner.analysis.contents import Step
 from runner.drawing.raster import Pixels
 from runner.environments.naming import spoken
 from runner.recording import schema
+from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
 from runner.replay.recorded import reset_of
@@ -30,18 +31,19 @@ _LEAST_SIDE: Final = 16
 
 
 class Values:
-    """What can be shown of the values of a space; `name` is that of a value that has no parts.
+    """What can be shown of the observations of a recording; `name` is that of a value that has no parts.
 
     Attributes:
         names: of the numbers, in the order of `numbers_in`.
         image: the part that is an image, the first one; None if there is none.
     """
 
-    def __init__(self, description: Mapping[str, object], name: str) -> None:
-        leaves = leaves_of(description, f"the {name} space")
+    def __init__(self, recording: Recording, name: str = "observation") -> None:
+        leaves = leaves_of(recording.spaces["observation"], "the observation space")
+        known = observation_names(recording)
         self._leaves = [leaf for leaf in leaves if 0 < _count(leaf) <= MAX_NUMBERS]
         self._texts = [leaf for leaf in leaves if leaf.dtype is None]
-        self.names = [each for leaf in self._leaves for each in number_names(leaf, name)]
+        self.names = [each for leaf in self._leaves for each in number_names(leaf, name, known=known)]
         self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
 
     def numbers_in(self, value: object) -> NDArray[np.float64]:
@@ -186,13 +188,13 @@ def _count(leaf: Leaf) -> int:
     return 0 if leaf.dtype is None else math.prod(leaf.dtype.shape)
 
 
-def number_names(leaf: Leaf, name: str, skip: int = 0) -> Iterator[str]:
-    """Yield a name for each number of a leaf: `position[0]`; of one without a path `name`.
+def number_names(leaf: Leaf, name: str, skip: int = 0, known: Sequence[str] = ()) -> Iterator[str]:
+    """Yield a name for each number of a leaf: the `known` ones, or `position[0]`.
 
-    The first `skip` keys of the path are left out.
+    A leaf without a path has the `name`; the first `skip` keys of a path are left out.
     """
     own = ".".join(leaf.path[skip:]) or name
-    return names_in(own, leaf.dtype.shape if leaf.dtype is not None else ())
+    return iter(known) if known else names_in(own, leaf.dtype.shape if leaf.dtype is not None else ())
 
 
 def names_in(array: str, shape: tuple[int, ...]) -> Iterator[str]:

@@ -90,7 +90,7 @@ def play_command(
             for step in played.steps():
                 print_json(step, indent=None)
             return
-        if not recording.tabular and Values(recording.spaces["observation"], "observation").image:
+        if not recording.tabular and Values(recording).image:
             say(f"Observations that are pictures are not shown: `dualtaxi export film {run_name}` does.")
         if not terminal.is_terminal or terminal.is_dumb_terminal:
             for frame in played.frames():

@@ -32,6 +32,7 @@ from runner.export.reports.player_data import (
 from runner.export.values import is_image, names_in, number_names, observed, step_actions_in_words
 from runner.recording import schema
 from runner.recording.extras import filled
+from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
 from runner.replay.recorded import reset_of
@@ -204,7 +205,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
     """Return what is shown of the observations, and a sentence on each thing that is not."""
     agents = recording.agents if len(recording.agents) > 1 else ()
     leaves = leaves_of(recording.spaces["observation"], f"{recording.path}: the observation space")
-    shown, notes, unseen = [], [], 0
+    shown, notes, unseen, known = [], [], 0, observation_names(recording)
     left = max(MAX_SERIES // len(agents), _LEAST_SERIES) if agents else MAX_SERIES
     budget = dict.fromkeys(agents or ("",), left)
     for leaf in leaves:
@@ -222,7 +223,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         taken = min(count, budget.get(agent, left))
         budget[agent] = budget.get(agent, left) - taken
         unseen += count - taken
-        names = tuple(islice(number_names(leaf, "", skip), taken))
+        names = tuple(islice(number_names(leaf, "", skip, known), taken))
         if names:
             shown.append(_ShownPart(agent, names, leaf.path, is_text=False))
     if unseen:

@@ -38,6 +38,7 @@ from runner.export.rerun.tracks import (
 from runner.export.values import FEW, acted, number_names, observed
 from runner.recording import schema
 from runner.recording.messages import frame_place, media_type
+from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
 from runner.replay.steps import frames_every, log_times_of
@@ -297,7 +298,8 @@ def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:
             for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
             if leaf.dtype is not None and (not agent or leaf.path[0] == agent)
         ]
-        names = [name for leaf in leaves for name in number_names(leaf, quantity, skip=bool(agent))]
+        known = observation_names(recording) if quantity == "observation" else ()
+        names = [name for leaf in leaves for name in number_names(leaf, quantity, bool(agent), known)]
         if 0 < len(names) <= MAX_LINES:
             parts[quantity] = [leaf.path for leaf in leaves], names
     return parts

@@ -24,6 +24,7 @@ from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.writing import export, export_runs
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
+from runner.recording.observation_names import NAMES
 from runner.recording.reader import open_recording
 from runner.recording.turns import taken
 from tests.runner.export.making import made_otherwise
@@ -125,7 +126,7 @@ def test_every_environment_of_a_vector_is_sent(tmp_path, mode, kind):
         lengths = exported.rows(f"{where}/length", "Scalars:scalars")
         assert [value for _, [value] in lengths] == ended["length"].tolist()
         assert exported.names(f"{where}/reward") == [f"train env_{i}"]
-        assert exported.names(f"{where}/observation") == [f"observation[{k}]" for k in range(4)]
+        assert exported.names(f"{where}/observation") == [*NAMES["CartPoleEnv"]]
 
 
 def test_every_agent_of_a_game_is_sent_where_it_acted(tmp_path):

@@ -60,6 +60,16 @@ def test_what_was_logged_after_the_episode_before_is_not_of_the_first_frame(page
     assert logged.text == "loss 1 before the first step"
 
 
+@pytest.mark.parametrize("name", ["pole", "poles"])
+def test_the_numbers_of_a_known_environment_have_names(page, name):
+    browser = page(f"/runs/{name}/replay/train/1?t=3")
+    rows = wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".series"))
+    names = " ".join(row.text for row in rows)
+    for number in ("cart position", "cart velocity", "pole angle", "pole angular velocity"):
+        assert number in names
+    assert "[2]" not in names
+
+
 def test_two_loops_are_played_in_step(page):
     browser = page("/compare/replay?run=pole&run=framed&at=2:1")
     wait(browser, lambda: len(shown_pictures(browser)) == 2)

@@ -13,6 +13,7 @@ from loop_replays import page, part, pictures, serving, steps_of, taken
 
 import runner
 from runner.recording import schema
+from runner.recording.observation_names import NAMES
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 
@@ -29,7 +30,7 @@ def test_a_part_has_the_recorded_values_from_the_reset_on(loops_client, loops, a
     with open_recording(find_run("pole", loops).recording) as recording:
         first = [reset["observation"].copy() for reset in recording.phase(phase).reset_values()][episode]
     for k, series in enumerate(whole["series"]):
-        assert series["name"] == f"[{k}]"
+        assert series["name"] == NAMES["CartPoleEnv"][k]
         expected = np.append(first[k], steps["next_observation"][:, k])
         assert series["values"] == pytest.approx(expected, rel=1e-4)
     later = part(loops_client, f"pole/replay/{address}", start=5, steps=4)
