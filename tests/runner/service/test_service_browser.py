@@ -156,6 +156,9 @@ def test_a_run_is_filmed_and_archived_from_its_page(page, folder, tmp_path):
     press(archive, "button")
     wait(browser, lambda: "It has an archive" in browser.page_source)
     assert (folder.parent / "archive" / find_run("second", folder).run_id).is_dir()
+    browser = page("/runs/second/replay/eval/60/1")
+    press(browser.find_element(By.CSS_SELECTOR, ".replay .onward:has(button)"), "button")
+    assert wait(browser, lambda: [*tmp_path.glob("*.mp4")])[0].read_bytes()[4:8] == b"ftyp"
 
 
 def test_what_was_learned_is_shown_in_a_situation_that_is_chosen(page):
