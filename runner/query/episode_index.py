@@ -135,7 +135,7 @@ class EpisodeIndex:
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""
         episodes, own_steps = (runs.table(name, [row]) for name in ("episodes", "steps"))
-        runs.left_out.pop(f"{row['id']} steps", None)  # a run need not have steps
+        runs.left_out.get(row["id"], {}).pop("steps", None)  # a run need not have steps
         _check(row, runs)
         run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
         with open_recording(run.recording) as recording:
@@ -180,9 +180,8 @@ class EpisodeIndex:
 
 def _check(row: IndexRow, runs: SelectedRuns) -> None:
     """Raise the error for which a run was left out."""
-    for key, reason in runs.left_out.items():
-        if key.startswith(f"{row['id']} "):
-            raise RecordingError(reason)
+    for sentence in runs.left_out.get(row["id"], {}).values():
+        raise RecordingError(sentence)
 
 
 def kind_of(path: Path) -> str:

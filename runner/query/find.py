@@ -259,7 +259,7 @@ class _Search:
                 self.files[k] = self.index.file(row, self.runs)
                 kinds.setdefault(kind_of(self.files[k]), []).append(k)
             except RunnerError as error:
-                if not any(key.startswith(f"{row['id']} ") for key in self.runs.left_out):
+                if not self.runs.left_out.get(row["id"]):
                     self.runs.leave_out("find", row, error)
         self.index.trim()
         wrong = []
@@ -333,8 +333,7 @@ class _Search:
 
     def found(self, expression: str, limit: int | None) -> Found:
         """Return the first episodes, as they are sorted."""
-        ids = {key.split()[0] for key in self.runs.left_out}
-        searched = [k for k, row in enumerate(self.runs.rows) if row["id"] not in ids]
+        searched = [k for k, row in enumerate(self.runs.rows) if not self.runs.left_out.get(row["id"])]
         self._sql("DELETE FROM hits WHERE run NOT IN (SELECT unnest($runs))", {"runs": searched})
         ((count,),) = self._sql("SELECT count(*) FROM hits")
         first = "SELECT run, row FROM hits ORDER BY key NULLS LAST, run, row LIMIT $limit"
@@ -356,7 +355,7 @@ class _Search:
         folders = {
             row["id"]: Path(row["root"], row["entry"]) for row in map(self.runs.rows.__getitem__, by_run)
         }
-        return Found(expression, hits, count, len(searched), list(self.runs.left_out.values()), folders)
+        return Found(expression, hits, count, len(searched), self.runs.sentences, folders)
 
     def _sql(self, query: str, values: Mapping[str, object] | None = None) -> list[Any]:
         rows: list[Any] = self.connection.execute(query, values).fetchall()

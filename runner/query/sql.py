@@ -80,7 +80,7 @@ class QueryResult:
     @property
     def left_out(self) -> list[str]:
         """Sentences on the runs that are left out, as far as the query has read."""
-        return list(self._runs.left_out.values())
+        return self._runs.sentences
 
     def batches(self) -> Iterator[pa.RecordBatch]:
         """Yield the rows, thousands at a time.

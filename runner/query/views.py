@@ -71,14 +71,19 @@ class SelectedRuns:
         self._report, self._reported = report, time.monotonic()
         self._read_runs: set[str] = set()
         self._read_rows = 0
-        self.left_out: dict[str, str] = {}
-        """Why runs are left out, or the rest of them, by their id and the view."""
+        self.left_out: dict[str, dict[str, str]] = {}
+        """Sentences on runs that are left out, or the rest of them, by their id and the view."""
         self.is_stopped = False
         """Set to make the query end before it reads another chunk or run."""
 
     def __str__(self) -> str:
         """Return how far the query has read."""
         return f"{self._read_rows:,} rows of {len(self._read_runs):,} of {len(self.rows):,} runs were read"
+
+    @property
+    def sentences(self) -> list[str]:
+        """Sentences on the runs that are left out."""
+        return [sentence for reasons in self.left_out.values() for sentence in reasons.values()]
 
     def view(self, name: str) -> pa.Table | Relation:
         """Return a view."""
@@ -98,7 +103,8 @@ class SelectedRuns:
 
     def leave_out(self, name: str, row: IndexRow, error: RunnerError) -> None:
         """Leave a run out of a view, or of `find`."""
-        self.left_out[f"{row['id']} {name}"] = f"run {row['id']} is left out of {name}: {error}"
+        reasons = self.left_out.setdefault(row["id"], {})
+        reasons[name] = f"run {row['id']} is left out of {name}: {error}"
 
     def _count(self, row: IndexRow, rows: int) -> None:
         if self.is_stopped:
