@@ -96,7 +96,9 @@ def page(browser: webdriver.Chrome, served: str) -> Iterator[Callable[[str], web
 
     Afterwards there must be no error, except for a configuration that is wrong, and no request elsewhere.
     """
-    browser.get_log("browser")
+    browser.get("about:blank")  # leaves the page of another test, of another service
+    for kind in ("browser", "performance"):
+        browser.get_log(kind)
 
     def open_page(address: str) -> webdriver.Chrome:
         browser.get(served + address)
