@@ -70,7 +70,7 @@ class EpisodeIndex:
             (self.folder / "packs").mkdir(parents=True, exist_ok=True)
             self._files = {path.stem[:-_HEX]: path for path in self.folder.glob("*-*.parquet")}
         self.read = set[Path]()
-        """The files that were asked for, and those in a pack with them."""
+        """The files that were asked for, their packs, and what else is packed there."""
         self._of_runs = defaultdict[str, list[Path]](list)
         for stem, path in self._files.items():
             self._of_runs[stem[:-_HEX]].append(path)
@@ -119,6 +119,7 @@ class EpisodeIndex:
                 self.read.update(packed)
                 if not pack.exists():
                     self._pack(packed, pack)
+                self.read.add(pack)
                 yield pack, packed
         for other in folder.glob(f"{kind}-*"):
             if other not in kept:

@@ -384,6 +384,26 @@ def test_a_wrong_limit_is_refused_before_anything_is_read(tmp_path, limit):
         runner.find("length > 0", tmp_path, limit=limit)
 
 
+def test_a_pack_that_another_search_removes_is_made_again(folder, monkeypatch):
+    before = runner.find("length > 20", folder)
+    monkeypatch.setattr(episode_index, "_LEAST", 1)
+    monkeypatch.setattr(episode_index, "_PACKED", 1)
+    packs, removed = episode_index.EpisodeIndex.packs, []
+
+    def packs_of(index, files):
+        for pack, packed in packs(index, files):
+            if not removed:
+                removed.append(pack)
+                pack.unlink()
+            yield pack, packed
+
+    monkeypatch.setattr(episode_index.EpisodeIndex, "packs", packs_of)
+    indexes = {path: path.stat().st_mtime_ns for path in (cache_folder() / EPISODES).glob("*.parquet")}
+    assert runner.find("length > 20", folder) == before
+    assert {path: path.stat().st_mtime_ns for path in indexes} == indexes
+    assert removed
+
+
 def test_extras_are_searched(tmp_path):
     losses, agreed = {}, {}
     with runner.record(Paying(1.0, length=6), tmp_path, name="learner") as env:
