@@ -194,8 +194,7 @@ def find_command(
       dualtaxi find 'max(next_observation[2]) > 0.2' --runs 'environment == "CartPole-v1"'
       dualtaxi find 'then(pickup, drop_off, within=5)' --sort -ret --json
       dualtaxi find 'min(reward) < -15' --mark expensive --tag look-again
-      dualtaxi find 'ret > 15' --quiet | while read run phase episodes; do
-          dualtaxi export minari $run --phase $phase --episodes $episodes; done
+      dualtaxi find 'ret > 15' --phase train --quiet --limit 0
     """
     require_one("as_json", "quiet")
     require("pyarrow", extra="sql", purpose="`find`")
