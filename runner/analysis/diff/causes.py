@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from runner.analysis.diff.updates import Update
     from runner.replay.tables import TableReplay
 
+DRAWING: Final = frozenset({"wolf_phc"})
+"""The algorithms that draw their actions: those of `learning.algorithms`, whose import would take most of the
+time of `diff --first`. A test compares both."""
 _CAUSED_BY_TABLES: Final = ("greedy_action", "policy_action")
 
 
@@ -197,10 +200,7 @@ def _exploration_text(left: _Side, right: _Side) -> str:
 
 def _draws_actions(a: Recording, b: Recording) -> bool:
     """Return whether either run draws the actions that do not explore from a learned policy."""
-    from runner.learning.algorithms import ALGORITHMS
-
-    names = (a.config.get("algorithm"), b.config.get("algorithm"))
-    return any(algorithm.draws_actions for name, algorithm in ALGORITHMS.items() if name in names)
+    return not DRAWING.isdisjoint((a.config.get("algorithm"), b.config.get("algorithm")))
 
 
 def _differ_by_exploration(left: _Side, right: _Side) -> bool:

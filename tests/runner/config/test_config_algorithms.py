@@ -6,6 +6,7 @@ from typing import get_args
 
 import pytest
 
+from runner.analysis.diff.causes import DRAWING
 from runner.config import from_mapping
 from runner.config.model import Algorithm
 from runner.learning.algorithms import ALGORITHMS, OF_SETTINGS
@@ -19,6 +20,7 @@ def test_every_algorithm_is_defined_and_survives_a_round_trip(algorithm):
     assert from_mapping(config.to_mapping()) == config
     definition = ALGORITHMS[algorithm]
     assert OF_SETTINGS[definition.settings] == definition
+    assert definition.draws_actions == (algorithm in DRAWING)
 
 
 def test_a_section_is_present_only_with_its_algorithm():
