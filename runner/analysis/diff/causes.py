@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from runner.analysis.diff.updates import Update
     from runner.replay.tables import TableReplay
 
-DRAWING: Final = frozenset({"wolf_phc"})
+DRAWING: Final = ("wolf_phc",)
 """The algorithms that draw their actions: those of `learning.algorithms`, whose import would take most of the
 time of `diff --first`. A test compares both."""
 _CAUSED_BY_TABLES: Final = ("greedy_action", "policy_action")
@@ -200,7 +200,7 @@ def _exploration_text(left: _Side, right: _Side) -> str:
 
 def _draws_actions(a: Recording, b: Recording) -> bool:
     """Return whether either run draws the actions that do not explore from a learned policy."""
-    return not DRAWING.isdisjoint((a.config.get("algorithm"), b.config.get("algorithm")))
+    return any(run.config.get("algorithm") in DRAWING for run in (a, b))
 
 
 def _differ_by_exploration(left: _Side, right: _Side) -> bool:
