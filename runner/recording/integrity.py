@@ -176,7 +176,7 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
                 names.take(record)
             if record.topic.message is schema.EXTRA:
                 names.check(record, contents)
-            elif layout is not None and record.topic in layout.topics:
+            elif layout is not None and layout.spaces and record.topic in layout.topics:
                 check_constants(record, layout.message(record.topic))
             chunk = record._replace(body=b"")
             del record  # memory that is free for the next record makes a survey a third quicker
