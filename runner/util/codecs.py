@@ -31,8 +31,8 @@ class Codec:
     """Compresses records at a level. The last argument is the size of a step in bytes if it holds values of
     spaces, such as arrays, else 0."""
     unpack: Callable[[bytes | memoryview, int], tuple[bytes, bool]]
-    """Returns the first bytes, as many as asked for at most, and whether there are more; never allocates more
-    than it was asked for, and raises one of `UNPACK_ERRORS` for other data."""
+    """Returns the first bytes, up to a number, and whether there are more. Allocates no more than that, and
+    raises one of `UNPACK_ERRORS` for other data."""
     bytes_per_step: int
     """Measured bytes of a step of a job, without the message index."""
     levels: range = range(0)
