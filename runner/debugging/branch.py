@@ -210,6 +210,8 @@ def refuse_misfits(
         raise ConfigError(
             f"policy: found {policy!r}, expected {', '.join(POLICIES)}, or module:function of your own"
         )
+    if seed < 0:
+        raise ConfigError(f"seed: found {seed}, expected 0 or more")
     if max_steps < 1:
         raise ConfigError(f"max_steps: found {max_steps}, expected 1 or more")
 

@@ -98,6 +98,7 @@ class EpisodeIndex:
     def trim(self) -> None:
         """Remove the oldest files beyond the limit."""
         remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
+        remove_oldest(self.folder / "packs", "*.parquet", keep=MAX_FILES // _LEAST)
 
     def packs(self, files: Set[Path]) -> Iterator[tuple[Path, list[Path]]]:
         """Yield packs of files with the same facts, each with all files that are in it.

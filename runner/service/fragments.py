@@ -45,6 +45,7 @@ from runner.export.reports.playback import playback_of
 from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
+from runner.export.thumbnail import thumbnail
 from runner.recording import schema
 from runner.recording.clock import read_clock
 from runner.recording.console import read_console
@@ -170,6 +171,13 @@ def resolved_step(path: Path, at: EpisodeRef) -> bytes:
     """Return a step as JSON, with an episode of the recording in place of a word."""
     with open_recording(path) as recording:
         return as_json(at.resolved(recording))
+
+
+def episode_thumbnail(path: Path, at: EpisodeRef) -> bytes:
+    """Return an episode as a small SVG picture."""
+    with open_recording(path) as recording:
+        step = at.resolved(recording)
+        return thumbnail(recording, step.phase, step.number_in(recording), step.heading).encode()
 
 
 def latest_episode(path: Path) -> bytes:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field, TypeAdapter
@@ -22,6 +22,8 @@ from runner.service.problems import error_docs
 from runner.service.processes import ProcessPool
 from runner.service.settings import ServiceSettings
 
+MAX_PICTURES: Final = 24
+"""The most hits that a page shows pictures of."""
 api = APIRouter(tags=["runs"])
 pages = APIRouter(include_in_schema=False)
 
@@ -78,7 +80,7 @@ async def find(request: Request, search: SearchOf) -> Response:
 @pages.get("/find")
 async def find_page(request: Request, search: SearchOf) -> Response:
     """Show the form, and the episodes that match."""
-    shown: dict[str, object] = {"search": search, "problem": "", "found": None}
+    shown: dict[str, object] = {"search": search, "problem": "", "found": None, "max_pictures": MAX_PICTURES}
     try:
         if search.expression.strip():
             from runner.query.find import Found  # needs the extra

@@ -25,7 +25,19 @@ def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
     def report(steps: int) -> None:
         if channel.stop():
             raise KeyboardInterrupt
-        channel.send(RunProgress(run_id, seed, 1, 1, 0, 1, steps, 0, 0, None))
+        progress = RunProgress(
+            run_id=run_id,
+            seed=seed,
+            run=1,
+            runs=1,
+            episode=0,
+            episodes=1,
+            train_steps=steps,
+            eval_steps=0,
+            bytes=0,
+            last_evaluation=None,
+        )
+        channel.send(progress)
 
     if not (spec.recordings / run_id).is_dir():
         task = EpisodeBranch(

@@ -1,4 +1,4 @@
-"""Doing a job: a configuration seed by seed, a sweep or an explanation; and the process that does it."""
+"""Doing a job: a configuration seed by seed, a branch, a sweep or an explanation; its process."""
 
 from __future__ import annotations
 

@@ -136,6 +136,15 @@ async def step_of(run: Run, compute: Computation, text: str) -> EpisodeRef:
     )
 
 
+@router.get("/thumbnail")
+async def thumbnail(
+    run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = TYPICAL
+) -> Response:
+    """Return a small picture of an episode, which takes no environment."""
+    picture = await compute(fragments.episode_thumbnail, run.recording, EpisodeRef.parse(at))
+    return Response(picture, media_type="image/svg+xml")
+
+
 @router.get("/latest")
 async def latest(
     request: Request,

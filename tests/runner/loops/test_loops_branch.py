@@ -323,6 +323,7 @@ def test_what_cannot_be_branched_leaves_no_run(runs, tmp_path):
         (ConfigError, "action: found '2', expected 0 to 1", {"at": "0:1", "action": "2"}),
         (ConfigError, "expected recorded, random, constant", {"at": "0:1", "policy": "best"}),
         (ConfigError, "cannot be imported", {"at": "0:1", "policy": "no_such_module:act"}),
+        (ConfigError, "seed: found -1, expected 0 or more", {"at": "0:1", "policy": "random", "seed": -1}),
     ):
         with pytest.raises(error, match=message):
             runner.branch(run, recordings=tmp_path, **options)

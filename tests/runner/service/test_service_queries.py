@@ -2,12 +2,33 @@
 
 from __future__ import annotations
 
+import html
+import re
+
+import gymnasium
+import numpy as np
 import pytest
 from selenium.webdriver.common.by import By
 from served import Served, wait
 
 import runner
 from runner.runs.resolve import find_run
+
+
+class Stranger(gymnasium.Env):
+    """An environment of nobody's package, whose rewards are not all finite."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self._t = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self._t += 1
+        return np.zeros(2, np.float32), np.nan if self._t == 3 else 1.0, self._t == 5, False, {}
 
 
 def test_the_route_answers_a_query(client, recordings):
@@ -50,6 +71,24 @@ def test_the_page_shows_what_it_is_asked(client):
     assert "2 rows" in text
     assert "&lt;b&gt;" in text
     assert "<b>" not in text
+
+
+def test_hits_have_pictures_that_take_no_environment(client, recordings):
+    with runner.record(Stranger(), recordings, name="own") as rec:
+        rec.reset(seed=1)
+        while not any(rec.step(1)[2:4]):
+            pass
+    text = client.get("/find", params={"expression": "length > 0", "limit": 1000}).text
+    pictures = [html.unescape(address) for address in re.findall(r'src="(/runs/[^"]+thumbnail[^"]+)"', text)]
+    assert 0 < len(pictures) <= 24
+    for address in pictures[:3]:
+        answer = client.get(address)
+        assert (answer.status_code, answer.headers["content-type"]) == (200, "image/svg+xml")
+    own = client.get(f"/runs/{rec.run.run_id}/replay/thumbnail?at=0").text
+    assert own.count("<polyline") == 1
+    assert "g-trail" in client.get("/runs/first/replay/thumbnail?at=eval:10:1").text
+    assert client.get("/runs/first/replay/thumbnail?at=99999").status_code == 404
+    assert client.get("/runs/first/replay/thumbnail?at=<b>").status_code == 400
 
 
 def test_the_route_finds_episodes(client, recordings):
