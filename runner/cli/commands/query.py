@@ -157,12 +157,12 @@ def find_command(
     mark: str | None = option(
         "--mark", metavar="TEXT", help="Mark the first step of the episodes shown, as `dualtaxi mark` does."
     ),
-    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="A tag of these marks."),
+    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated."),
     quiet: bool = option(
         "-q",
         "--quiet",
         is_flag=True,
-        help="Print a line RUN PHASE EPISODES for each run, for other commands.",
+        help="Print ids only: a line RUN PHASE EPISODES for each run.",
     ),
     as_json: bool = json_option,
     recordings: tuple[Path, ...] = folders_option,

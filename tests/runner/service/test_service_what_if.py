@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 
 import pytest
@@ -96,8 +97,10 @@ def test_the_last_frame_of_a_replay_asks_for_the_last_step(page, recorded):
     assert link.get_attribute("href").endswith(f"/what-if/0:{length - 1}")
 
 
-def test_a_loop_has_no_such_link(loops_client):
-    assert "What if" not in loops_client.get("/runs/pole/replay/train/0").text
+def test_a_loop_has_a_form_instead_of_the_page(loops_client):
+    replay = loops_client.get("/runs/pole/replay/train/0").text
+    assert "data-to-what-if" not in replay
+    assert re.search(r'href="/runs/\w+/branch\?at=0:0">What if another action were next', replay)
 
 
 def test_nothing_sticks_out_of_a_narrow_page(page, browser):
