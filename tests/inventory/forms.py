@@ -294,6 +294,7 @@ PARTS: Final = (
     "/runs/{run}/random-policy",
     "/runs/{run}/distributions",
     "/runs/{run}/replay/latest",
+    "/runs/{run}/replay/thumbnail",
     "/runs/{run}/rerun/frame",
     "/runs/{run}/system/part",
     "/runs/{run}/console/part",
