@@ -13,7 +13,11 @@ from typing import Any, Self
 
 import httpx2
 import psutil
-from selenium.common.exceptions import NoSuchElementException, StaleElementReferenceException
+from selenium.common.exceptions import (
+    NoSuchElementException,
+    StaleElementReferenceException,
+    WebDriverException,
+)
 from selenium.webdriver.remote.webdriver import WebDriver
 from selenium.webdriver.support.ui import WebDriverWait
 
@@ -30,8 +34,17 @@ def free_port() -> int:
 
 def wait(browser: WebDriver, is_so: Callable[[], Any], seconds: float = 60) -> Any:
     """Wait until a page is so, and return what was found; parts of it may be replaced meanwhile."""
+
+    def ask(_: WebDriver) -> Any:
+        try:
+            return is_so()
+        except WebDriverException as error:
+            if "does not belong to the document" in str(error):  # another way in which drivers say stale
+                return None
+            raise
+
     ignored = [NoSuchElementException, StaleElementReferenceException]
-    return WebDriverWait(browser, seconds, 0.05, ignored).until(lambda _: is_so())
+    return WebDriverWait(browser, seconds, 0.05, ignored).until(ask)
 
 
 class Served:
