@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from runner.query.chunks import Relation
 
 MAX_FILES: Final = 20_000
-_VERSION: Final = 3
+_VERSION: Final = 4
 _PACKED: Final = 64
 """The files that a pack has in the mean."""
 _LEAST: Final = 8
@@ -199,12 +199,11 @@ def facts_of(path: Path) -> Facts:
 def register_steps(connection: Any, steps: Relation, extras: Relation | None) -> pa.Schema:
     """Register the view `steps` with columns for extras, and return its columns.
 
-    An extra that a step lacks is NULL, a flag false. The extras of a vector, which are for all its
-    environments together, are left out.
+    An extra that a step lacks is NULL, a flag false.
     """
     connection.register("own_steps", steps)
     joined, columns, more = "", "own_steps.*", []
-    if extras is not None and "step" in steps.schema.names and "environment" not in steps.schema.names:
+    if extras is not None and "step" in steps.schema.names:
         connection.register("extras", extras)
         joined = "LEFT JOIN extras USING (phase, step)"
         more = [column for column in extras.schema if column.name.startswith(layout.EXTRA_PREFIX)]

@@ -128,6 +128,7 @@ def test_nested_observations_and_actions_of_a_continuous_space(tmp_path):
     }
     actions, rewards = draws.random((50, 4, 2)), draws.random((50, 4))
     ends = draws.random((50, 4)) < 0.1
+    ends[1:] &= ~ends[:-1]  # the step after an end only resets the environment
     with runner.record_batches("Robot", tmp_path, autoreset_mode="NextStep") as rec:
         rec.batch(seen, actions, rewards, ends)
     assert verify(rec.run.recording).finding == ""
@@ -207,6 +208,12 @@ def test_resets_and_modes_are_checked(tmp_path):
             rec.batch(*BATCH, **final)
         with pytest.raises(ConfigError, match="extras: found shape"):
             rec.batch(*BATCH, extras={"value": np.ones((2, 5))})
+        twice = np.zeros((5, 2), bool)
+        twice[1:3, 1] = True
+        with pytest.raises(
+            RecordingError, match="environment 1: found the end of an episode in the step after"
+        ):
+            rec.batch(*BATCH[:3], twice)
         rec.batch(*BATCH)
     assert rec.run.summary["train_steps"] == 10
     ended = (*BATCH[:3], np.ones((5, 2), bool))

@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.archive.runs import archive_run
@@ -444,6 +445,41 @@ def test_extras_are_searched(tmp_path):
     (row,) = runner.sql(query, recordings=tmp_path).arrow().to_pylist()
     assert row["n"] == sum(map(len, losses.values()))
     assert row["loss"] == 3
+
+
+@pytest.mark.parametrize("way", ["NextStep", "SameStep", "batches"])
+def test_extras_of_each_environment_are_searched(tmp_path, way):
+    draws = np.random.default_rng(0)
+    actions = draws.integers(2, size=(120, 3))
+    extras = {"loss": draws.integers(50, size=(120, 3)) / 2, "q": draws.normal(size=(120, 3, 2))}
+    extras["agreed"] = extras["loss"] > 12
+    if way == "batches":
+        over = np.zeros((120, 3), np.bool_)
+        over[14::15], over[36::20, 0] = True, True
+        places = draws.normal(size=(121, 3, 2)).astype(np.float32)
+        with runner.record_batches(
+            "Corridor", tmp_path, action_space=spaces.Discrete(2), autoreset_mode="NextStep"
+        ) as rec:
+            rec.batch(places, actions, over * 1.0, over, extras=extras)
+    else:
+        mode = AutoresetMode(way)
+        envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3, autoreset_mode=mode)
+        with runner.record_vector(envs, tmp_path) as rec:
+            rec.reset(seed=0)
+            for t in range(120):
+                rec.step(actions[t], extras={name: values[t] for name, values in extras.items()})
+    with open_recording(rec.run.recording) as recording:
+        by_episode = list(map(recording.train.extras.of_episode, range(recording.train.episodes.count())))
+    expected = {
+        "any(extra.loss > 24)": lambda values: (values["loss"] > 24).any(),
+        "count(extra.agreed) > 8": lambda values: values["agreed"].sum() > 8,
+        "max(extra.q[1]) > 2": lambda values: values["q"][:, 1].max() > 2,
+    }
+    for expression, holds in expected.items():
+        hits = runner.find(expression, tmp_path, limit=None).hits
+        wanted = [k for k, values in enumerate(by_episode) if holds(values)]
+        assert sorted(hit.episode for hit in hits) == wanted, expression
+        assert 0 < len(wanted) < len(by_episode)
 
 
 def test_hits_are_exported(tmp_path, folder):
