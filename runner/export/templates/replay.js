@@ -68,10 +68,10 @@ class Replay {
   column(agent, lines) {
     const box = Replay.make("section"),
       facts = Replay.make("dl");
-    if (agent) box.append(Replay.make("h4", agent.replaceAll("_", " ")), facts);
+    if (agent) box.append(Replay.make("h3", agent.replaceAll("_", " ")), facts);
     let kind = null;
     const rows = lines.map((line) => {
-      if (line.kind !== kind) box.append(Replay.make("h5", line.kind));
+      if (line.kind !== kind) box.append(Replay.make(agent ? "h4" : "h3", line.kind));
       kind = line.kind;
       const row = Replay.make("div", undefined, "series"),
         value = Replay.make("b");
@@ -318,7 +318,7 @@ class Replay {
         taken = table.taken[i];
       const names = episode.choices[episode.choices.length > 1 ? learner : 0];
       const who = episode.agents.length > 1 ? episode.agents[learner] : "Next action";
-      const title = Replay.make("h4", who + ": Q-values here ");
+      const title = Replay.make("h3", who + ": Q-values here ");
       const most = rows.length < table.of ? `${rows.length} of ${table.of} actions; ` : "";
       title.append(Replay.make("small", `(${most}bars from the lowest here to the highest)`));
       const values = rows.map((row) => row[1]),
