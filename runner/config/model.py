@@ -215,11 +215,6 @@ class ExperimentConfig(Settings):
         """The mode that `tables` and `rewards` spell out; None for independent learners on one reward."""
         return next((mode for mode, means in LEARNERS.items() if means == (self.tables, self.rewards)), None)
 
-    @property
-    def competitive(self) -> bool:
-        """What the environment's `competitive` argument must be: whether each agent has its own reward."""
-        return self.rewards == "individual"
-
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
         if (self.tables, self.rewards) == ("joint", "individual"):

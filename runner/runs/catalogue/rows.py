@@ -21,8 +21,6 @@ from runner.runs.listing import listed_run
 from runner.runs.run import Run
 from runner.util.values import is_number
 
-SEEDS: Final = 2**64
-
 _MODES: Final = {"joint team": "cooperative", "per_agent individual": "competitive"}
 _DEPTH: Final = 20
 _LOGGED: Final = 64

@@ -78,7 +78,6 @@ def test_a_byte_order_mark_and_windows_lines_are_read(tmp_path):
 def test_mode_tables_and_rewards_agree(given, tables, rewards, mode):
     config = from_mapping({"episodes": 1, **given})
     assert (config.tables, config.rewards, config.mode) == (tables, rewards, mode)
-    assert config.competitive is (rewards == "individual")
 
 
 @pytest.mark.parametrize(
