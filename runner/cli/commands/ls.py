@@ -39,7 +39,7 @@ MAX_PROBLEMS: Final = 5
 ON_A_TERMINAL: Final = 50
 """Runs listed on a terminal by default."""
 _READ_BYTES: Final = 1 << 20
-_SPOOL_BYTES: Final = 1 << 20
+_SPOOL_BYTES: Final = 8 << 20
 """Output up to this size is kept in memory, longer output in a temporary file."""
 
 _DEFAULT_COLUMNS: Final = (
