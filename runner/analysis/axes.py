@@ -19,7 +19,7 @@ from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.clock import read_clock
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
-from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS
 
 Values = NDArray[np.float64]
 Position = TypeVar("Position", int, float)
@@ -119,7 +119,7 @@ def positions(recording: Recording, axis: Axis) -> Positions:
     if axis in (EPISODES, STEPS):
         if not has_environment(recording.config):
             axis = LOGGED_STEPS
-        elif axis is EPISODES and not recording.eval.has_metrics and not any(recording.done().values()):
+        elif axis is EPISODES and recording.table(SCALAR_TOPIC) and not any(recording.done().values()):
             axis = STEPS  # of values that were logged before the first step
     elif axis is TIME:
         steps, values = _times(recording)

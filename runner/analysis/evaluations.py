@@ -279,12 +279,11 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
     Narrow columns join the values of several agents: `-800.0/-812.5`.
     """
     columns = {"episode": [f"{record.episode:,}" for record in records]}
-    is_job = records[0].training is not None
-    if not is_job:  # of a job, the table's explanation states the trials
+    shown = list(METRICS)
+    if records[0].training is None:  # of a job, the table's explanation states the trials
         columns["trials"] = [f"{record.trials:,}" for record in records]
-    for metric in METRICS:
-        if not is_job and all(record.value(metric.name) is None for record in records):
-            continue
+        shown = [m for m in shown if any(record.value(m.name) is not None for record in records)]
+    for metric in shown:
         values = [record.values[metric.name] for record in records]
         texts = [list(map(humanize.number, by_agent.values())) for by_agent in values]
         if is_narrow or len(texts[0]) == 1:
@@ -303,16 +302,17 @@ def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord
         words = event_in_words(name)
         heading = f"{words[: len(agent)]}\n{words[len(agent) + 1 :]}" if dot else words
         columns.append((heading, [f"{record.events[name]:,}" for record in records]))
+    explanation = (
+        "Each row: the evaluation episodes of the loop after that number of training episodes. Events are "
+        "counted over all of them."
+    )
     filled = [record.training.percent_filled.values() for record in records if record.training]
     if filled:
         columns.append(("filled %", ["/".join(map(humanize.number, shares)) for shares in filled]))
-    explanation = (
-        f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
-        "episodes. Events are counted over all trials."
-        if recording.eval.has_metrics
-        else "Each row: the evaluation episodes of the loop after that number of training episodes. Events "
-        "are counted over all of them."
-    )
+        explanation = (
+            f"Each row: {records[0].trials} trials with the greedy policy after that number of training "
+            "episodes. Events are counted over all trials."
+        )
     headings, cells = zip(*columns, strict=True)
     grid = Grid(headings, list(zip(*cells, strict=True)))
     return Section("Evaluations", [explanation], [grid])
