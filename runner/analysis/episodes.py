@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from runner.analysis.contents import require_steps
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.errors import NotInRecording, RecordingError, RunnerError, nearest
-from runner.replay.steps import check_steps, step_of_episode, steps_of
+from runner.replay.steps import step_of_episode, steps_of
 from runner.util.humanize import capitalised
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def first_state(recording: Recording, at: EpisodeRef) -> int:
     """Return the state in which an episode of a tabular environment begins."""
     require_steps(recording, "show", may_redo=True)
     steps = steps_of(recording, at.phase, at.number_in(recording))[:1]
-    check_steps(steps, recording.mdp, str(recording.path))
+    recording.mdp.check_steps(steps, str(recording.path))
     return int(steps["state"][0])
 
 

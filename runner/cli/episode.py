@@ -16,7 +16,7 @@ from runner.export.pictures import PictureMoment, moments_of
 from runner.export.values import plain_value, step_actions_in_words, value_in_words
 from runner.recording.spaces import least_number
 from runner.replay.recorded import reset_of
-from runner.replay.steps import check_steps, transitions_of
+from runner.replay.steps import transitions_of
 from runner.util.humanize import number
 from runner.util.jsonable import as_json
 from runner.util.values import Json
@@ -120,7 +120,7 @@ def _named(recording: Recording) -> Callable[[Step], dict[str, object]]:
 
     def describe(row: Step) -> dict[str, object]:
         step = np.asarray(row).reshape(1)
-        check_steps(step, mdp, str(recording.path), "recorded")
+        mdp.check_steps(step, str(recording.path), "recorded")
         events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
         description: dict[str, object] = {}
         for name, names in words.items():

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Final
 
-from runner.analysis.diff.settings import Change
 from runner.config import ConfigError, ExperimentConfig, from_mapping
 from runner.config.model import LEARNERS, SECTION_OF
 from runner.errors import EnvironmentNotUsable, RunnerError
 from runner.runs.branches import training_branches
+from runner.util.differences import Change
 from runner.util.humanize import listed, setting
 from runner.util.values import Json, JsonView
 

@@ -30,7 +30,7 @@ from runner.planning.optimum import optimal_values
 from runner.recording import schema
 from runner.recording.blocks import blank_records
 from runner.recording.reader import Recording, open_recording
-from runner.replay.steps import check_steps, episode_blocks, steps_of
+from runner.replay.steps import episode_blocks, steps_of
 from runner.replay.tables import TableReplay
 from runner.runs.run import Run
 from runner.util.humanize import counted
@@ -151,7 +151,7 @@ class _Branches:
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
         returns = self._returns
         for block in episode_blocks(recording, phase, episode):
-            check_steps(block, self._mdp, str(recording.path), schema.PHASE_NAMES[phase])
+            self._mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[phase])
             before = block[: max(0, t - done)]
             self._returns = _summed(self._returns, before)
             self._succeeded |= self._has_success(before)

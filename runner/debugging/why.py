@@ -38,7 +38,7 @@ from runner.errors import ConfigError, RunnerError, nearest
 from runner.learning.algorithms import ALGORITHMS
 from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
-from runner.replay.steps import check_steps, last_step
+from runner.replay.steps import last_step
 from runner.runs.run import Run
 
 POLICY_NOTE: Final = (
@@ -201,7 +201,7 @@ def _step_at(recording: Recording, at: EpisodeRef | None) -> NDArray[np.void]:
     if at.t >= len(steps):
         raise at.no_step(recording, len(steps), at.t)
     (block,) = steps.rows(at.t, at.t + 1)
-    check_steps(block, recording.mdp, str(recording.path), schema.PHASE_NAMES[at.phase])
+    recording.mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
     step: NDArray[np.void] = block[0]
     return step
 

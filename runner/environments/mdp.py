@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from runner.environments.scene import SceneDescription, scene_mistake
-from runner.errors import EnvironmentNotUsable
+from runner.errors import EnvironmentNotUsable, RecordingError
 from runner.util.arrays import Array
 from runner.util.values import JsonView, is_text, is_whole
 
@@ -130,6 +130,21 @@ class Mdp:
         at = np.where(exists, state, 0), np.where(exists, action, 0)
         leads = (self.next_state[at] == next_state[:, np.newaxis]) & (self.probability[at] > 0)
         return np.asarray(leads & exists[:, np.newaxis])
+
+    def check_steps(self, block: NDArray[np.void], where: str, phase: str = "training") -> None:
+        """Refuse steps with a state or an action that it does not have: they are used as indices.
+
+        Raises:
+            RecordingError: there is such a step.
+        """
+        bounds = {"state": self.states, "next_state": self.states, "action": self.joint_actions}
+        for name, bound in bounds.items():
+            if (largest := int(block[name].max())) >= bound:
+                step = int(block["step"][int(block[name].argmax())])
+                raise RecordingError(
+                    f"{where}: found {name} {largest} in {phase} step {step}, expected less than {bound}; "
+                    "`dualtaxi verify` checks the whole recording."
+                )
 
     def rewards_of(self, learners: int) -> NDArray[np.float64]:
         """Return rewards as [S, J, K, learners]: their own where there are several, else the shared one."""

@@ -17,7 +17,7 @@ from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
 from runner.replay.recorded import reset_of
-from runner.replay.steps import check_steps, transitions_of
+from runner.replay.steps import transitions_of
 from runner.util.arrays import Records
 
 MAX_NUMBERS: Final = 64
@@ -106,7 +106,7 @@ def observations_of(recording: Recording, phase: str, episode: int, start: int =
     for t, step in enumerate(transitions_of(recording, phase, episode, first), first):
         if recording.tabular:
             where, name = str(recording.path), schema.PHASE_NAMES[phase]
-            check_steps(np.asarray(step).reshape(1), recording.mdp, where, name)
+            recording.mdp.check_steps(np.asarray(step).reshape(1), where, name)
         if start == 0 and t == 0 and recording.has_states:
             yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None
         elif start == 0 and t == 0:

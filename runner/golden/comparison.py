@@ -15,7 +15,6 @@ import numpy as np
 
 from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.sections import sections
-from runner.analysis.diff.settings import changes_in
 from runner.environments.gym_types import Env
 from runner.errors import CannotRedo, ConfigError
 from runner.execution.rerun import OUTSIDE
@@ -28,6 +27,7 @@ from runner.replay.engine import Difference
 from runner.replay.environment import rerun
 from runner.runs.run import Run
 from runner.util.arrays import Array
+from runner.util.differences import changes_in
 from runner.util.extras import require
 from runner.util.humanize import setting
 

@@ -16,7 +16,6 @@ import numpy as np
 from runner.environments.mdp import step_counts
 from runner.recording import schema
 from runner.recording.description import environment_count
-from runner.recording.differences import first_differing_row
 from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
@@ -24,6 +23,7 @@ from runner.recording.steps import aligned
 from runner.recording.topic_chunks import TopicChunks
 from runner.recording.turns import is_taken
 from runner.util.arrays import Array, Flags, Ints, Records, zeros
+from runner.util.differences import first_differing_row
 
 _MAX_STEPS: Final = 2**62
 """More steps than a recording has."""

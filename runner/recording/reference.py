@@ -13,10 +13,10 @@ import numpy as np
 
 from runner.errors import Diverged
 from runner.recording import schema
-from runner.recording.differences import differing_rows, first_difference
 from runner.recording.messages import Logged, Message, decode
 from runner.recording.schema import BLOCK_TOPICS, Topic
 from runner.util.arrays import Records
+from runner.util.differences import differing_rows, first_difference
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording

@@ -17,7 +17,6 @@ from runner.errors import CannotRedo, shortened
 from runner.recording import schema
 from runner.recording.actions import EpisodeDigests, after_step
 from runner.recording.description import environment_count
-from runner.recording.differences import first_difference, first_differing_row
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value, decode
@@ -36,6 +35,7 @@ from runner.replay.stepping import (
 )
 from runner.replay.trust import require_plain, trusting
 from runner.util.arrays import Array, Ints
+from runner.util.differences import first_difference, first_differing_row
 from runner.util.jsonable import as_json
 
 BLOCK_SECONDS: Final = 0.2

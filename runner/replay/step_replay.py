@@ -19,7 +19,6 @@ from runner.learning import kernel
 from runner.learning.learner import Learner, NamedTables
 from runner.learning.ledger import UPDATE
 from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
-from runner.replay.steps import check_steps
 from runner.util.arrays import Array
 
 NO_ROWS: Final = np.empty((0, 0, 0))
@@ -176,7 +175,7 @@ class StepReplay:
                 f"{self._where}: found training steps {first} to {last} in a block of {len(steps)}, expected "
                 f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
             )
-        check_steps(steps, self._mdp, self._where)
+        self._mdp.check_steps(steps, self._where)
         if self._learner.algorithm.remember and self._remembered != self.step and (t := int(steps["t"][0])):
             self._recall(t)
         records = steps.view(np.recarray)

@@ -1,4 +1,4 @@
-"""Steps by episode, rerun where only their actions were recorded, and checks of steps; no compiled code."""
+"""Steps by episode, rerun where only their actions were recorded; no compiled code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.mdp import Mdp
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.messages import Message, frame_place
@@ -253,19 +252,3 @@ def last_step(recording: Recording) -> int:
     """Return the last training step at which the tables can be had."""
     snapshots = max((snapshot.step for snapshot in recording.snapshots()), default=0)
     return max(snapshots, recording.train.steps.count())
-
-
-def check_steps(block: NDArray[np.void], mdp: Mdp, where: str, phase: str = "training") -> None:
-    """Refuse steps with a state or an action that the environment does not have: they are used as indices.
-
-    Raises:
-        RecordingError: there is such a step.
-    """
-    bounds = {"state": mdp.states, "next_state": mdp.states, "action": mdp.joint_actions}
-    for name, bound in bounds.items():
-        if (largest := int(block[name].max())) >= bound:
-            step = int(block["step"][int(block[name].argmax())])
-            raise RecordingError(
-                f"{where}: found {name} {largest} in {phase} step {step}, expected less than {bound}; "
-                "`dualtaxi verify` checks the whole recording."
-            )

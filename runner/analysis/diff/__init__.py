@@ -12,6 +12,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypedDict
 
+import numpy as np
+from numpy.typing import NDArray
+
 from runner.analysis.contents import why_no_steps
 from runner.analysis.diff.causes import Cause, branch_relation, find_cause, find_kind, with_branch
 from runner.analysis.diff.code import FileChange, code_changes
@@ -26,26 +29,24 @@ from runner.analysis.diff.divergence import (
 )
 from runner.analysis.diff.metrics import MetricDiff, loop_means, metric_diffs
 from runner.analysis.diff.overlap import Overlap, VisitsDiff, training_overlap, visits_diff
-from runner.analysis.diff.settings import (
-    Change,
-    EnvironmentDiff,
-    changes_in,
-    environment_diff,
-    equal_values,
-    loop_environment_diff,
-)
 from runner.analysis.diff.tables import TableDiff, table_diffs
+from runner.environments.mdp import Mdp
+from runner.environments.naming import actions_in_words, states_in_words
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.runs.branches import BranchOrigin, origin_in, training_branches
 from runner.runs.checkpoints import read_checkpoints
 from runner.runs.run import Run
+from runner.util.arrays import Array
+from runner.util.differences import Change, changes_in, equal_values
 from runner.util.humanize import counted
 
 NOT_CONTENT: Final = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""
 _BY_PATH: Final = ("config", "provenance", "costs")
 """Fields of a `RunDiff` that are lists of values by path."""
+_MAX_EXAMPLES: Final = 10
+"""Differing transitions that are described."""
 
 
 class Identity(TypedDict):
@@ -55,6 +56,35 @@ class Identity(TypedDict):
     name: str
     seed: int | None
     status: str
+
+
+@dataclass(frozen=True)
+class TransitionChange:
+    """The names of a state and a joint action whose outcomes differ, and descriptions of the outcomes."""
+
+    state: str
+    action: str
+    a: str
+    b: str
+
+
+@dataclass(frozen=True)
+class EnvironmentDiff:
+    """How two environments differ."""
+
+    description: list[Change] = field(default_factory=list)
+    transitions: int = 0
+    """How many (state, action) pairs have other outcomes."""
+    of: int = 0
+    """How many pairs there are; 0 if the environments have other states or actions."""
+    examples: list[TransitionChange] = field(default_factory=list)
+    other_starts: bool = False
+    """Whether episodes start elsewhere."""
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing differs."""
+        return not (self.description or self.transitions or self.other_starts)
 
 
 @dataclass(frozen=True)
@@ -339,3 +369,69 @@ def _notes(a: Recording, b: Recording) -> list[str]:
     elif len(a.agents) != len(b.agents):
         notes.append("other modes: rewards are compared summed, and Q-tables not at all")
     return notes
+
+
+# --- environments -------------------------------------------------------------------------------------
+
+
+def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
+    """Return how two environments differ, down to single transitions."""
+    description = changes_in(a.description(), b.description())
+    if a.next_state.shape[:2] != b.next_state.shape[:2]:
+        sizes = Change("states x actions", a.next_state.shape[:2], b.next_state.shape[:2])
+        return EnvironmentDiff(description=[sizes, *description])
+    differs = np.zeros(a.next_state.shape[:2], np.bool_)  # padding does not count
+    for k in range(max(a.next_state.shape[2], b.next_state.shape[2])):
+        for left, right in zip(_outcome(a, k), _outcome(b, k), strict=True):
+            differs |= left != right
+    pairs = np.argwhere(differs)
+    return EnvironmentDiff(
+        description=description,
+        transitions=len(pairs),
+        of=differs.size,
+        examples=_examples(a, b, pairs[:: max(1, len(pairs) // _MAX_EXAMPLES)][:_MAX_EXAMPLES]),
+        other_starts=not np.array_equal(a.start, b.start),
+    )
+
+
+def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
+    """Return how the descriptions of two environments and their spaces differ."""
+    described = [{"spaces": recording.spaces, **recording.environment} for recording in (a, b)]
+    return EnvironmentDiff(changes_in(*described))
+
+
+def _outcome(mdp: Mdp, k: int) -> list[Array]:
+    """Return outcome k of every pair: probability, next state, summed reward, terminated, events."""
+    shape = mdp.next_state.shape
+    if k >= shape[2]:
+        return [np.zeros(shape[:2])] * 5
+    real = mdp.probability[..., k] > 0
+    columns: list[NDArray[Any]] = [mdp.next_state, mdp.summed_rewards, mdp.terminated, mdp.events]
+    return [mdp.probability[..., k], *(np.where(real, column[..., k], 0) for column in columns)]
+
+
+def _examples(a: Mdp, b: Mdp, pairs: NDArray[np.intp]) -> list[TransitionChange]:
+    if not len(pairs):
+        return []
+    states, actions = states_in_words(a), actions_in_words(a)
+    states_b = states_in_words(b)
+    return [
+        TransitionChange(
+            state=str(states[s]),
+            action=str(actions[j]),
+            a=_outcomes_in_words(a, states, s, j),
+            b=_outcomes_in_words(b, states_b, s, j),
+        )
+        for s, j in pairs.tolist()
+    ]
+
+
+def _outcomes_in_words(mdp: Mdp, states: NDArray[np.object_], s: int, j: int) -> str:
+    outcomes = []
+    for k in np.flatnonzero(mdp.probability[s, j] > 0):
+        chance = mdp.probability[s, j, k]
+        rewards = ", ".join(f"{reward:g}" for reward in mdp.rewards[s, j, k])
+        end = ", the end" if mdp.terminated[s, j, k] else ""
+        share = "" if chance == 1 else f"{chance:.3g}: "
+        outcomes.append(f"{share}{states[mdp.next_state[s, j, k]]}; reward {rewards}{end}")
+    return " | ".join(outcomes)

@@ -25,7 +25,6 @@ from runner.environments.naming import (
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.steps import check_steps
 from runner.runs.branches import training_branches
 
 if TYPE_CHECKING:
@@ -156,7 +155,7 @@ def find_kind(divergence: Divergence, a: Recording, b: Recording) -> Cause:
     left, right = _Side(a, divergence.a_step), _Side(b, divergence.b_step)
     for recording, step in (left, right):
         name = schema.PHASE_NAMES[divergence.phase]
-        check_steps(np.array([step]), recording.mdp, str(recording.path), name)
+        recording.mdp.check_steps(np.array([step]), str(recording.path), name)
     if divergence.field in ("episode", "t"):
         return Cause("transition", f"an episode ended in one of them: {_outcome_text(divergence, a, b)}")
     if divergence.t == 0 and left.step["state"] != right.step["state"]:

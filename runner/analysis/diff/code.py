@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from runner.analysis.diff.settings import Change
 from runner.recording.code import patch_parts, unified_diff
 from runner.recording.reader import Recording
+from runner.util.differences import Change
 from runner.util.humanize import counted
 
 MAX_LINES: Final = 200

@@ -20,12 +20,12 @@ from runner.analysis.evaluations import evaluations_of
 from runner.errors import shortened
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES
-from runner.recording.differences import differing_rows
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.replay.recorded import ended_episode
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
+from runner.util.differences import differing_rows
 
 Block = NDArray[np.void]
 

@@ -10,11 +10,11 @@ from runner.analysis.diff import NOT_CONTENT, RunDiff
 from runner.analysis.diff.causes import Cause
 from runner.analysis.diff.code import FileChange, code_changes, made_in_words
 from runner.analysis.diff.divergence import Divergence
-from runner.analysis.diff.settings import Change, changes_in
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
 from runner.recording.reader import Recording
 from runner.runs.branches import PATHS
+from runner.util.differences import Change, changes_in
 from runner.util.humanize import UNKNOWN, counted, setting
 
 _MAX_SETTINGS: Final = 4

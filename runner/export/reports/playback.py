@@ -41,7 +41,7 @@ from runner.export.reports.player_data import (
 )
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.replay.steps import check_steps, steps_of
+from runner.replay.steps import steps_of
 from runner.replay.tables import TableReplay, tables_at
 from runner.util.humanize import capitalised
 
@@ -65,7 +65,7 @@ def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, fi
         shown = steps[first : first + limit]
         if not len(shown):
             raise at.no_step(recording, len(steps), max(first, at.t))
-        check_steps(shown, recording.mdp, str(recording.path))
+        recording.mdp.check_steps(shown, str(recording.path))
         values = _values(recording, shown, at)
         ended = ending_of(recording, at.phase, number)
         return tabular_playback(recording, at, steps, ended, values, first, limit)

@@ -20,7 +20,6 @@ from runner.export.rerun.steps import Batch, StepTracks, grid_view
 from runner.export.rerun.tracks import GREY, MAX_ROWS, Track, Writer, cleared, scalars, text_track
 from runner.recording import schema
 from runner.recording.turns import taken
-from runner.replay.steps import check_steps
 from runner.util.arrays import Records
 
 T = TypeVar("T")
@@ -121,7 +120,7 @@ class RunReader:
         trials = int(plan["trials"]) if plan else 2**63 - 1
         for steps in self._blocks(phase, spans):
             if self._steps:
-                check_steps(steps, recording.mdp, str(recording.path), schema.PHASE_NAMES[phase])
+                recording.mdp.check_steps(steps, str(recording.path), schema.PHASE_NAMES[phase])
             trained, episode = (steps[name].astype(np.int64) for name in ("step", "episode"))
             number = episode
             if phase == "eval":  # shown by the training episodes before it

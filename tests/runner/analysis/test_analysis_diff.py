@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from runner.analysis.diff import RunDiff, diff
 from runner.analysis.diff.divergence import FIELDS, first_difference
 from runner.analysis.diff.sections import sections
-from runner.analysis.diff.settings import Change, changes_in
 from runner.analysis.sections import markdown
 from runner.cli import cli
 from runner.config import from_mapping
@@ -26,6 +25,7 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs import run as runs
+from runner.util.differences import Change, changes_in
 from tests.runner.altering import altered, without_digest
 from tests.runner.analysis.conftest import BASE
 from tests.runner.recording.making import stopping_after

@@ -1,14 +1,16 @@
-"""Rows in which recorded values differ from others: from those that were made again, or of another run."""
+"""The rows in which two arrays differ, in bits or beyond a tolerance; the values in which two mappings do."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runner.util.arrays import Array, Flags, Records
+from runner.util.values import flatten
 
 _COMPARED_BYTES: Final = 1 << 16
 
@@ -65,3 +67,34 @@ def _bits(values: Array) -> Array:
     if kind not in "bfV":
         return values
     return np.ascontiguousarray(values).view(f"u{size}" if kind == "f" and size in (2, 4, 8) else "u1")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A value by its path, in both runs; None where one has none."""
+
+    path: str
+    a: object
+    b: object
+
+
+def changes_in(a: Mapping[str, object], b: Mapping[str, object]) -> list[Change]:
+    """Return the differences of two nested mappings, by dotted path."""
+    left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
+    paths = dict.fromkeys([*left, *right])
+
+    def filled(path: str) -> bool:
+        """Return whether a mapping is empty in one, and the other's entries in it are listed anyway."""
+        return {} in (left.get(path), right.get(path)) and any(p.startswith(f"{path}.") for p in paths)
+
+    return [
+        Change(path, left.get(path), right.get(path))
+        for path in paths
+        if ((path in left) != (path in right) or left.get(path) != right.get(path)) and not filled(path)
+    ]
+
+
+def equal_values(a: Mapping[str, object], b: Mapping[str, object]) -> dict[str, object]:
+    """Return the values that two nested mappings share, by dotted path."""
+    left, right = flatten(a, keep_empty=True), flatten(b, keep_empty=True)
+    return {path: value for path, value in left.items() if path in right and right[path] == value}
