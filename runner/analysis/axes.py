@@ -20,8 +20,8 @@ from runner.recording.clock import read_clock
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
 from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS
+from runner.util.arrays import Floats
 
-Values = NDArray[np.float64]
 Position = TypeVar("Position", int, float)
 
 UPDATE_NAMES: Final = ("updates", "n_updates")
@@ -79,12 +79,12 @@ class Positions:
     """The positions of a run's moments on an axis."""
 
     axis: Axis
-    steps: Values
+    steps: Floats
     """Training steps at which the axis's value is known, ascending; not used for episodes and steps."""
-    values: Values
+    values: Floats
     """Its values there, which never decrease."""
 
-    def at(self, episodes: ArrayLike, steps: ArrayLike) -> Values:
+    def at(self, episodes: ArrayLike, steps: ArrayLike) -> Floats:
         """Return the positions of moments by the training episodes and training steps before them."""
         if self.axis is EPISODES:
             return np.asarray(episodes, np.float64)
@@ -138,7 +138,7 @@ def axes_of(recording: Recording) -> list[Axis]:
     return list(axes)
 
 
-def edges_of(axis: Axis, last: float, parts: int) -> Values:
+def edges_of(axis: Axis, last: float, parts: int) -> Floats:
     """Return the edges of at most `parts` stretches of 1, 2, 5, 10, ... that reach from 0 to `last`.
 
     Runs of about the same length have the same edges. Only an axis without whole numbers has stretches
@@ -151,12 +151,12 @@ def edges_of(axis: Axis, last: float, parts: int) -> Values:
     return np.arange(max(math.ceil(last / width * (1 - 1e-12)), 1) + 1, dtype=np.float64) * width
 
 
-def stretches_at(edges: Values, at: Values) -> NDArray[np.intp]:
+def stretches_at(edges: Floats, at: Floats) -> NDArray[np.intp]:
     """Return the number of the stretch that has each position; a position at an edge ends a stretch."""
     return (np.searchsorted(edges, at) - 1).clip(0, len(edges) - 2)
 
 
-def _times(recording: Recording) -> tuple[Values, Values]:
+def _times(recording: Recording) -> tuple[Floats, Floats]:
     """Return training steps, and the seconds that had passed when they were taken.
 
     The clock counts the steps of evaluations too. In a run that has any, it is read at the ends of training
@@ -182,7 +182,7 @@ def _times(recording: Recording) -> tuple[Values, Values]:
     return np.concatenate(steps), np.concatenate(values)
 
 
-def _logged(recording: Recording, axis: Axis) -> tuple[Values, Values]:
+def _logged(recording: Recording, axis: Axis) -> tuple[Floats, Floats]:
     """Return training steps, and the positions on an axis that the loop logged there.
 
     Of more than 262,144 values every second, fourth, ... is used.

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.contents import require_steps
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.errors import NotInRecording, RecordingError, RunnerError, nearest
 from runner.replay.steps import step_of_episode, steps_of
+from runner.util.arrays import Ints, Records
 from runner.util.humanize import capitalised
 
 if TYPE_CHECKING:
@@ -249,9 +249,7 @@ def _episode_named(recording: Recording, word: str) -> EpisodeRef:
     return EpisodeRef(max(0, recording.train.episodes.count() - 1))
 
 
-def references(
-    recording: Recording, phase: str, numbers: Sequence[int] | NDArray[np.int64]
-) -> list[EpisodeRef]:
+def references(recording: Recording, phase: str, numbers: Sequence[int] | Ints) -> list[EpisodeRef]:
     """Return the references to episodes, counted over their phase; trials are counted in their evaluation."""
     if phase == "train":
         return [EpisodeRef(int(number)) for number in numbers]
@@ -266,7 +264,7 @@ def references(
     ]
 
 
-def ranked_episodes(recording: Recording) -> tuple[str, NDArray[np.int64]]:
+def ranked_episodes(recording: Recording) -> tuple[str, Ints]:
     """Return the phase and the numbers of its episodes from worst to best: by success, return and length.
 
     They are the trials of all evaluations; of a run without trials the training episodes.
@@ -294,7 +292,7 @@ def ranked(recording: Recording, phase: str, start: int, stop: int) -> list[Epis
     return references(recording, phase, numbers[[0, len(numbers) // 2, -1]])
 
 
-def _by_rank(records: NDArray[np.void]) -> NDArray[np.int64]:
+def _by_rank(records: Records) -> Ints:
     """Return the numbers of episodes from worst to best; a return that is no number is the worst."""
     with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
         returns = records["returns"].sum(axis=1)

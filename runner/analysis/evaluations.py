@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import event_in_words, spoken
@@ -17,6 +16,7 @@ from runner.recording.metrics import METRICS, defined_metrics, is_usable
 from runner.recording.reader import Recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.util import humanize
+from runner.util.arrays import Ints, Records
 from runner.util.values import finite
 
 
@@ -119,7 +119,7 @@ class Evaluation:
     """Number of the evaluation from 0, also where a repair lost others."""
 
     @property
-    def episodes(self) -> NDArray[np.int64]:
+    def episodes(self) -> Ints:
         """The numbers of its trials."""
         return np.arange(self.start, self.stop)
 
@@ -211,7 +211,7 @@ def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[
     )
 
 
-def _loop_record(recording: Recording, evaluation: Evaluation, trials: NDArray[np.void]) -> EvaluationRecord:
+def _loop_record(recording: Recording, evaluation: Evaluation, trials: Records) -> EvaluationRecord:
     agents, environment = recording.agents, recording.environment
     defined = defined_metrics(bool(environment["success_events"]), environment["penalty_below"] is not None)
     of_trials = {metric.name: metric.of_trials(trials) for metric in defined}

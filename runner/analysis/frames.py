@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.evaluations import evaluation_records, training_records
 from runner.archive.places import at_hand
@@ -35,7 +34,7 @@ from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.listing import run_at
 from runner.runs.run import Run
-from runner.util.arrays import Array, leaves
+from runner.util.arrays import Array, Records, leaves
 from runner.util.extras import require
 from runner.util.values import flatten
 
@@ -256,7 +255,7 @@ def evaluation_column(key: str) -> str:
     return rest if first == "events" else f"{names.get(first, first)}{dot}{rest}"
 
 
-def _plain_columns(records: NDArray[np.void], names: Sequence[str]) -> dict[str, Array]:
+def _plain_columns(records: Records, names: Sequence[str]) -> dict[str, Array]:
     """Return fields of records as arrays of their own."""
     return {name: records[name].copy() for name in names}
 

@@ -22,11 +22,10 @@ from runner.environments.naming import numbered_actions, spoken
 from runner.recording.metrics import is_usable
 from runner.recording.reader import Recording
 from runner.recording.spaces import decode
-from runner.util.arrays import Array, leaves
+from runner.util.arrays import Array, Floats, Ints, leaves
 
-Values = NDArray[np.float64]
 Quantity = Literal["return", "length", "action", "reward"]
-Block = tuple[Values, Mapping[tuple[Quantity, str], Array]]
+Block = tuple[Floats, Mapping[tuple[Quantity, str], Array]]
 """The positions of a block of records, and its values by quantity and line."""
 
 _UNITS: Final[Mapping[Quantity, str]] = {
@@ -77,14 +76,14 @@ class _QuantityCounts:
     high: float = -np.inf
     distinct: set[float] = field(default_factory=set)
     left_out: int = 0
-    counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
-    levels: Values = field(default_factory=lambda: np.empty(0))
+    counts: Ints = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    levels: Floats = field(default_factory=lambda: np.empty(0))
 
     @property
     def is_distinct(self) -> bool:
         return len(self.distinct) <= _MAX_DISTINCT
 
-    def scan(self, values: Values) -> None:
+    def scan(self, values: Floats) -> None:
         """Extend the range and the distinct values."""
         usable = values[is_usable(values)]
         self.left_out += len(values) - len(usable)
@@ -104,7 +103,7 @@ class _QuantityCounts:
         )
         self.counts = np.zeros((stretches, len(self.levels) - (not self.is_distinct)), np.int64)
 
-    def count(self, stretches: NDArray[np.intp], values: Values) -> None:
+    def count(self, stretches: NDArray[np.intp], values: Floats) -> None:
         """Count the values of a block, each in its stretch."""
         usable = is_usable(values)
         side = "left" if self.is_distinct else "right"

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.axes import Axis
 from runner.analysis.compare.statistics import iqm_band
@@ -17,6 +16,7 @@ from runner.analysis.groups import Group
 from runner.analysis.series import LOGGED, lines_in, points_of, title_of
 from runner.errors import RunnerError
 from runner.recording.metrics import METRIC_OF, SHARES
+from runner.util.arrays import Floats
 
 
 class NoMetrics(RunnerError):
@@ -33,12 +33,12 @@ class Curve:
 
     group: int
     line: str
-    places: NDArray[np.float64]
+    places: Floats
     """Positions on the axis of the groups."""
-    middle: NDArray[np.float64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    runs: NDArray[np.float64]
+    middle: Floats
+    low: Floats
+    high: Floats
+    runs: Floats
     """Each run, [runs, positions], NaN where it has no value."""
 
 
@@ -73,7 +73,7 @@ class Panel:
         return all(not (curve.low < 0).any() for curve in self.curves)
 
 
-def smoothed(places: NDArray[np.float64], values: NDArray[np.float64], memory: float) -> NDArray[np.float64]:
+def smoothed(places: Floats, values: Floats, memory: float) -> Floats:
     """Return the exponential mean of values, which begins at the first.
 
     A value's weight falls to 1/e over the memory, so the line does not depend on how many points there are.

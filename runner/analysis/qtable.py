@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import BinaryIO, NotRequired, TypedDict
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Grid, Section
@@ -22,6 +21,7 @@ from runner.recording.reader import Recording
 from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode
 from runner.replay.tables import TableReplay
+from runner.util.arrays import Floats
 from runner.util.humanize import UNKNOWN, number
 from runner.util.values import Json
 
@@ -75,7 +75,7 @@ class QTables:
     """The Q-tables at a step."""
 
     description: TablesDescription
-    array: NDArray[np.float64]
+    array: Floats
     """As `one_array` returns them."""
 
     step_to_look_at: EpisodeRef | None = None
@@ -223,7 +223,7 @@ def _recorded(recording: Recording, step: int | None, state: str | None) -> QTab
 def _action_values(
     agent: str,
     names: Iterable[object],
-    values: NDArray[np.float64],
+    values: Floats,
     greedy: int,
     visits: Sequence[int] | None,
 ) -> Iterator[ActionValue]:
@@ -241,7 +241,7 @@ def _action_values(
         }
 
 
-def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def one_array(tables: Sequence[Floats]) -> Floats:
     """Return the tables as one array, [states, actions], of several learners [learners, states, actions].
 
     Where learners differ in their actions, cells beyond a learner's own actions are nan.
@@ -254,7 +254,7 @@ def one_array(tables: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
     return whole
 
 
-def summarize(agent: str, q: NDArray[np.float64]) -> TableSummary:
+def summarize(agent: str, q: Floats) -> TableSummary:
     """Return size, fill and range of a learner's table [states, actions]."""
     zeros = int(q.size - np.count_nonzero(q))
     return {

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.axes import EPISODES, Axis, Positions, edges_of, positions, stretches_at
 from runner.analysis.evaluations import (
@@ -25,6 +24,7 @@ from runner.recording.messages import Message
 from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import has_environment
+from runner.util.arrays import Floats
 from runner.util.humanize import counted
 from runner.util.values import JsonView
 
@@ -360,7 +360,7 @@ def _loop_training(
     return [(ends[k + 1], readings) for k, readings in training.items()], averaged
 
 
-def _edges(recording: Recording, moments: Positions) -> tuple[NDArray[np.float64], str]:
+def _edges(recording: Recording, moments: Positions) -> tuple[Floats, str]:
     """Return the edges of stretches, and a sentence on them if not each position has one of its own."""
     if has_environment(recording.config):
         done = recording.done()
@@ -399,7 +399,7 @@ def _episode_readings(recording: Recording, length: float, returns: Iterable[flo
 
 
 def _mean_episodes(
-    recording: Recording, moments: Positions, edges: NDArray[np.float64], not_finite: Counter[str]
+    recording: Recording, moments: Positions, edges: Floats, not_finite: Counter[str]
 ) -> dict[int, Readings]:
     """Return mean length and return of the training episodes that end in each stretch, by its number."""
     agents, bins = len(recording.agents), len(edges) - 1
@@ -437,18 +437,18 @@ def _mean_episodes(
 def _mean_scalars(
     recording: Recording,
     moments: Positions,
-    edges: NDArray[np.float64],
+    edges: Floats,
     names: dict[str, None],
     max_further: int,
     not_finite: Counter[str],
-) -> tuple[dict[str, NDArray[np.float64]], bool]:
+) -> tuple[dict[str, Floats], bool]:
     """Return the means of the values logged under each name in each stretch; NaN where there are none.
 
     Also whether any is the mean of several values.
     """
     wanted, bins = set(names), len(edges) - 1
-    sums: dict[str, NDArray[np.float64]] = {}
-    counts: dict[str, NDArray[np.float64]] = {}
+    sums: dict[str, Floats] = {}
+    counts: dict[str, Floats] = {}
     for series, rows in recording.scalars():
         steps, episodes = rows["step"].copy(), rows["episode"].copy()
         in_evaluation = np.array([phase != "train" for _, phase in series])[rows["series"]]

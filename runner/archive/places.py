@@ -19,7 +19,7 @@ from runner.runs.run import RUN_FILE, Run
 from runner.runs.trust_marks import copy_mark
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
-from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, report_progress
+from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, Report, report_progress
 
 if TYPE_CHECKING:
     from runner.archive.store import ArchiveStore
@@ -31,8 +31,6 @@ LOCK_SECONDS: Final = 600.0
 MEMORY_BYTES: Final = 4 * 10**9
 """Memory for restoring an archive, beyond what the process takes at its start."""
 _RESTORE_SECONDS: Final = 7 * 86400.0
-
-Report = Callable[[int], None]
 
 
 def default_target(recordings: Path) -> str:

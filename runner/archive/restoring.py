@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import pyarrow as pa
 from blake3 import blake3
-from numpy.typing import NDArray
 
 from runner.archive import layout
 from runner.archive.columns import Table
@@ -30,9 +29,10 @@ from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
-from runner.util.arrays import Records
+from runner.util.arrays import Records, Unsigned
 from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import storage_errors
+from runner.util.processes import Report
 from runner.util.values import Json
 
 _ROWS_AT_ONCE: Final = 1024
@@ -42,9 +42,7 @@ _MAX_PENDING: Final = 8
 """Blocks in the pipeline: as many as the recorder has of a topic."""
 
 
-def restore(
-    folder: Path, path: Path | None = None, report: Callable[[int], None] = lambda _: None
-) -> Manifest:
+def restore(folder: Path, path: Path | None = None, report: Report = lambda _: None) -> Manifest:
     """Write the recording of an archive to a new file; return the archive's manifest.
 
     Args:
@@ -70,7 +68,7 @@ def restore(
 class _Restorer:
     """Restores one archive into a file, or into hashes only."""
 
-    def __init__(self, archive: Archive, file: RecordingFile | None, report: Callable[[int], None]) -> None:
+    def __init__(self, archive: Archive, file: RecordingFile | None, report: Report) -> None:
         self._archive = archive
         self._file = file
         self._report = report
@@ -187,9 +185,7 @@ class _Restorer:
             if topic.message is schema.IMAGE:
                 self._batches.flush()
 
-    def _send_chunk(
-        self, topic: Topic, records: memoryview, times: NDArray[np.uint64], offsets: NDArray[np.uint64]
-    ) -> None:
+    def _send_chunk(self, topic: Topic, records: memoryview, times: Unsigned, offsets: Unsigned) -> None:
         self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
         if topic.name in ("/train/step", "/eval/step"):

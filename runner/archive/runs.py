@@ -13,7 +13,7 @@ from pathlib import Path
 
 from runner.archive.layout import CONTENTS
 from runner.archive.manifest import Manifest
-from runner.archive.places import Report, archive_of, restore_to
+from runner.archive.places import archive_of, restore_to
 from runner.archive.restoring import restore
 from runner.archive.store import ArchiveStore, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
@@ -28,6 +28,7 @@ from runner.runs.locking import locked
 from runner.runs.resolve import run_of_id
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.store import Store
+from runner.util.processes import Report
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Self
@@ -33,6 +33,7 @@ from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
 from runner.runs.checkpoints import read_checkpoints
 from runner.util.files import write_object
+from runner.util.processes import Report
 
 ROWS_A_GROUP: Final = 1 << 18
 BYTES_A_GROUP: Final = 32 << 20
@@ -41,9 +42,7 @@ LEVEL: Final = 9
 """The zstd level: a higher one saves a tenth of a byte per step, and takes three times as long."""
 
 
-def write_archive(
-    recording: Recording, folder: Path, report: Callable[[int], None] = lambda _: None
-) -> Manifest:
+def write_archive(recording: Recording, folder: Path, report: Report = lambda _: None) -> Manifest:
     """Write a recording into a folder as an archive, the manifest last; return the manifest.
 
     Args:
@@ -114,7 +113,7 @@ class TableWriter:
 class _ArchiveWriter:
     """Writes one recording as an archive."""
 
-    def __init__(self, recording: Recording, folder: Path, report: Callable[[int], None]) -> None:
+    def __init__(self, recording: Recording, folder: Path, report: Report) -> None:
         self._recording = recording
         self._folder = folder
         self._report = report

@@ -14,7 +14,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -42,7 +42,7 @@ from runner.runs.trust_marks import marking_nothing
 from runner.util.files import storage_errors
 from runner.util.humanize import counted, number
 from runner.util.jsonable import as_json
-from runner.util.processes import report_progress
+from runner.util.processes import Report, Stop, report_progress
 from runner.util.values import checked_run_name
 
 POLICIES: Final = ("recorded", "random", "constant")
@@ -117,8 +117,8 @@ def branch(
     recordings: str | os.PathLike[str] | None = None,
     max_steps: int = MAX_STEPS,
     trust: bool = False,
-    report: Callable[[int], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
+    report: Report = lambda _: None,
+    stop: Stop = lambda: False,
 ) -> Branch | TrainingBranch:
     """Change one step of a recorded run, and record what follows as a run of its own, with the same draws.
 
@@ -217,7 +217,7 @@ def refuse_misfits(
 
 
 def branch_episode(
-    run: Run, task: EpisodeBranch, recordings: Path, report: Callable[[int], None] = lambda _: None
+    run: Run, task: EpisodeBranch, recordings: Path, report: Report = lambda _: None
 ) -> Branch:
     """Play an episode of a loop on from a step, and record that as a run in a folder: see `branch`.
 

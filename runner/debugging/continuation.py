@@ -6,7 +6,6 @@ import math
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning import kernel
 from runner.learning.algorithms import POLICY, QLearning
@@ -14,8 +13,7 @@ from runner.learning.kernel import Tally
 from runner.learning.learner import CHOSEN, NEVER, Learner
 from runner.learning.schedules import compile_schedule, schedule_value
 from runner.planning.evaluation import joint_probabilities
-
-Records = NDArray[np.void]
+from runner.util.arrays import Floats, Records
 
 
 class Position(NamedTuple):
@@ -74,7 +72,7 @@ class Continuation:
         return own if self._moment.phase == "eval" else f"{own}, exploring with probability {self.epsilon:g}"
 
     @property
-    def policy(self) -> NDArray[np.float64]:
+    def policy(self) -> Floats:
         """The probability of each joint action in each state, [S, J], with the epsilon of the moment."""
         learner, epsilon = self._learner, self.epsilon
         width, policy = learner.model.width, learner.policy
@@ -89,7 +87,7 @@ class Continuation:
         joint = joint_probabilities(own)
         return epsilon / math.prod(width) + (1 - epsilon) * joint
 
-    def play(self, action: int, steps: NDArray[np.void], episodes: NDArray[np.void]) -> int:
+    def play(self, action: int, steps: Records, episodes: Records) -> int:
         """Take a joint action, play on until the episode ends or `steps` is full, and return the steps taken.
 
         The action is taken whatever the policy would choose. `steps` are step records of the phase, filled;
@@ -143,5 +141,5 @@ class Continuation:
         filled, ended = kernel.evaluate(cursor, *fixed, tally, steps, ends, moment.episode + 1, moment.state)
         return filled, ended
 
-    def _scheduled(self, schedule: NDArray[np.float64]) -> float:
+    def _scheduled(self, schedule: Floats) -> float:
         return float(schedule_value(schedule, self._moment.trained_episode, self._moment.trained_step))

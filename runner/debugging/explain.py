@@ -36,6 +36,7 @@ from runner.runs.resolve import find_run
 from runner.runs.run import Run, recordings_folder
 from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
+from runner.util.processes import Stop
 from runner.util.values import JsonView
 
 Source = str | os.PathLike[str] | JsonView | ExperimentConfig | Run
@@ -67,7 +68,7 @@ def explain(
     recordings: str | os.PathLike[str] | None = None,
     report: Report = lambda *_: None,
     planned: Callable[[SamplingPlan], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Stop = lambda: False,
     trust: bool = False,
 ) -> Explanation:
     """Train mixtures of two configurations, and return which settings make the difference between them.
@@ -158,7 +159,7 @@ def answer(
     pool: Workers[Measurement, MixtureResult],
     report: Report = lambda *_: None,
     planned: Callable[[SamplingPlan], None] = lambda _: None,
-    stop: Callable[[], bool] = lambda: False,
+    stop: Stop = lambda: False,
 ) -> Explanation:
     """Return the explanation of a question, trained by some workers; see `explain`."""
     began, mixing, folder = time.monotonic(), question.mixing, question.recordings

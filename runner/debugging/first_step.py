@@ -27,6 +27,7 @@ from runner.recording.reader import open_recording
 from runner.runs.catalogue.removal import plan, remove
 from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED, Run, new_run
+from runner.util.processes import Stop
 
 Place = tuple[int, int, int]
 """A training step: its number, its episode and its t."""
@@ -41,7 +42,7 @@ def first_step(
     recordings: Path,
     name: str,
     report: Callable[[int, int], None],
-    stop: Callable[[], bool],
+    stop: Stop,
 ) -> FirstStep:
     """Record A with and without one setting of B, until they differ; return where they do.
 

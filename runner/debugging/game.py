@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.compare.statistics import Estimate, bootstrap_means
 from runner.debugging.explanation import ENOUGH, Interaction, Mixture, Setting
@@ -16,6 +15,7 @@ from runner.debugging.factors import MAX_ALL
 from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures
 from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
 from runner.sweep.local import Workers
+from runner.util.arrays import Floats
 
 _START_SECONDS: Final = 10.0
 """About the time to start workers, load kernels in them, and record the two short runs of the first step."""
@@ -98,7 +98,7 @@ class Game:
         low, own, high = self.values((0, number, self.mixing.everything)).mean(axis=1).tolist()
         return float((own - low) / (high - low)) if high != low else math.nan
 
-    def values(self, numbers: Sequence[int]) -> NDArray[np.float64]:
+    def values(self, numbers: Sequence[int]) -> Floats:
         """Return the values of mixtures that were measured, [mixtures, seeds]."""
         return self._mixtures.values(numbers, self.metric)
 

@@ -18,7 +18,6 @@ from typing import Final, Self
 
 import numpy as np
 from blake3 import blake3
-from numpy.typing import NDArray
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from runner.config import ExperimentConfig, from_mapping
@@ -37,7 +36,9 @@ from runner.recording.layout import layout_of
 from runner.sweep.local import Workers
 from runner.sweep.objective import readings
 from runner.util import __version__
+from runner.util.arrays import Floats
 from runner.util.files import storage_errors
+from runner.util.processes import Stop
 from runner.util.values import Json, finite
 
 VALUES: Final = "values.jsonl"
@@ -77,7 +78,7 @@ class Measurement:
         """Return the task: it runs in one thread, and writes nothing."""
         return self
 
-    def run(self, stop: Callable[[], bool]) -> MixtureResult:
+    def run(self, stop: Stop) -> MixtureResult:
         """Return what was measured; errors that a user can fix become a result."""
         by_seed: dict[int, Readings] = {}
         seconds = 0.0
@@ -96,7 +97,7 @@ class Measurement:
 
 
 def measure(
-    config: ExperimentConfig, seed: int, recordings: Path, stop: Callable[[], bool] = lambda: False
+    config: ExperimentConfig, seed: int, recordings: Path, stop: Stop = lambda: False
 ) -> Readings | None:
     """Train an experiment with a seed to its end, in memory, and return the readings there; None if stopped.
 
@@ -192,7 +193,7 @@ class Mixtures:
         """Return the readings of a mixture that were measured, by the order of the seeds."""
         return [self._found[mixture, seed] for seed in self.seeds if (mixture, seed) in self._found]
 
-    def values(self, mixtures: Sequence[int], metric: str) -> NDArray[np.float64]:
+    def values(self, mixtures: Sequence[int], metric: str) -> Floats:
         """Return the values of a metric in mixtures, [mixtures, seeds].
 
         Raises:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.debugging.expressions import JOINT, TABLE_NAMES, Array, Columns, Quantity
@@ -16,6 +15,7 @@ from runner.learning.learner import rules_of
 from runner.learning.watching import Watch, WatchedValues, explorations
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
+from runner.util.arrays import Flags, Ints, Records
 
 MAX_CELLS: Final = 4_096
 """The most Q-values of an expression."""
@@ -97,7 +97,7 @@ class JobColumns:
         """The values now, one row each; NaN for those of a step before the first step."""
         return self._last
 
-    def take(self, block: NDArray[np.void], needed: int) -> Iterator[tuple[NDArray[np.int64], Columns]]:
+    def take(self, block: Records, needed: int) -> Iterator[tuple[Ints, Columns]]:
         """Yield the steps after which quantities may have changed, as places in a block, and their values.
 
         The block has the training steps that follow. The values have a row more, before the others: those
@@ -113,7 +113,7 @@ class JobColumns:
                 self._last = {key: column[-1:] for key, column in whole.items()}
                 yield places + first, whole
 
-    def _part(self, block: NDArray[np.void], needed: int) -> tuple[NDArray[np.int64], Columns]:
+    def _part(self, block: Records, needed: int) -> tuple[Ints, Columns]:
         changes = None if self._replay is None else self._replay.watch(block, self._watch)
         visits = {each: self._visited(each, block) for each in self._visits}
         may_change = np.full(len(block), self._every_step)
@@ -137,7 +137,7 @@ class JobColumns:
             self._visits[each] += int(np.count_nonzero(mask))
         return places, columns
 
-    def _of_steps(self, steps: NDArray[np.void]) -> dict[Quantity, Array]:
+    def _of_steps(self, steps: Records) -> dict[Quantity, Array]:
         columns: dict[Quantity, Array] = {}
         for each in self._quantities:
             if each.name in ("step", "episode"):
@@ -152,7 +152,7 @@ class JobColumns:
                     columns[each][len(steps) - len(own) :] = explorations(rules, *numbers)
         return columns
 
-    def _of_tables(self, changes: WatchedValues, places: NDArray[np.int64]) -> dict[Quantity, Array]:
+    def _of_tables(self, changes: WatchedValues, places: Ints) -> dict[Quantity, Array]:
         """Return the values at places in a block, each that of the last change before or at it."""
         at = np.searchsorted(changes.row, places, side="right")
         values = self._table_values(changes)
@@ -187,7 +187,7 @@ class JobColumns:
                 self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
         check_lost(recording, expected, stop)
 
-    def _visited(self, quantity: Quantity, steps: NDArray[np.void]) -> NDArray[np.bool_]:
+    def _visited(self, quantity: Quantity, steps: Records) -> Flags:
         mask = steps["state"] == quantity.state
         if quantity.action < 0:
             return np.asarray(mask)

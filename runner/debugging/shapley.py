@@ -12,13 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from runner.util.arrays import Floats
+
 T = TypeVar("T")
 
 
-def shapley_values(values: Values) -> Values:
+def shapley_values(values: Floats) -> Floats:
     """Return the share of each setting: its effect, averaged over all orders in which settings change.
 
     L. S. Shapley, "A value for n-person games", 1953. The shares of all settings, [k, columns], add up to the
@@ -27,7 +27,7 @@ def shapley_values(values: Values) -> Values:
     return np.array([_effect(values, (i,)) for i in range(len(values).bit_length() - 1)])
 
 
-def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
+def shapley_interactions(values: Floats) -> dict[tuple[int, int], Floats]:
     """Return for each pair of settings (i, j), i < j, what both do beyond each, averaged over the others.
 
     The Shapley interaction index of M. Grabisch and M. Roubens, "An axiomatic approach to the concept of
@@ -38,7 +38,7 @@ def shapley_interactions(values: Values) -> dict[tuple[int, int], Values]:
     return {pair: _effect(values, pair) for pair in pairs}
 
 
-def _effect(values: Values, settings: Sequence[int]) -> Values:
+def _effect(values: Floats, settings: Sequence[int]) -> Floats:
     """Return what settings do together beyond what fewer of them do, averaged over the others, [columns]."""
     count = len(values).bit_length() - 1
     beyond = values.reshape(*[2] * count, -1)  # bit i of a mixture is axis count - 1 - i
@@ -46,11 +46,11 @@ def _effect(values: Values, settings: Sequence[int]) -> Values:
         beyond = np.diff(beyond, axis=count - 1 - i)
     beyond = beyond.reshape(-1, values.shape[1])
     sizes = np.bitwise_count(np.arange(len(beyond)))
-    averaged: Values = _weights(count + 1 - len(settings))[sizes] @ beyond
+    averaged: Floats = _weights(count + 1 - len(settings))[sizes] @ beyond
     return averaged
 
 
-def _weights(count: int) -> Values:
+def _weights(count: int) -> Floats:
     """Return the share of the orders of `count` settings in which s given ones come before a given one."""
     factorial = math.factorial
     return np.array([factorial(s) * factorial(count - s - 1) / factorial(count) for s in range(count)])

@@ -8,21 +8,22 @@ with the run.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError, StorageError
 from runner.execution.estimate import free_bytes
 from runner.learning.ledger import SHARE, UPDATE, Ledger, spread
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
+from runner.util.arrays import Floats, Records
 from runner.util.files import storage_errors
 from runner.util.humanize import size
+from runner.util.processes import Report
 
 STRETCHES: Final = 20
 """The most stretches of equally many episodes by which weights are counted."""
@@ -43,13 +44,13 @@ class Weights:
 
     value: float
     """The Q-value in the replayed table."""
-    initial: NDArray[np.float64]
+    initial: Floats
     """[tables, S * width]: of the initial values."""
-    initial_values: NDArray[np.float64]
+    initial_values: Floats
     """[tables, S * width]."""
-    outcomes: NDArray[np.float64]
+    outcomes: Floats
     """[outcomes]: of the rewards of all steps with this outcome, an index of `Model.next_state`."""
-    episodes: NDArray[np.float64]
+    episodes: Floats
     """[stretches, 2]: of the rewards in each stretch of episodes, and what these add to the Q-value."""
     stretch: int
     """Episodes of a stretch."""
@@ -57,13 +58,11 @@ class Weights:
     """The episode of the last step."""
     counted: int
     """Number of steps whose rewards have a weight."""
-    largest: NDArray[np.void]
+    largest: Records
     """[limit] of `SHARE`: the steps that add or take most, these first."""
 
 
-def weights_of(
-    recording: Recording, cell: Cell, stop: int, limit: int, report: Callable[[int], None]
-) -> Weights:
+def weights_of(recording: Recording, cell: Cell, stop: int, limit: int, report: Report) -> Weights:
     """Return the weights of a Q-value after a number of training steps of a job that learns.
 
     `limit` is the most steps in `Weights.largest`; `report` is called with the number of steps read so far.
@@ -131,9 +130,7 @@ def weights_of(
     )
 
 
-def _updates(
-    recording: Recording, replay: TableReplay, learner: int, stop: int
-) -> Iterator[NDArray[np.void]]:
+def _updates(recording: Recording, replay: TableReplay, learner: int, stop: int) -> Iterator[Records]:
     """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`.
 
     Raises:
@@ -153,7 +150,7 @@ def _updates(
         yield updates
 
 
-def _largest(known: NDArray[np.void], shares: NDArray[np.void], limit: int) -> NDArray[np.void]:
+def _largest(known: Records, shares: Records, limit: int) -> Records:
     """Return the shares that add or take most, of those that are known and further ones."""
     both = np.concatenate([known, shares[shares["contribution"] != 0]])
     return both[np.lexsort((both["step"], -np.abs(both["contribution"])))[:limit]]

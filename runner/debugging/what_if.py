@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.contents import ending_of, require_steps
 from runner.analysis.episodes import EpisodeRef, StepLike
@@ -33,6 +32,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import episode_blocks, steps_of
 from runner.replay.tables import TableReplay
 from runner.runs.run import Run
+from runner.util.arrays import Floats, Records
 from runner.util.humanize import counted
 from runner.util.values import finite
 
@@ -50,10 +50,10 @@ class Branched:
 
     at: EpisodeRef
     """The recorded step."""
-    steps: NDArray[np.void]
+    steps: Records
     """Those up to the branch as they were recorded, then those played."""
     outcome: Outcome
-    tables: list[NDArray[np.float64]]
+    tables: list[Floats]
     """The Q-tables of each learner that the branch was played with, [S, actions]; empty if there are none."""
 
 
@@ -165,7 +165,7 @@ class _Branches:
     def _learns(self) -> bool:
         return self._tables.learner.rules.learns
 
-    def _has_success(self, steps: NDArray[np.void]) -> bool:
+    def _has_success(self, steps: Records) -> bool:
         return len(steps) > 0 and bool((events_of(self._mdp, steps) & self._mdp.success_mask).any())
 
     def episode(self, action: int) -> Branched:
@@ -175,7 +175,7 @@ class _Branches:
         tables = self._tables.tables if self._learns else []
         return Branched(self._at, np.concatenate([before, steps]), outcome, tables)
 
-    def _play(self, action: int) -> tuple[NDArray[np.void], Outcome]:
+    def _play(self, action: int) -> tuple[Records, Outcome]:
         """Return the steps from an action on, and where the whole episode leads."""
         recording, phase, t = self._recording, self._at.phase, self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
@@ -183,7 +183,7 @@ class _Branches:
             blank_records(topic, recording.layout.message(topic), count).view(np.recarray)
             for topic, count in zip(schema.PHASES[phase], (limit, 1), strict=True)
         ]
-        steps: NDArray[np.void] = blocks[0][: self._playing.play(action, *blocks)]
+        steps: Records = blocks[0][: self._playing.play(action, *blocks)]
         times = self._step["log_time"] + np.arange(len(steps), dtype=np.uint64) * schema.STEP_NANOSECONDS
         steps["log_time"] = times
         steps["publish_time"] = times
@@ -247,9 +247,7 @@ class _Branches:
             for actions in own.tolist()
         ]
 
-    def _exact_values(
-        self, state: int, policy: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _exact_values(self, state: int, policy: Floats) -> tuple[Floats, Floats]:
         """Return the values of each joint action under the policy, [J, learners], and the optimum, [J]."""
         mdp, learners, discount = self._mdp, len(self._recording.agents), self._playing.discount
         if discount >= 1:
@@ -276,7 +274,7 @@ class _Branches:
             yield f"episodes that were not over after {MAX_STEPS:,} more steps were not played to their end"
 
 
-def _summed(returns: NDArray[np.float64], steps: NDArray[np.void]) -> NDArray[np.float64]:
+def _summed(returns: Floats, steps: Records) -> Floats:
     """Return returns after more steps, added one by one, as the kernel does: equal to the last bit."""
     return np.asarray(np.cumsum(np.vstack([returns, steps["rewards"]]), axis=0)[-1])
 

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Final
 
@@ -28,6 +28,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.util.expressions import CONDITION
 from runner.util.humanize import UNKNOWN, counted
+from runner.util.processes import Report
 from runner.util.values import Json
 
 MAX_INTERVALS: Final = 10_000
@@ -132,7 +133,7 @@ def when(
     every: bool = False,
     first: StepLike | None = None,
     last: StepLike | None = None,
-    report: Callable[[int], None] = lambda _: None,
+    report: Report = lambda _: None,
 ) -> When:
     """Return the first training step after which an expression holds, or every interval in which it does.
 
@@ -159,7 +160,7 @@ def when_in(
     every: bool = False,
     first: StepLike | None = None,
     last: StepLike | None = None,
-    report: Callable[[int], None] = lambda _: None,
+    report: Report = lambda _: None,
     limit: int = MAX_INTERVALS,
 ) -> When:
     """Return when an expression held in the training of an open recording; see `when`.
@@ -214,7 +215,7 @@ def _search(
     intervals: int,
     start: int,
     stop: int,
-    report: Callable[[int], None],
+    report: Report,
 ) -> _Found:
     """Evaluate an expression after the steps from `start` to before `stop`; unless `every`, to the first."""
     moments: list[WhenMoment] = []

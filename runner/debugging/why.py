@@ -10,11 +10,10 @@ determines that. So the sum is exact: it is the value, but for the rounding of b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import at_hand
@@ -40,6 +39,8 @@ from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import last_step
 from runner.runs.run import Run
+from runner.util.arrays import Floats, Records
+from runner.util.processes import Report
 
 POLICY_NOTE: Final = (
     "WoLF-PHC acts by a policy, which is no such sum: its moves have a fixed size. This is the Q-value that "
@@ -64,7 +65,7 @@ def why(
     agent: str | None = None,
     at: StepLike | None = None,
     limit: int = LIMIT,
-    report: Callable[[int], None] = lambda _: None,
+    report: Report = lambda _: None,
 ) -> Why:
     """Return where a Q-value of a run comes from.
 
@@ -97,7 +98,7 @@ def why_in(
     agent: str | None = None,
     at: StepLike | None = None,
     limit: int = LIMIT,
-    report: Callable[[int], None] = lambda _: None,
+    report: Report = lambda _: None,
 ) -> Why:
     """Return where a Q-value comes from, as `why` does, from an open recording."""
     recording.require_job(
@@ -186,7 +187,7 @@ def _learner(recording: Recording, agent: str | None) -> int:
     return learners.index(names[0])
 
 
-def _step_at(recording: Recording, at: EpisodeRef | None) -> NDArray[np.void]:
+def _step_at(recording: Recording, at: EpisodeRef | None) -> Records:
     """Return the record of a step.
 
     Raises:
@@ -202,7 +203,7 @@ def _step_at(recording: Recording, at: EpisodeRef | None) -> NDArray[np.void]:
         raise at.no_step(recording, len(steps), at.t)
     (block,) = steps.rows(at.t, at.t + 1)
     recording.mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
-    step: NDArray[np.void] = block[0]
+    step: Records = block[0]
     return step
 
 
@@ -234,7 +235,7 @@ def _by_reward(mdp: Mdp, weights: Weights, learner: int, learners: int) -> Itera
         yield RewardPart(sum(part.weight for part in rest), sum(part.contribution for part in rest), None, "")
 
 
-def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Iterator[StepPart]:
+def _steps(recording: Recording, largest: Records, learner: int) -> Iterator[StepPart]:
     """Yield the steps of some shares, in their order."""
     mdp = recording.mdp
     states, actions = states_in_words(mdp), actions_in_words(mdp)
@@ -262,7 +263,7 @@ def _steps(recording: Recording, largest: NDArray[np.void], learner: int) -> Ite
         )
 
 
-def _moves(mdp: Mdp, outcomes: NDArray[np.float64], agent: str) -> Iterator[Move]:
+def _moves(mdp: Mdp, outcomes: Floats, agent: str) -> Iterator[Move]:
     """Yield the weight of the moves of an agent, or of all agents if it is empty, thing by thing."""
     if mdp.scene is None or mdp.scene_cells is None:
         return

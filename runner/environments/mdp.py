@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable, RecordingError
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Flags, Floats, Ints, Records
 from runner.util.values import JsonView, is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
@@ -41,9 +41,9 @@ class Transitions(TypedDict):
     """The arrays of an environment's outcomes, as `Mdp` has them."""
 
     next_state: NDArray[np.int32]
-    probability: NDArray[np.float64]
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
+    probability: Floats
+    rewards: Floats
+    terminated: Flags
     events: NDArray[np.uint32]
 
 
@@ -73,15 +73,15 @@ class Mdp:
     kwargs: JsonView
     next_state: NDArray[np.int32]
     """[S, J, K]."""
-    probability: NDArray[np.float64]
+    probability: Floats
     """[S, J, K]; 0 where a pair has fewer outcomes; these come last."""
-    rewards: NDArray[np.float64]
+    rewards: Floats
     """[S, J, K, R]; R is 1 if all agents share the reward, or the number of agents."""
-    terminated: NDArray[np.bool_]
+    terminated: Flags
     """[S, J, K]."""
     events: NDArray[np.uint32]
     """[S, J, K]: bit i is `event_names[i]`."""
-    start: NDArray[np.float64]
+    start: Floats
     """[S]: probability that an episode starts there."""
     step_limit: int
     """Steps after which an episode is truncated; 0 for never."""
@@ -109,7 +109,7 @@ class Mdp:
         return int(self.next_state.shape[1])
 
     @cached_property
-    def own_actions(self) -> NDArray[np.int64]:
+    def own_actions(self) -> Ints:
         """[J, agents]: each agent's part of every joint action."""
         joint = np.arange(self.joint_actions)
         return np.stack(np.unravel_index(joint, self.action_counts), axis=1).astype(np.int64)
@@ -120,18 +120,18 @@ class Mdp:
         return sum(1 << self.event_names.index(name) for name in self.success_events)
 
     @property
-    def summed_rewards(self) -> NDArray[np.float64]:
+    def summed_rewards(self) -> Floats:
         """[S, J, K]: the reward of all agents together."""
         return np.asarray(self.rewards.sum(axis=-1))
 
-    def outcomes_to(self, state: Indices, action: Indices, next_state: Indices) -> NDArray[np.bool_]:
+    def outcomes_to(self, state: Indices, action: Indices, next_state: Indices) -> Flags:
         """Return which outcomes of steps, [N] each, lead to their next states: [N, K]; none if unknown."""
         exists = (state >= 0) & (state < self.states) & (action >= 0) & (action < self.joint_actions)
         at = np.where(exists, state, 0), np.where(exists, action, 0)
         leads = (self.next_state[at] == next_state[:, np.newaxis]) & (self.probability[at] > 0)
         return np.asarray(leads & exists[:, np.newaxis])
 
-    def check_steps(self, block: NDArray[np.void], where: str, phase: str = "training") -> None:
+    def check_steps(self, block: Records, where: str, phase: str = "training") -> None:
         """Refuse steps with a state or an action that it does not have: they are used as indices.
 
         Raises:
@@ -146,7 +146,7 @@ class Mdp:
                     "`dualtaxi verify` checks the whole recording."
                 )
 
-    def rewards_of(self, learners: int) -> NDArray[np.float64]:
+    def rewards_of(self, learners: int) -> Floats:
         """Return rewards as [S, J, K, learners]: their own where there are several, else the shared one."""
         if self.rewards.shape[-1] in (learners, 1):
             return np.broadcast_to(self.rewards, (*self.rewards.shape[:-1], learners))
@@ -176,8 +176,8 @@ class Mdp:
 
 
 def step_counts(
-    mdp: Mdp, rewards: NDArray[np.float64], state: Indices, action: Indices, next_state: Indices
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    mdp: Mdp, rewards: Floats, state: Indices, action: Indices, next_state: Indices
+) -> tuple[Ints, Flags]:
     """Return events and penalties of steps, [N, events + 1], and which rewards the table excludes, [N].
 
     A step has the events of the outcome that leads to its next state, of several that with its reward. Its
@@ -197,7 +197,7 @@ def step_counts(
     return counts, is_possible & ~paid.any(axis=1)
 
 
-def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
+def events_of(mdp: Mdp, steps: Records) -> NDArray[np.uint32]:
     """Return the events of recorded steps, a bit mask each; none where the table has no such outcome.
 
     A record holds where a step led, not which outcome it took: that is one with its next state; of several
@@ -212,7 +212,7 @@ def events_of(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
     return masks
 
 
-def _events(mdp: Mdp, steps: NDArray[np.void]) -> NDArray[np.uint32]:
+def _events(mdp: Mdp, steps: Records) -> NDArray[np.uint32]:
     state, action = steps["state"].astype(np.int64), steps["action"].astype(np.int64)
     likely = mdp.outcomes_to(state, action, steps["next_state"])
     outcome = np.zeros(len(steps), np.int64)
@@ -343,7 +343,7 @@ def _range(values: Array) -> str:
     return f"{values.min()} to {values.max()}" if values.size else "none"
 
 
-def _sums(probability: NDArray[np.float64]) -> str:
+def _sums(probability: Floats) -> str:
     """Return a text of the lowest value and the sums along the last axis."""
     if not probability.size:
         return "none"
@@ -362,7 +362,7 @@ def _rows(array: Array | None) -> int | None:
     return None if array is None or not array.ndim else len(array)
 
 
-def _sums_to_one(probability: NDArray[np.float64]) -> bool:
+def _sums_to_one(probability: Floats) -> bool:
     """Return whether the last axis adds up to 1, as well as decimal fractions can."""
     if not probability.size or not (probability >= 0).all():
         return False

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 
 from runner.environments.mdp import Transitions
 from runner.errors import EnvironmentNotUsable
+from runner.util.arrays import Flags
 
 # Okabe and Ito (2008): distinguishable with any common colour blindness.
 _VERMILLION, _GREEN, _YELLOW, _BLUE = "#D55E00", "#009E73", "#F0E442", "#0072B2"
 _GREY, _SKY_BLUE = "#777777", "#56B4E9"
 
-Events = Mapping[str, NDArray[np.bool_]]
+Events = Mapping[str, Flags]
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,14 +213,14 @@ def _one_player(cells: int) -> dict[str, Any]:
     }
 
 
-def _action(arrays: Transitions, action: int) -> NDArray[np.bool_]:
+def _action(arrays: Transitions, action: int) -> Flags:
     """Return the real outcomes [S, J, K] of an action."""
     taken = np.zeros(arrays["next_state"].shape, np.bool_)
     taken[:, action] = True
     return np.asarray(taken & (arrays["probability"] > 0))
 
 
-def _arrives(arrays: Transitions, where: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _arrives(arrays: Transitions, where: Flags) -> Flags:
     """Return the outcomes [S, J, K] that enter one of these states from another."""
     entered = where[arrays["next_state"]] & ~where[:, np.newaxis, np.newaxis]
     return np.asarray(entered & (arrays["probability"] > 0))

@@ -24,11 +24,12 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions, agent_of, joint_action, numbered_actions, own_action
 from runner.errors import ConfigError, RunnerError
 from runner.execution.initial_tables import recorded_tables
-from runner.execution.session import Report, Stop, run_job
+from runner.execution.session import Report, run_job
 from runner.recording.reader import Recording, open_recording
 from runner.recording.reuse import PackedChunks
 from runner.runs.branches import TrainingOrigin, origin_in
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
+from runner.util.processes import Stop
 from runner.util.values import checked_run_name
 
 Action = str | int | Mapping[str, str | int]

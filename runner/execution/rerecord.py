@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
@@ -18,7 +17,7 @@ from runner.config.loading import recorded_packing
 from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, Diverged, RunnerError
 from runner.execution.initial_tables import address, recorded_tables
-from runner.execution.session import Report, Session, Stop, recorder_for, run_job
+from runner.execution.session import Report, Session, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.actions import ACTION_TOPICS, after_step
@@ -41,9 +40,10 @@ from runner.runs import run as runs
 from runner.runs.locking import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import Run, unless_empty
+from runner.util.arrays import Ints, Records
 from runner.util.files import storage_errors
 from runner.util.humanize import counted
-from runner.util.processes import report_progress
+from runner.util.processes import Stop, report_progress
 
 Start = int | Literal["random", "each"]
 
@@ -288,9 +288,7 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
             raise Diverged(name, "digest", digests.get(name), expected)
 
 
-def _whole_steps(
-    recording: Recording, replay: Replay, piece: Piece, states: NDArray[np.int64]
-) -> NDArray[np.void]:
+def _whole_steps(recording: Recording, replay: Replay, piece: Piece, states: Ints) -> Records:
     """Return the whole records of the steps of a piece; `states` are as for `put_states`."""
     records = blank_steps(recording, piece.phase, piece.rows)
     for environment in replay.environments:

@@ -26,9 +26,8 @@ from runner.replay.engine import Difference, Replay
 from runner.replay.environment import rerun, stream_from_child
 from runner.replay.makers import why_not_rerun, why_uncertain
 from runner.runs.provenance import Differences
-from runner.util.processes import report_progress
+from runner.util.processes import Report, report_progress
 
-Report = Callable[[int], None]
 OUTSIDE: Final = (
     "The environment gives other results each time for the same seed and actions: it depends on more than "
     "its seed, such as the global random generators, the clock, the order of a set, or threads."

@@ -24,7 +24,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, truncated_message
 from runner.execution.initial_tables import configured_tables, recorded_tables, resolve_job
-from runner.execution.session import Report, Session, Stop, describe, evaluation_brief, execute, recorder_for
+from runner.execution.session import Report, Session, describe, evaluation_brief, execute, recorder_for
 from runner.execution.verify import differing_environment
 from runner.learning.learner import Learner, NamedTables
 from runner.recording import schema
@@ -44,6 +44,7 @@ from runner.runs.locking import locked
 from runner.runs.provenance import Differences, differing_provenance, provenance
 from runner.runs.run import RECORDING_FILE, Run
 from runner.util.files import storage_errors
+from runner.util.processes import Stop
 
 DECISIVE: Final = (
     "dualtaxi",

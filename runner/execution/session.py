@@ -41,6 +41,7 @@ from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
 from runner.runs.run import Run
 from runner.util.arrays import Records
+from runner.util.processes import Stop
 
 REPORT_SECONDS: Final = 0.1
 
@@ -62,7 +63,6 @@ class Progress:
 
 
 Report = Callable[[Progress], None]
-Stop = Callable[[], bool]
 
 
 def run_job(

@@ -30,6 +30,7 @@ from runner.learning import draws
 from runner.learning.compiling import INLINED, inlined
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
+from runner.util.arrays import Floats, Ints
 
 FIRST, SECOND = 0, 1
 """Rows of `Tables.extra` of Double Q-learning: its two Q-tables."""
@@ -44,29 +45,29 @@ class Memory(NamedTuple):
     once is `Algorithm.capacity`.
     """
 
-    count: NDArray[np.int64]
+    count: Ints
     """[L]: how many values a learner remembers; always 0 of an algorithm that remembers nothing."""
-    cells: NDArray[np.int64]
+    cells: Ints
     """[L, capacity]: the values, as places in the learner's table, state * width + action."""
-    numbers: NDArray[np.float64]
+    numbers: Floats
     """[L, capacity]: for each of them its trace, or the reward that followed."""
 
 
 class Tables(NamedTuple):
     """The learners' tables, those of one kind one after the other, and values derived from them."""
 
-    q: NDArray[np.float64]
+    q: Floats
     """[sum of S * width]: table i starts at offset[i], row-major. These values are shown, and greedy actions
     follow them; of Double Q-learning the mean of both tables."""
     offset: tuple[int, ...]
     """[L]; a tuple, as `Model.width`: their length is known when the kernel is compiled."""
     greedy: NDArray[np.int32]
     """[L, S]: the lowest action of the highest value."""
-    value: NDArray[np.float64]
+    value: Floats
     """[L, S]: the highest value."""
-    extra: NDArray[np.float64]
+    extra: Floats
     """[2, sum of S * width], each row laid out as `q`; without rows if the algorithm has no such tables."""
-    visits: NDArray[np.float64]
+    visits: Floats
     """[L, S]: updates of a state's policy by WoLF-PHC; without rows for the others."""
     memory: Memory
 
@@ -76,9 +77,9 @@ class Rules(NamedTuple):
 
     algorithm: NamedTuple
     """The algorithm's own settings; their type is known when a kernel is compiled."""
-    step_size: NDArray[np.float64]
-    discount: NDArray[np.float64]
-    epsilon: NDArray[np.float64]
+    step_size: Floats
+    discount: Floats
+    epsilon: Floats
     by_step: bool
     """Whether step size, discount or epsilon counts steps, not episodes."""
     learns: bool
@@ -138,7 +139,7 @@ def _row(model: Model, tables: Tables, i: int, state: int) -> int:
 
 
 @inlined
-def _best(q: NDArray[np.float64], row: int, width: int) -> int:
+def _best(q: Floats, row: int, width: int) -> int:
     best = Index(0)
     highest = q[row]
     for action in range(Index(1), Index(width)):
@@ -283,7 +284,7 @@ def _double_q_learning(rules: Rules, model: Model, tables: Tables, seen: Transit
 class HystereticSchedules(NamedTuple):
     """The settings of Hysteretic Q-learning."""
 
-    decrease: NDArray[np.float64]
+    decrease: Floats
     """The step size of updates that lower a value."""
 
 
@@ -298,8 +299,8 @@ def _hysteretic_rate(rules: Rules, episode: int, step: int, step_size: float, se
 class WolfPhcSchedules(NamedTuple):
     """The settings of WoLF-PHC: how far the policy moves in one update."""
 
-    win: NDArray[np.float64]
-    lose: NDArray[np.float64]
+    win: Floats
+    lose: Floats
 
 
 @numba.njit
@@ -363,7 +364,7 @@ def _wolf_phc(rules: Rules, model: Model, tables: Tables, seen: Transition) -> t
 class SarsaLambdaSchedules(NamedTuple):
     """The settings of SARSA(lambda)."""
 
-    trace_decay: NDArray[np.float64]
+    trace_decay: Floats
     """Lambda."""
 
 
@@ -409,7 +410,7 @@ def _sarsa_lambda(rules: Rules, model: Model, tables: Tables, seen: Transition) 
 class NStepQLearning(NamedTuple):
     """The settings of n-step Q-learning."""
 
-    n: NDArray[np.float64]
+    n: Floats
     """Rewards in a return, a constant; kernels take it from the room in `Memory`."""
 
 

@@ -30,37 +30,38 @@ from runner.learning.compiling import inlined, loop
 from runner.learning.ledger import outcome_of
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
+from runner.util.arrays import Floats, Ints, Records
 
 
 class Tally(NamedTuple):
     """Counts within an episode, and over the last steps and episodes."""
 
-    returns: NDArray[np.float64]
+    returns: Floats
     """[L]: rewards of the current episode so far."""
-    event_classes: NDArray[np.int64]
+    event_classes: Ints
     """[E]: steps of the current episode by event class."""
     recent_outcomes: NDArray[np.int32]
     """Ring over the last steps: outcome class of step k at k modulo its length."""
-    recent_lengths: NDArray[np.int64]
+    recent_lengths: Ints
     """Ring over the last episodes: length of episode k at k modulo its length."""
 
 
 class Ends(NamedTuple):
     """Room for the episodes that a call ends, of one type for all environments: a loop is compiled once."""
 
-    counts: NDArray[np.int64]
+    counts: Ints
     """[n, 7 + E]: what `ENDS` names, and the steps by event."""
-    returns: NDArray[np.float64]
+    returns: Floats
     """[n, L]."""
 
     @classmethod
-    def of(cls, episodes: NDArray[np.void]) -> Ends:
+    def of(cls, episodes: Records) -> Ends:
         """Return room for as many episodes as a block of records has."""
         n = len(episodes)
         events, learners = episodes["events"].shape[1], episodes["returns"].shape[1]
         return cls(np.empty((n, len(ENDS) + events), np.int64), np.empty((n, learners)))
 
-    def put(self, episodes: NDArray[np.void], ended: int) -> None:
+    def put(self, episodes: Records, ended: int) -> None:
         """Fill the first records of a block with the first episodes that ended."""
         episodes, counts = episodes[:ended], self.counts[:ended]
         for column, name in enumerate(ENDS):
@@ -141,13 +142,13 @@ def _end_episode(model: Model, tally: Tally, ends: Ends, row: int, last: np.reco
 
 @loop
 def train(
-    cursor: NDArray[np.void],
+    cursor: Records,
     seed: np.uint64,
     model: Model,
     tables: Tables,
     rules: Rules,
     tally: Tally,
-    steps: NDArray[np.void],
+    steps: Records,
     ends: Ends,
     until_episode: int,
     until_step: int,
@@ -256,13 +257,13 @@ def train(
 
 @loop
 def evaluate(
-    cursor: NDArray[np.void],
+    cursor: Records,
     seed: np.uint64,
     model: Model,
     tables: Tables,
     policy: NDArray[np.int32],
     tally: Tally,
-    steps: NDArray[np.void],
+    steps: Records,
     ends: Ends,
     until_episode: int,
     start: int,
@@ -379,7 +380,7 @@ def relearn(
 
 
 @loop
-def recall(seed: np.uint64, model: Model, tables: Tables, rules: Rules, steps: NDArray[np.void]) -> None:
+def recall(seed: np.uint64, model: Model, tables: Tables, rules: Rules, steps: Records) -> None:
     """Remember recorded training steps, in order, as when they were learned from; only the memory changes."""
     for k in range(len(steps)):
         for i in range(len(model.width)):
@@ -387,7 +388,7 @@ def recall(seed: np.uint64, model: Model, tables: Tables, rules: Rules, steps: N
 
 
 @inlined
-def _read_rows(model: Model, tables: Tables, rows: NDArray[np.float64], k: int, state: int) -> None:
+def _read_rows(model: Model, tables: Tables, rows: Floats, k: int, state: int) -> None:
     """Read each learner's values of a state into row k of `rows`, [n, L, widest], if it has one."""
     if k < len(rows):
         for i in range(len(model.width)):
@@ -402,9 +403,9 @@ def replay(
     model: Model,
     tables: Tables,
     rules: Rules,
-    steps: NDArray[np.void],
-    rows: NDArray[np.float64],
-    updates: NDArray[np.void],
+    steps: Records,
+    rows: Floats,
+    updates: Records,
     traced: int,
 ) -> None:
     """Apply the updates of recorded training steps, in order, to the tables.
@@ -424,9 +425,7 @@ def replay(
 
 
 @loop
-def read_states(
-    tables: Tables, states: NDArray[np.int32], value: NDArray[np.float64], greedy: NDArray[np.int32]
-) -> None:
+def read_states(tables: Tables, states: NDArray[np.int32], value: Floats, greedy: NDArray[np.int32]) -> None:
     """Read the highest value and the greedy action of states, [n], into [L, n]; nan and -1 for state -1."""
     for i in range(value.shape[0]):
         for k in range(value.shape[1]):
@@ -445,11 +444,11 @@ def replay_probed(
     model: Model,
     tables: Tables,
     rules: Rules,
-    steps: NDArray[np.void],
-    rows: NDArray[np.float64],
-    before: NDArray[np.int64],
+    steps: Records,
+    rows: Floats,
+    before: Ints,
     states: NDArray[np.int32],
-    value: NDArray[np.float64],
+    value: Floats,
     greedy: NDArray[np.int32],
 ) -> None:
     """Replay steps, and read the states of row k of `states` before step `before[k]`; they ascend."""
@@ -463,7 +462,7 @@ def replay_probed(
 
 
 @numba.njit(cache=True)
-def fill_random(q: NDArray[np.float64], seed: np.uint64, low: float, high: float) -> None:
+def fill_random(q: Floats, seed: np.uint64, low: float, high: float) -> None:
     """Fill the tables with draws, uniform in [low, high)."""
     state = draws.key(seed, draws.INITIAL_Q, 0)
     for cell in range(len(q)):

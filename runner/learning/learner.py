@@ -20,13 +20,14 @@ from runner.learning.algorithms import ALGORITHMS, Memory, Rules, Tables
 from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
+from runner.util.arrays import Floats, Ints, Records
 
 NEVER: Final = 2**62
 """A step that no training reaches."""
 CHOSEN: Final = np.empty(0, np.int32)
 """As `Segment.replacement`: agents take the actions that they choose."""
 
-NamedTables = Mapping[str, NDArray[np.float64]]
+NamedTables = Mapping[str, Floats]
 """The tables of one learner: its Q-table as `q`, and the other `tables` of its algorithm by name."""
 
 
@@ -93,7 +94,7 @@ class Learner:
         """Training episodes done."""
         return int(self._cursor["episode"][0])
 
-    def table(self, i: int) -> NDArray[np.float64]:
+    def table(self, i: int) -> Floats:
         """Return learner i's Q-table as it is now, [S, width]: a view.
 
         These are the values that greedy actions follow; of Double Q-learning the mean of both tables.
@@ -102,23 +103,23 @@ class Learner:
 
     def named_tables(self, i: int) -> NamedTables:
         """Return all tables of learner i as they are now, [S, width] each and visits [S, 1]: views."""
-        tables: dict[str, NDArray[np.float64]] = {"q": self.table(i)}
+        tables: dict[str, Floats] = {"q": self.table(i)}
         for name, array in zip(self.kinds[1:], self.tables.extra, strict=False):
             tables[name] = self._of(i, array)
         if "visits" in self.kinds:
             tables["visits"] = self.tables.visits[i][:, np.newaxis]
         return tables
 
-    def snapshot(self) -> list[NDArray[np.float64]]:
+    def snapshot(self) -> list[Floats]:
         """Return all tables as a snapshot numbers them, those of one kind together: views."""
         return [self.named_tables(i)[name] for name in self.kinds for i in range(len(self.agents))]
 
-    def _of(self, i: int, array: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _of(self, i: int, array: Floats) -> Floats:
         start, width = int(self.tables.offset[i]), int(self.model.width[i])
         return array[start : start + self.mdp.states * width].reshape(-1, width)
 
     def train(
-        self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int, until_step: int
+        self, steps: Records, episodes: Records, until_episode: int, until_step: int
     ) -> tuple[int, int]:
         """Train until a block is full, or an episode or step is reached; return (steps, episodes) filled.
 
@@ -162,7 +163,7 @@ class Learner:
         return self._policy
 
     @property
-    def policy(self) -> NDArray[np.int32] | list[NDArray[np.float64]]:
+    def policy(self) -> NDArray[np.int32] | list[Floats]:
         """The policy of the present evaluation.
 
         The joint action of each state, [S]; of an algorithm that draws its actions one array a learner,
@@ -175,9 +176,7 @@ class Learner:
             return [policy / policy.sum(axis=1, keepdims=True) for policy in policies]
         return self._policy
 
-    def evaluate(
-        self, steps: NDArray[np.void], episodes: NDArray[np.void], until_episode: int
-    ) -> tuple[int, int]:
+    def evaluate(self, steps: Records, episodes: Records, until_episode: int) -> tuple[int, int]:
         """Play trials until a block is full or trial `until_episode` (counted over the run) is reached."""
         ends = kernel.Ends.of(episodes)
         filled, ended = kernel.evaluate(
@@ -229,14 +228,14 @@ class Learner:
         return rewards[seen].tolist(), counts[seen].tolist()
 
     @cached_property
-    def _distinct_rewards(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _distinct_rewards(self) -> tuple[Floats, Ints]:
         """The summed rewards, ascending, and for each outcome class which it is; a shared one counts once."""
         shared = self.mdp.rewards.shape[-1] == 1
         summed = self.model.rewards[:, 0] if shared else self.model.rewards.sum(axis=1)
         rewards, where = np.unique(summed, return_inverse=True)
         return rewards, where
 
-    def _mark_success(self, episodes: NDArray[np.void]) -> None:
+    def _mark_success(self, episodes: Records) -> None:
         if self._success.any():
             episodes["success"] = episodes["events"][:, self._success].any(axis=1)
 
@@ -266,7 +265,7 @@ class Learner:
             self.tables.greedy[i] = self.table(i).argmax(axis=1)
             self.tables.value[i] = self.table(i).max(axis=1)
 
-    def _fill(self, cells: NDArray[np.float64]) -> None:
+    def _fill(self, cells: Floats) -> None:
         """Fill cells with the configured initial values; 0 where it names another run's tables."""
         start = self.config.initial_q
         if isinstance(start, RandomTable):
@@ -340,7 +339,7 @@ def kinds_of(config: ExperimentConfig) -> tuple[str, ...]:
     return ("q", *ALGORITHMS[config.algorithm].tables)
 
 
-def name_tables(tables: Sequence[NDArray[np.float64]], kinds: tuple[str, ...]) -> list[NamedTables]:
+def name_tables(tables: Sequence[Floats], kinds: tuple[str, ...]) -> list[NamedTables]:
     """Return the tables of a whole snapshot by learner and name."""
     learners = len(tables) // len(kinds)
     return [{name: tables[k * learners + i] for k, name in enumerate(kinds)} for i in range(learners)]

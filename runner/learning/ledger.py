@@ -13,12 +13,12 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning.algorithms import Rules, expects, exploring, rate
 from runner.learning.compiling import inlined, loop
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
+from runner.util.arrays import Floats, Records
 
 UPDATE: Final = np.dtype([("outcome", "<u4"), ("bootstrapped", "<i4"), ("episode", "<i8"), ("second", "?")])
 """What decides the weights of a learner's update: the outcome of the step, as an index of `Model.next_state`,
@@ -36,13 +36,13 @@ class Ledger(NamedTuple):
     T tables of the learner: 2 of Double Q-learning, else 1.
     """
 
-    weights: NDArray[np.float64]
+    weights: Floats
     """[T, S * width]: how much of each value of the tables at this step the Q-value has."""
-    distances: NDArray[np.float64]
+    distances: Floats
     """[T, S * width]: these weights times the mean number of steps between that state and the Q-value's."""
-    outcomes: NDArray[np.float64]
+    outcomes: Floats
     """[outcomes]: how much of the rewards of steps with this outcome it has."""
-    episodes: NDArray[np.float64]
+    episodes: Floats
     """[stretches, 2]: how much of the rewards in a stretch of episodes it has, and what these add to it."""
 
 
@@ -71,10 +71,10 @@ def spread(
     rules: Rules,
     i: int,
     first: int,
-    updates: NDArray[np.void],
+    updates: Records,
     ledger: Ledger,
     stretch: int,
-    shares: NDArray[np.void],
+    shares: Records,
 ) -> int:
     """Spread the weights of learner i's values over the updates of a block, from the last to the first.
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
+from runner.util.arrays import Flags, Floats, Ints, Records
 
 PENALTY_BIT = np.uint32(1 << 31)
 """Bit of an event class that marks a penalty; events themselves use the bits below it."""
@@ -30,11 +31,11 @@ class Model(NamedTuple):
     """[S * J * K]."""
     outcome_class: NDArray[np.int32]
     """[S * J * K]; an array of its own, so that the one that every step waits for is small."""
-    cumulative: NDArray[np.float64]
+    cumulative: Floats
     """[S * J, K]: cumulative probability of the outcomes; the last real one and all after it are 1."""
-    rewards: NDArray[np.float64]
+    rewards: Floats
     """[C, L]: reward of each learner."""
-    terminated: NDArray[np.bool_]
+    terminated: Flags
     """[C]."""
     event_class: NDArray[np.int32]
     """[C]."""
@@ -42,7 +43,7 @@ class Model(NamedTuple):
     """[E]: bit i is event i, bit 31 a penalty."""
     start_states: NDArray[np.int32]
     """States an episode can start in."""
-    start_cumulative: NDArray[np.float64]
+    start_cumulative: Floats
     """Their cumulative probability; the last is 1."""
     own_action: NDArray[np.int32]
     """[J, L]: each learner's part of a joint action."""
@@ -85,7 +86,7 @@ def build_model(mdp: Mdp, tables: str) -> Model:
     )
 
 
-def _outcome_classes(mdp: Mdp, rewards: NDArray[np.float64]) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+def _outcome_classes(mdp: Mdp, rewards: Floats) -> tuple[Records, Ints]:
     """Return the distinct (rewards, terminated, mask) of all outcomes, and each outcome's class."""
     learners = rewards.shape[-1]
     kind = np.dtype([("rewards", "<f8", (learners,)), ("terminated", "?"), ("mask", "<u4")])
@@ -99,7 +100,7 @@ def _outcome_classes(mdp: Mdp, rewards: NDArray[np.float64]) -> tuple[NDArray[np
     return rows[first], class_of
 
 
-def _cumulative(probability: NDArray[np.float64]) -> NDArray[np.float64]:
+def _cumulative(probability: Floats) -> Floats:
     """Return cumulative probabilities along the last axis, exactly 1 from the last possible entry on."""
     total = np.cumsum(probability, axis=-1)
     left = np.cumsum(probability[:, ::-1], axis=-1)[:, ::-1]  # what is still to come, this one included

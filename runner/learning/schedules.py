@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
+from runner.util.arrays import Floats
 
 CONSTANT, LINEAR, EXPONENTIAL, PIECEWISE = 0.0, 1.0, 2.0, 3.0
 
 
 @numba.njit(cache=True)
-def schedule_value(schedule: NDArray[np.float64], episode: int, step: int) -> float:
+def schedule_value(schedule: Floats, episode: int, step: int) -> float:
     """Return the schedule's value at an episode and a training step, both counted from 0."""
     if schedule[0] == CONSTANT:
         return schedule[3]
@@ -28,7 +28,7 @@ def schedule_value(schedule: NDArray[np.float64], episode: int, step: int) -> fl
 
 
 @numba.njit
-def _changing_value(schedule: NDArray[np.float64], n: int) -> float:
+def _changing_value(schedule: Floats, n: int) -> float:
     if schedule[0] == LINEAR:
         value = _between(0.0, schedule[3], schedule[5], schedule[4], n)
     elif schedule[0] == EXPONENTIAL:
@@ -59,7 +59,7 @@ def _power(base: float, n: int) -> float:
 
 
 @numba.njit
-def _piecewise(schedule: NDArray[np.float64], n: int) -> float:
+def _piecewise(schedule: Floats, n: int) -> float:
     k = 5
     while k < len(schedule):
         if n < schedule[k]:
@@ -68,7 +68,7 @@ def _piecewise(schedule: NDArray[np.float64], n: int) -> float:
     return schedule[len(schedule) - 1]
 
 
-def compile_schedule(value: float | Schedule) -> NDArray[np.float64]:
+def compile_schedule(value: float | Schedule) -> Floats:
     """Return the configured constant or schedule as the array that `schedule_value` reads."""
     if isinstance(value, Linear):
         parameters = [value.start, value.end, float(value.over)]

@@ -13,41 +13,42 @@ from runner.learning.algorithms import Index, Rules, Tables, exploring
 from runner.learning.compiling import inlined, loop
 from runner.learning.kernel import relearn
 from runner.learning.model import Model
+from runner.util.arrays import Flags, Floats, Ints, Records
 
 
 class Watch(NamedTuple):
     """The values to watch, and the greedy paths from P start states."""
 
-    states: NDArray[np.bool_]
+    states: Flags
     """[S]: the states whose updates are reported."""
-    cells: NDArray[np.int64]
+    cells: Ints
     """[n]: places in `Tables.q`."""
-    greedy: NDArray[np.int64]
+    greedy: Ints
     """[m, 2]: a learner and a state each."""
-    starts: NDArray[np.int64]
+    starts: Ints
     """[P]: where the greedy paths start."""
     success: np.uint32
     """The bits of an event mask that mean success."""
     path: NDArray[np.int32]
     """[P, S]: the states on each path, in order."""
-    length: NDArray[np.int64]
+    length: Ints
     """[P]: how many there are."""
-    on_path: NDArray[np.bool_]
+    on_path: Flags
     """[P, S]: whether a state is on the path."""
-    succeeds: NDArray[np.bool_]
+    succeeds: Flags
     """[P]: whether the path has an event of success."""
 
 
 class WatchedValues(NamedTuple):
     """The watched values after the steps of a block that could change them, a row for each."""
 
-    row: NDArray[np.int64]
+    row: Ints
     """[k]: the step, as its place in the block, ascending."""
-    q: NDArray[np.float64]
+    q: Floats
     """[k, n]."""
     greedy: NDArray[np.int32]
     """[k, m]."""
-    succeeds: NDArray[np.bool_]
+    succeeds: Flags
     """[k, P]."""
 
 
@@ -113,7 +114,7 @@ def _read(tables: Tables, watch: Watch, changes: WatchedValues, k: int) -> None:
 
 
 @inlined
-def _is_remembered(model: Model, tables: Tables, states: NDArray[np.bool_]) -> bool:
+def _is_remembered(model: Model, tables: Tables, states: Flags) -> bool:
     """Return whether a learner remembers a value of one of these states, [S]."""
     memory = tables.memory
     for i in range(len(model.width)):
@@ -137,7 +138,7 @@ def replay_watched(
     model: Model,
     tables: Tables,
     rules: Rules,
-    steps: NDArray[np.void],
+    steps: Records,
     watch: Watch,
     changes: WatchedValues,
 ) -> int:
@@ -167,7 +168,7 @@ def replay_watched(
 
 
 @numba.njit(cache=True, nogil=True)
-def explorations(rules: Rules, episodes: NDArray[np.int64], steps: NDArray[np.int64]) -> NDArray[np.float64]:
+def explorations(rules: Rules, episodes: Ints, steps: Ints) -> Floats:
     """Return the probability of exploring at training steps of these episodes, [n]."""
     probabilities = np.empty(len(steps))
     for k in range(len(steps)):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import ConfigError
 from runner.loops.extras import begin_layout, blank_extras, put_extras
@@ -20,6 +19,7 @@ from runner.recording.extras import (
 )
 from runner.recording.recorder import Recorder
 from runner.recording.spaces import Description, leaf_dtype
+from runner.util.arrays import Ints
 
 
 class CopiedExtras:
@@ -51,9 +51,7 @@ class CopiedExtras:
             )
         self._is_described = False
 
-    def copy(
-        self, source: Source, phase: str, numbers: NDArray[np.int64], new_step: int, new_position: int
-    ) -> int:
+    def copy(self, source: Source, phase: str, numbers: Ints, new_step: int, new_position: int) -> int:
         """Copy the extras of some steps, which follow each other in the run; return how many had some.
 
         Args:

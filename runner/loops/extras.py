@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import ConfigError, RunnerError
 from runner.loops.step_buffer import StepBuffer
@@ -34,7 +33,7 @@ from runner.recording.gym_values import SCALARS
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
 from runner.recording.spaces import Description, Value, item_dtype, leaf_dtype, row_dtype
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Flags, Ints, Unsigned
 from runner.util.values import is_utf8
 
 _MAX_ROWS: Final = 4096
@@ -349,9 +348,7 @@ class PendingExtras:
         self._max_rows, self._held_row = self._room, self._held_row - n
         self._held = sum(self._row_bytes.values()) * self._n if self._held_row >= 0 else 0
 
-    def _send(
-        self, steps: NDArray[np.int64], columns: Mapping[str, Array], given: Mapping[str, NDArray[np.bool_]]
-    ) -> None:
+    def _send(self, steps: Ints, columns: Mapping[str, Array], given: Mapping[str, Flags]) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""
         recorder = self._recorder
         # The steps of the other phase came before all of these.
@@ -363,7 +360,7 @@ class PendingExtras:
         put_extras(recorder, self._phase, self._layout, steps, positions, columns, given)
         self._final[self._phase] = int(steps[-1])
 
-    def _given(self, n: int) -> dict[str, NDArray[np.bool_]]:
+    def _given(self, n: int) -> dict[str, Flags]:
         """Return whether each environment's step has a value, by name, in n rows; blank those without one."""
         given = {name: np.ones(n, np.bool_) for name in self._columns}
         for row, names in self._partial.items():
@@ -388,10 +385,10 @@ def put_extras(
     recorder: Recorder,
     phase: str,
     layout: ExtraLayout,
-    steps: NDArray[np.int64],
-    positions: NDArray[np.uint64],
+    steps: Ints,
+    positions: Unsigned,
     columns: Mapping[str, Array],
-    given: Mapping[str, NDArray[np.bool_]],
+    given: Mapping[str, Flags],
 ) -> None:
     """Record the extras of steps, given by number and position.
 

@@ -20,7 +20,6 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 from blake3 import blake3
-from numpy.typing import NDArray
 
 from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
@@ -58,7 +57,7 @@ from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, shards_locked, shards_of
 from runner.runs.trust_marks import merge_marks
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Floats, Records
 from runner.util.files import storage_errors
 
 _OWN_METADATA: Final = frozenset({"run", "result", "repair"})
@@ -272,7 +271,7 @@ class _Fold:
 
     # --- the order ------------------------------------------------------------------------------------
 
-    def _ordered(self) -> tuple[NDArray[np.void], tuple[Array, Array]]:
+    def _ordered(self) -> tuple[Records, tuple[Array, Array]]:
         """Return the units of all processes in the order of the run; keys and steps of its evaluations."""
         for source in self._sources:
             for phase, units in source.units.items():
@@ -289,7 +288,7 @@ class _Fold:
         evaluated = units[units["phase"] == PHASES.index("eval")]
         return units, (evaluated["key"].copy(), np.concatenate([[0], np.cumsum(evaluated["steps"])]))
 
-    def _alongside(self, times: Array) -> NDArray[np.float64]:
+    def _alongside(self, times: Array) -> Floats:
         """Return the training steps of the run when every process had stepped its environments so often."""
         total = np.zeros(len(times))
         for source in self._sources:

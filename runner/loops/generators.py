@@ -14,11 +14,11 @@ from typing import Any, Final
 import gymnasium
 import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
-from numpy.typing import NDArray
 
 from runner.environments.gym_types import AnyVectorEnv
 from runner.loops.vec_env import mode_of
 from runner.recording.reset_states import SEED_BYTES, STEPS_BETWEEN, ResetState
+from runner.util.arrays import Flags
 
 _SPARSE_STEPS_A_BYTE: Final = 2
 """An emulator's state takes some 14 kB, half of it after compression: a quarter of a byte for each step."""
@@ -109,7 +109,7 @@ class GeneratorWatch:
         self.due: float = 0 if self._resets_itself else math.inf
         """The number of steps from which on `before_step` is to be called before each step."""
 
-    def before_step(self, over: NDArray[np.bool_]) -> States:
+    def before_step(self, over: Flags) -> States:
         """Return what the resets that a step does in place of steps are going to depend on.
 
         Args:

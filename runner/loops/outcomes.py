@@ -6,11 +6,11 @@ import math
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.recording.metrics import METRICS, RECENT_EPISODES, defined_metrics, finite_mean
 from runner.recording.schema import Topic
+from runner.util.arrays import Floats, Records
 
 MAX_NAMES: Final = 64
 """The most names with their last logged value in a summary."""
@@ -34,11 +34,11 @@ class Outcomes:
         self._evaluated_after = -1
         self._trials = 0
         """Number of trials of the last evaluation."""
-        self._values: dict[str, NDArray[np.float64]] = {}
+        self._values: dict[str, Floats] = {}
         """Values of those trials, summed over agents, by metric."""
         self._logged: dict[str, float | None] = {}
 
-    def take_episodes(self, topic: Topic, records: NDArray[np.void]) -> None:
+    def take_episodes(self, topic: Topic, records: Records) -> None:
         """Add episodes that the recorder gets."""
         if topic.phase == "train":
             self._trained += len(records)

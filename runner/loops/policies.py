@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.games import game_spaces, is_game
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
@@ -34,8 +33,8 @@ from runner.replay.trust import trusting
 from runner.runs.checkpoints import Checkpoint
 from runner.runs.run import Run
 from runner.runs.trust_marks import marking_nothing
-from runner.util.arrays import Array
-from runner.util.processes import importing_from
+from runner.util.arrays import Array, Floats
+from runner.util.processes import Report, importing_from
 
 MAX_NUMBERS: Final = 256
 """The most numbers in one of the values that a policy returns along an episode."""
@@ -73,7 +72,7 @@ def play_checkpoint(
     episodes: int,
     seed: int = 0,
     trust: bool = False,
-    report: Callable[[int], None] = lambda _: None,
+    report: Report = lambda _: None,
 ) -> Run:
     """Play a checkpoint in the recorded environment; return the run that it was recorded in.
 
@@ -129,7 +128,7 @@ class ValuesAlong:
 
     actions: object
     """The T recorded actions, nested as their space."""
-    rewards: NDArray[np.float64]
+    rewards: Floats
     """[T, agents]."""
     values: Mapping[str, Array]
     """What the policy returned for the observation before each step, by name: [T, ...]."""

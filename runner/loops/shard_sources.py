@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 from mcap.writer import MCAP0_MAGIC
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -110,12 +109,12 @@ class Source:
                 return number, last
         return number, last
 
-    def _only_resets(self, phase: str) -> NDArray[np.int64]:
+    def _only_resets(self, phase: str) -> Ints:
         steps = self.recording.phase(phase).steps
         blocks = steps.numbered(range(self.stops[phase] if steps.have_turns else 0))
         return np.concatenate([np.empty(0, np.int64), *(block["step"][~is_taken(block)] for block in blocks)])
 
-    def _units(self, phase: str) -> NDArray[np.void]:
+    def _units(self, phase: str) -> Records:
         """Return the units of a phase, ordered by environment, without key and new numbers."""
         table, stop = self.recording.phase(phase).resets, self.stops[phase]
         dtype = np.dtype([(name, "i8") for name in _RESET])

@@ -12,7 +12,6 @@ from typing import Any, Final, SupportsFloat
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 
 from runner.environments.layers import final_observations
 from runner.environments.mdp import Mdp, step_counts
@@ -38,7 +37,7 @@ from runner.recording.recorder import BLOCK_BYTES, Recorder
 from runner.recording.reset_options import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions
 from runner.recording.reset_states import ResetState
 from runner.recording.spaces import Value, least_number
-from runner.util.arrays import Array, Flags, Ints, Records, zeros
+from runner.util.arrays import Array, Flags, Floats, Ints, Records, zeros
 
 MAX_SEED: Final = 2**64 - 1
 """The largest seed that the record of a reset holds."""
@@ -284,7 +283,7 @@ class StepBuffer:
         self,
         observations: object,
         actions: object,
-        rewards: NDArray[np.float64],
+        rewards: Floats,
         terminated: Flags,
         truncated: Flags,
         finals: object = None,

@@ -16,6 +16,7 @@ from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
 from runner.planning.kernel import Chain, Paths
 from runner.planning.optimum import require_discount, sweep_tolerance
+from runner.util.arrays import Flags, Floats, Ints
 
 
 @dataclass(frozen=True)
@@ -53,12 +54,12 @@ class _Chosen:
     """The outcomes of the action that a policy chooses in each state, [S, K] each."""
 
     next_state: NDArray[np.int32]
-    probability: NDArray[np.float64]
-    rewards: NDArray[np.float64]
+    probability: Floats
+    rewards: Floats
     """[S, K, L]."""
-    terminated: NDArray[np.bool_]
-    success: NDArray[np.bool_]
-    penalty: NDArray[np.bool_] | NDArray[np.float64]
+    terminated: Flags
+    success: Flags
+    penalty: Flags | Floats
     """Whether a step is a penalty; of merged outcomes its probability."""
 
 
@@ -68,9 +69,9 @@ class _AtStarts(NamedTuple):
     success_percent: float
     """Mean over the start states."""
     timeout_percent: float
-    totals: NDArray[np.float64]
+    totals: Floats
     """[N, 2 + L]: length, penalties, and the return of each learner."""
-    values: NDArray[np.float64]
+    values: Floats
     """[N, L]: discounted; nan for a discount of 1."""
     cycles: tuple[Cycle, ...] = ()
 
@@ -89,7 +90,7 @@ def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount
 
 
 def evaluate_stochastic_policy(
-    mdp: Mdp, policies: Sequence[NDArray[np.float64]], learners: int, discount: float
+    mdp: Mdp, policies: Sequence[Floats], learners: int, discount: float
 ) -> PolicyOutcome:
     """Return the exact outcome of learners that draw their actions, in expectation over all draws.
 
@@ -101,9 +102,7 @@ def evaluate_stochastic_policy(
     return _measured(mdp, _drawn(mdp, joint_probabilities(policies), learners), discount)
 
 
-def policy_values(
-    mdp: Mdp, joint: NDArray[np.float64], learners: int, discount: float
-) -> NDArray[np.float64]:
+def policy_values(mdp: Mdp, joint: Floats, learners: int, discount: float) -> Floats:
     """Return the discounted value of each state under a policy for each learner, [S, learners].
 
     The horizon is infinite: an episode that the environment cuts off counts as if it went on.
@@ -120,9 +119,7 @@ def policy_values(
     return _chain_values(chain, kernel.find_paths(chain), discount)
 
 
-def action_values(
-    mdp: Mdp, state: int, values: NDArray[np.float64], rewards: NDArray[np.float64], discount: float
-) -> NDArray[np.float64]:
+def action_values(mdp: Mdp, state: int, values: Floats, rewards: Floats, discount: float) -> Floats:
     """Return what each joint action in a state is worth if later steps are worth `values`, [J, n].
 
     Args:
@@ -133,12 +130,12 @@ def action_values(
     return np.asarray((mdp.probability[state][..., None] * outcome).sum(axis=1))
 
 
-def random_policy(mdp: Mdp) -> list[NDArray[np.float64]]:
+def random_policy(mdp: Mdp) -> list[Floats]:
     """Return the policy that takes every joint action with the same probability, for one learner."""
     return [np.full((mdp.states, mdp.joint_actions), 1 / mdp.joint_actions)]
 
 
-def joint_probabilities(policies: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+def joint_probabilities(policies: Sequence[Floats]) -> Floats:
     """Return the probability [S, J] of each joint action, the first learner's the most significant."""
     return functools.reduce(
         lambda joint, own: (joint[:, :, None] * own[:, None, :]).reshape(len(own), -1), policies
@@ -186,14 +183,14 @@ def _chosen(mdp: Mdp, policy: NDArray[np.int32], learners: int) -> _Chosen:
     )
 
 
-def _drawn(mdp: Mdp, joint: NDArray[np.float64], learners: int) -> _Chosen:
+def _drawn(mdp: Mdp, joint: Floats, learners: int) -> _Chosen:
     """Return the outcomes of each state under a policy that draws, [S, J]."""
     if ((joint > 0).sum(axis=1) == 1).all():
         return _chosen(mdp, joint.argmax(axis=1).astype(np.int32), learners)
     return _merged(mdp, joint[..., None] * mdp.probability, learners)
 
 
-def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chosen:
+def _merged(mdp: Mdp, probability: Floats, learners: int) -> _Chosen:
     """Return the outcomes of each state under a policy that draws, [S, J, K] as [S, K'].
 
     Outcomes that lead to the same state are merged, with the mean of their rewards: of 36 joint actions of
@@ -227,9 +224,7 @@ def _merged(mdp: Mdp, probability: NDArray[np.float64], learners: int) -> _Chose
     )
 
 
-def _deterministic(
-    chosen: _Chosen, starts: NDArray[np.int64], weights: NDArray[np.float64], limit: int, discount: float
-) -> _AtStarts:
+def _deterministic(chosen: _Chosen, starts: Ints, weights: Floats, limit: int, discount: float) -> _AtStarts:
     chain = _chain(chosen)
     paths = kernel.find_paths(chain)
     lengths, returns, counts = kernel.play_all(chain, paths, starts, limit)
@@ -243,9 +238,7 @@ def _deterministic(
     )
 
 
-def _stochastic(
-    chosen: _Chosen, starts: NDArray[np.int64], weights: NDArray[np.float64], limit: int, discount: float
-) -> _AtStarts:
+def _stochastic(chosen: _Chosen, starts: Ints, weights: Floats, limit: int, discount: float) -> _AtStarts:
     p = chosen.probability
     gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), _expected_rewards(chosen)])
     chances, totals = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
@@ -265,7 +258,7 @@ def _chain(chosen: _Chosen) -> Chain:
     )
 
 
-def _chain_values(chain: Chain, paths: Paths, discount: float) -> NDArray[np.float64]:
+def _chain_values(chain: Chain, paths: Paths, discount: float) -> Floats:
     """Return the discounted values of a chain, [S, L]; nan for a discount of 1."""
     values = np.full_like(chain.rewards, np.nan)
     if discount < 1:
@@ -275,7 +268,7 @@ def _chain_values(chain: Chain, paths: Paths, discount: float) -> NDArray[np.flo
     return values
 
 
-def _stochastic_values(chosen: _Chosen, discount: float) -> NDArray[np.float64]:
+def _stochastic_values(chosen: _Chosen, discount: float) -> Floats:
     """Return the discounted values of outcomes by chance, [S, L]; nan for a discount of 1."""
     rewards = _expected_rewards(chosen)
     values = np.full_like(rewards, np.nan)
@@ -286,11 +279,11 @@ def _stochastic_values(chosen: _Chosen, discount: float) -> NDArray[np.float64]:
     return values
 
 
-def _expected_rewards(chosen: _Chosen) -> NDArray[np.float64]:
+def _expected_rewards(chosen: _Chosen) -> Floats:
     return np.asarray((chosen.probability[..., None] * chosen.rewards).sum(axis=1))
 
 
-def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64]) -> tuple[Cycle, ...]:
+def _cycles(paths: Paths, starts: Ints, weights: Floats) -> tuple[Cycle, ...]:
     """Return the cycles that start states lead into."""
     stuck = paths.cycle[starts]
     shares = np.bincount(stuck[stuck >= 0], weights[stuck >= 0], minlength=len(paths.offsets) - 1)
@@ -304,16 +297,16 @@ def _cycles(paths: Paths, starts: NDArray[np.int64], weights: NDArray[np.float64
     return tuple(sorted(cycles, key=lambda cycle: (-cycle.percent, cycle.states)))
 
 
-def start_mean(mdp: Mdp, values: NDArray[np.float64]) -> float:
+def start_mean(mdp: Mdp, values: Floats) -> float:
     """Return the mean of values [S] over the states that an episode starts in."""
     return _mean(values, mdp.start)
 
 
-def _mean(values: NDArray[np.float64] | NDArray[np.bool_], weights: NDArray[np.float64]) -> float:
+def _mean(values: Floats | Flags, weights: Floats) -> float:
     """Return the weighted mean, correctly rounded sums: 100 % is 100."""
     return math.fsum((values * weights).tolist()) / math.fsum(weights.tolist())
 
 
-def _means(columns: NDArray[np.float64], weights: NDArray[np.float64]) -> tuple[float, ...]:
+def _means(columns: Floats, weights: Floats) -> tuple[float, ...]:
     """Return the weighted mean of each column of [N, C]."""
     return tuple(_mean(column, weights) for column in columns.T)

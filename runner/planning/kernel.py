@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.learning.numba_cache import leave_out_scipy
+from runner.util.arrays import Flags, Floats, Ints
 
 leave_out_scipy()
 
@@ -16,38 +17,38 @@ leave_out_scipy()
 class Chain(NamedTuple):
     """The steps of a deterministic policy in a deterministic environment, one for each state, [S] each."""
 
-    next_state: NDArray[np.int64]
-    rewards: NDArray[np.float64]
+    next_state: Ints
+    rewards: Floats
     """[S, L]."""
-    terminated: NDArray[np.bool_]
-    success: NDArray[np.bool_]
+    terminated: Flags
+    success: Flags
     """Whether the step is a success."""
-    penalty: NDArray[np.bool_]
+    penalty: Flags
 
 
 class Paths(NamedTuple):
     """The path from every state of a chain."""
 
-    length: NDArray[np.int64]
+    length: Ints
     """[S]: steps to the end of the episode; 0 where there is none."""
-    cycle: NDArray[np.int64]
+    cycle: Ints
     """[S]: number of the cycle that the path enters; -1 where the episode ends."""
-    away: NDArray[np.int64]
+    away: Ints
     """[S]: steps until the cycle; 0 for its members."""
-    entry: NDArray[np.int64]
+    entry: Ints
     """[S]: index in `members` of the state by which the path enters its cycle."""
-    members: NDArray[np.int64]
+    members: Ints
     """States of all cycles, cycle by cycle, in the order they are visited."""
-    offsets: NDArray[np.int64]
+    offsets: Ints
     """[cycles + 1]: index in `members` at which each cycle begins."""
 
 
 @numba.njit(cache=True, nogil=True)
 def iterate_values(
     next_state: NDArray[np.int32],
-    weight: NDArray[np.float64],
-    reward: NDArray[np.float64],
-    values: NDArray[np.float64],
+    weight: Floats,
+    reward: Floats,
+    values: Floats,
     tolerance: float,
 ) -> int:
     """Improve `values` in place, state by state, until no sweep changes one by more than the tolerance.
@@ -134,9 +135,7 @@ def find_paths(chain: Chain) -> Paths:
 
 
 @numba.njit(cache=True, nogil=True)
-def walk(
-    chain: Chain, state: int, steps: int, returns: NDArray[np.float64], counts: NDArray[np.int64], times: int
-) -> int:
+def walk(chain: Chain, state: int, steps: int, returns: Floats, counts: Ints, times: int) -> int:
     """Add up rewards and counts of some steps from a state, `times` over; return the state after them.
 
     Args:
@@ -157,9 +156,7 @@ def walk(
 
 
 @numba.njit(cache=True, nogil=True)
-def play_all(
-    chain: Chain, paths: Paths, starts: NDArray[np.int64], limit: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+def play_all(chain: Chain, paths: Paths, starts: Ints, limit: int) -> tuple[Ints, Floats, Ints]:
     """Return length [N], returns [N, L] and counts [N, (successes, penalties)] of an episode from each start.
 
     An episode is truncated after `limit` steps. One round of a cycle counts for every further round.
@@ -188,12 +185,12 @@ def play_all(
 @numba.njit(cache=True, nogil=True)
 def expect(
     next_state: NDArray[np.int32],
-    probability: NDArray[np.float64],
-    terminated: NDArray[np.bool_],
-    success: NDArray[np.bool_],
-    gains: NDArray[np.float64],
+    probability: Floats,
+    terminated: Flags,
+    success: Flags,
+    gains: Floats,
     limit: int,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Return the probabilities of success and termination [S, 2], and expected sums [S, G], of an episode.
 
     Args:
@@ -226,9 +223,9 @@ def expect(
 @numba.njit(cache=True, nogil=True)
 def discounted(
     next_state: NDArray[np.int32],
-    weight: NDArray[np.float64],
-    rewards: NDArray[np.float64],
-    values: NDArray[np.float64],
+    weight: Floats,
+    rewards: Floats,
+    values: Floats,
     tolerance: float,
 ) -> None:
     """Improve the values [S, L] of a policy in place until no sweep changes one by more than the tolerance.
@@ -257,9 +254,7 @@ def discounted(
 
 
 @numba.njit(cache=True, nogil=True)
-def discounted_paths(
-    chain: Chain, paths: Paths, order: NDArray[np.int64], discount: float, values: NDArray[np.float64]
-) -> None:
+def discounted_paths(chain: Chain, paths: Paths, order: Ints, discount: float, values: Floats) -> None:
     """Fill the discounted values [S, L] of a chain: cycles in closed form, the rest backwards.
 
     Args:

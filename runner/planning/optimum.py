@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
-from runner.util.arrays import Scalar
+from runner.util.arrays import Floats, Scalar
 
 TOLERANCE: Final = 1e-10
 """How far a value may be from the true one."""
 
 
-def optimal_values(mdp: Mdp, discount: float) -> NDArray[np.float64]:
+def optimal_values(mdp: Mdp, discount: float) -> Floats:
     """Return what all agents together can get at most from each state, [S], to within 1e-10.
 
     Value iteration, in place: Sutton and Barto, Reinforcement Learning, 2nd edition, section 4.4. The
@@ -28,7 +28,7 @@ def optimal_values(mdp: Mdp, discount: float) -> NDArray[np.float64]:
     return _iterated(mdp.next_state, weight, reward, discount)
 
 
-def greedy_policy(mdp: Mdp, discount: float, values: NDArray[np.float64]) -> NDArray[np.int32]:
+def greedy_policy(mdp: Mdp, discount: float, values: Floats) -> NDArray[np.int32]:
     """Return the joint action that leads to the most of these values, [S]; the first of equals.
 
     Values that differ by rounding only count as equal.
@@ -41,7 +41,7 @@ def greedy_policy(mdp: Mdp, discount: float, values: NDArray[np.float64]) -> NDA
 
 def best_response(
     mdp: Mdp, policy: NDArray[np.int32], learner: int, learners: int, discount: float
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return what one learner can get at most from each state while all others keep to a policy, [S].
 
     Args:
@@ -60,8 +60,8 @@ def best_response(
 
 
 def best_response_to_stochastic(
-    mdp: Mdp, policies: Sequence[NDArray[np.float64]], learner: int, discount: float
-) -> NDArray[np.float64]:
+    mdp: Mdp, policies: Sequence[Floats], learner: int, discount: float
+) -> Floats:
     """Return what one learner can get at most from each state while all others draw from their policies, [S].
 
     Args:
@@ -77,7 +77,7 @@ def best_response_to_stochastic(
         parts = np.moveaxis(array.reshape(states, *widths, outcomes), 1 + learner, 1)
         return parts.reshape(states, widths[learner], -1)
 
-    others: NDArray[np.float64] = np.ones((states, 1))
+    others: Floats = np.ones((states, 1))
     for number, policy in enumerate(policies):
         if number != learner:
             others = (others[:, :, None] * policy[:, None, :]).reshape(states, -1)
@@ -105,15 +105,13 @@ def sweep_tolerance(discount: float) -> float:
     return TOLERANCE * (1 - discount) / max(discount, 0.5)
 
 
-def _weight(mdp: Mdp, discount: float) -> NDArray[np.float64]:
+def _weight(mdp: Mdp, discount: float) -> Floats:
     """Return the discounted probability [S, J, K] that an outcome comes and the episode goes on."""
     require_discount(discount)
     return np.asarray(discount * mdp.probability * ~mdp.terminated)
 
 
-def _iterated(
-    next_state: NDArray[np.int32], weight: NDArray[np.float64], reward: NDArray[np.float64], discount: float
-) -> NDArray[np.float64]:
+def _iterated(next_state: NDArray[np.int32], weight: Floats, reward: Floats, discount: float) -> Floats:
     values = np.zeros(len(next_state))
     kernel.iterate_values(
         np.ascontiguousarray(next_state),

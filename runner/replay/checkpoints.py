@@ -19,10 +19,10 @@ from typing import Final
 import numpy as np
 import zstandard
 from blake3 import blake3
-from numpy.typing import NDArray
 
 import runner.learning
 from runner.recording.reader import Recording
+from runner.util.arrays import Floats
 from runner.util.files import TABLES, cache_folder, replacing
 
 CHECKPOINT_STEPS: Final = 1 << 20
@@ -44,7 +44,7 @@ class Checkpoints:
         self._prefix = f"{run_id}-{_key(recording)}" if recording.file.finished else ""
         self._saved = False
 
-    def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[NDArray[np.float64]]]:
+    def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[Floats]]:
         """Return the last checkpoint at or before a step, and its tables; step -1 if there is none.
 
         Args:
@@ -56,7 +56,7 @@ class Checkpoints:
                 return at, tables
         return -1, []
 
-    def save(self, step: int, tables: Sequence[NDArray[np.float64]]) -> None:
+    def save(self, step: int, tables: Sequence[Floats]) -> None:
         """Save the tables at a step, unless they are there."""
         path = self._path(step)
         if not self._prefix or path.exists():
@@ -89,7 +89,7 @@ class Checkpoints:
         steps = [name.removeprefix(self._prefix).removesuffix(".zst") for name in names]
         return [int(step) for step in steps if step.isdecimal()]
 
-    def _load(self, step: int, shapes: Sequence[tuple[int, ...]]) -> list[NDArray[np.float64]] | None:
+    def _load(self, step: int, shapes: Sequence[tuple[int, ...]]) -> list[Floats] | None:
         """Return the tables of a checkpoint; None if it is damaged, and then it is removed."""
         path, sizes = self._path(step), [math.prod(shape) for shape in shapes]
         try:

@@ -10,7 +10,6 @@ from itertools import dropwhile
 from typing import Any, Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.games import as_parallel, is_game
 from runner.errors import CannotRedo, shortened
@@ -34,9 +33,10 @@ from runner.replay.stepping import (
     VectorStepper,
 )
 from runner.replay.trust import require_plain, trusting
-from runner.util.arrays import Array, Ints
+from runner.util.arrays import Array, Ints, Records
 from runner.util.differences import first_difference, first_differing_row
 from runner.util.jsonable import as_json
+from runner.util.processes import Report
 
 BLOCK_SECONDS: Final = 0.2
 """Blocks of steps take about this long, so that progress and a hanging environment can be seen."""
@@ -50,10 +50,9 @@ _MAX_PICTURE_BYTES: Final = 8 << 20
 
 ALL: Final = -1
 """The number that stands for all environments of a vector."""
-Report = Callable[[int], None]
 _MAX_TEXT: Final = 200
 _Key = tuple[str, int]
-_Steps = tuple[NDArray[np.void], list[PlacedReset]]
+_Steps = tuple[Records, list[PlacedReset]]
 
 
 @dataclass(frozen=True)
@@ -92,9 +91,9 @@ class RerunSteps:
     phase: str
     environment: int
     """Which environment of a vector; 0 for a single one."""
-    recorded: NDArray[np.void]
+    recorded: Records
     """The recorded steps, as `Steps.rows` yields them; each environment of a vector counts its episodes."""
-    got: NDArray[np.void]
+    got: Records
     """What the environment returned: the fields `next_state` or `next_observation`, `rewards`, `terminated`,
     `truncated`, and of games `agents_terminated` and `agents_truncated`, each as in a recording."""
     starts: Sequence[Start] = ()
@@ -342,9 +341,7 @@ def _are_separate(recording: Recording) -> bool:
     return False
 
 
-def _of_environment(
-    rows: NDArray[np.void], places: Sequence[int], environment: int
-) -> tuple[Ints, list[int]]:
+def _of_environment(rows: Records, places: Sequence[int], environment: int) -> tuple[Ints, list[int]]:
     """Return which of the rows of all environments are steps that one took, and places among these.
 
     Args:
@@ -395,9 +392,7 @@ class RerunComparison:
         frames = returned.frames[:done]
         return RerunSteps(phase, environment, rows[:done], got[:done], starts, frames, difference)
 
-    def _first_row(
-        self, phase: str, environment: int, rows: NDArray[np.void], got: NDArray[np.void]
-    ) -> tuple[int, str] | None:
+    def _first_row(self, phase: str, environment: int, rows: Records, got: Records) -> tuple[int, str] | None:
         """Return the first row that differs, and its first field that does; None if none does."""
         names = [name for name in got.dtype.names or () if name in (rows.dtype.names or ())]
         first = first_difference(rows, got, names, self._tolerance)
@@ -413,9 +408,7 @@ class RerunComparison:
             values[0, k], values[1, k] = start.reset.observation, start.got
         return first_differing_row(values[0], values[1], self._tolerance)
 
-    def _first_digest(
-        self, phase: str, environment: int, rows: NDArray[np.void], got: NDArray[np.void]
-    ) -> int | None:
+    def _first_digest(self, phase: str, environment: int, rows: Records, got: Records) -> int | None:
         """Return the first row at which the episode so far has another digest than was recorded."""
         if not len(rows) or "digest" not in (rows.dtype.names or ()):
             return None

@@ -29,11 +29,11 @@ from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
-from runner.replay.engine import ALL, Replay, Report, RerunSteps, environments_of
+from runner.replay.engine import ALL, Replay, RerunSteps, environments_of
 from runner.replay.makers import why_not_rerun
 from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
 from runner.replay.stepping import Stepper
-from runner.util.processes import CallFailed, ChildProcess, TimedOut, report_progress
+from runner.util.processes import CallFailed, ChildProcess, Report, TimedOut, report_progress
 
 MEMORY_BYTES: Final = 4 * 10**9
 """How much a child process may allocate; importing RLlib, which wraps many games, takes 2.1 GB of it."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from runner.learning.watching import Watch
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
+from runner.util.arrays import Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,11 +20,11 @@ class StateHistory:
     An entry beyond a learner's own actions has no meaning.
     """
 
-    visits: NDArray[np.int64]
+    visits: Ints
     """How often the learner took the action there."""
-    changed_step: NDArray[np.int64]
+    changed_step: Ints
     """The step that last changed the value; -1 for never. An update by nothing changes nothing."""
-    changed_episode: NDArray[np.int64]
+    changed_episode: Ints
     """The episode of that step."""
 
 
@@ -69,7 +70,7 @@ def _watch_of(replay: TableReplay, state: int) -> Watch:
     )
 
 
-def _count(visits: NDArray[np.int64], actions: NDArray[np.int32]) -> None:
+def _count(visits: Ints, actions: NDArray[np.int32]) -> None:
     """Count each learner's own `actions`, [visits, learners]."""
     for i in range(len(visits)):
         visits[i] += np.bincount(actions[:, i], minlength=visits.shape[1])

@@ -10,7 +10,6 @@ from itertools import groupby, pairwise
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import RecordingError, shortened
 from runner.recording.description import environment_count
@@ -21,6 +20,7 @@ from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.spaces import Value, decode
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
+from runner.util.arrays import Records
 from runner.util.jsonable import as_json
 
 _BLOCK_BYTES: Final = 16 << 20
@@ -97,7 +97,7 @@ class Piece:
     phase: str
     first: int
     """The number of its first step."""
-    rows: NDArray[np.void]
+    rows: Records
     """The records, [steps of each environment * environments]; values of varying size are objects."""
     resets: Sequence[RecordedReset]
     """In order; in a piece with steps, each comes before one of the steps."""
@@ -250,16 +250,14 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
     yield from _without_steps(phase, resets if waiting is None else [waiting, *resets], nothing)
 
 
-def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: NDArray[np.void]) -> Iterator[Piece]:
+def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: Records) -> Iterator[Piece]:
     """Yield resets that no step of their phase follows at once, the resets of one time together."""
     for time, group in groupby(resets, key=lambda reset: reset.time):
         here = list(group)
         yield Piece(phase, here[0].step, nothing, here, time)
 
 
-def _blocks(
-    recording: Recording, phase: str, start_time: int, stop_time: int | None
-) -> Iterator[NDArray[np.void]]:
+def _blocks(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Records]:
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
     table, stop = recording.phase(phase).steps, FOREVER if stop_time is None else stop_time + 1
     # A block of actions alone may have more steps than fit into memory when they are whole.

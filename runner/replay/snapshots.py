@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning.learner import name_tables
 from runner.replay.step_replay import StepReplay
+from runner.util.arrays import Floats, Records
 
 S = TypeVar("S")
 
@@ -37,7 +37,7 @@ class DerivedTables(Generic[S]):
         self._known = True
         """Whether the tables are the run's own: no step is missing since it began or they were given."""
 
-    def take(self, steps: NDArray[np.void]) -> None:
+    def take(self, steps: Records) -> None:
         """Take the next training steps."""
         while self._next is not None and self._next[0] <= int(steps["step"][-1]):
             before = int(np.searchsorted(steps["step"], self._next[0]))
@@ -51,13 +51,13 @@ class DerivedTables(Generic[S]):
         while self._next is not None:
             self._visit_next()
 
-    def at(self, step: int, table: int) -> NDArray[np.float64] | None:
+    def at(self, step: int, table: int) -> Floats | None:
         """Return a table after `step` training steps, a view; None if the steps do not determine it."""
         tables = self._replay.snapshot()
         is_here = self._known and step == self._replay.step and 0 <= table < len(tables)
         return tables[table] if is_here else None
 
-    def give(self, step: int, table: int, values: NDArray[np.float64]) -> None:
+    def give(self, step: int, table: int, values: Floats) -> None:
         """Set a table to its recorded values; once all tables of a step are set, they are known again."""
         replay = self._replay
         tables = replay.snapshot()
@@ -71,7 +71,7 @@ class DerivedTables(Generic[S]):
         tables[table] = values
         replay.rewind(step, name_tables(tables, replay.kinds))
 
-    def _apply(self, steps: NDArray[np.void]) -> None:
+    def _apply(self, steps: Records) -> None:
         if not len(steps):
             return
         first, last = int(steps["step"][0]), int(steps["step"][-1])

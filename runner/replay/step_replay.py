@@ -19,7 +19,7 @@ from runner.learning import kernel
 from runner.learning.learner import Learner, NamedTables
 from runner.learning.ledger import UPDATE
 from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Floats, Ints, Records
 
 NO_ROWS: Final = np.empty((0, 0, 0))
 NO_UPDATES: Final = np.empty(0, UPDATE)
@@ -28,7 +28,7 @@ NO_UPDATES: Final = np.empty(0, UPDATE)
 class StateProbe(NamedTuple):
     """Values and greedy actions of some states, read before some of the steps of a block."""
 
-    before: NDArray[np.int64]
+    before: Ints
     """[k]: rows of the block, ascending."""
     states: NDArray[np.int32]
     """[k, n]: the states that are read before each of these rows; -1 for none."""
@@ -46,7 +46,7 @@ class StateProbe(NamedTuple):
 class Trace(NamedTuple):
     """What decides the weights of one learner's updates, see `learning.ledger`."""
 
-    updates: NDArray[np.void]
+    updates: Records
     """[steps] of `UPDATE`: filled."""
     learner: int
 
@@ -83,7 +83,7 @@ class StepReplay:
         return self._learner.kinds
 
     @property
-    def tables(self) -> list[NDArray[np.float64]]:
+    def tables(self) -> list[Floats]:
         """The Q-tables at `step`, [states, actions] per learner: views that `apply` changes."""
         return [self._learner.table(i) for i in range(len(self.agents))]
 
@@ -102,7 +102,7 @@ class StepReplay:
         """The greedy actions at `step`, [learners, states]: the lowest of the best ones."""
         return self._learner.tables.greedy
 
-    def snapshot(self) -> list[NDArray[np.float64]]:
+    def snapshot(self) -> list[Floats]:
         """Return all tables in the order of a snapshot, the tables of a kind together: views."""
         return self._learner.snapshot()
 
@@ -111,15 +111,15 @@ class StepReplay:
         self._learner.set_tables(tables)
         self.step = step
 
-    def empty_rows(self, count: int) -> NDArray[np.float64]:
+    def empty_rows(self, count: int) -> Floats:
         """Return an array for the values seen in `count` steps: nan, [count, learners, most actions]."""
         widths = self._learner.model.width
         return np.full((count, len(widths), max(widths)), np.nan)
 
     def apply(
         self,
-        steps: NDArray[np.void],
-        rows: NDArray[np.float64] = NO_ROWS,
+        steps: Records,
+        rows: Floats = NO_ROWS,
         probe: StateProbe | None = None,
         trace: Trace | None = None,
     ) -> None:
@@ -149,7 +149,7 @@ class StepReplay:
         begin(self._learner.model, self._learner.tables, watch, changes)
         return changes
 
-    def watch(self, steps: NDArray[np.void], watch: Watch) -> WatchedValues:
+    def watch(self, steps: Records, watch: Watch) -> WatchedValues:
         """Apply updates as `apply` does, and return the watched values after each that could change them.
 
         Args:
@@ -163,7 +163,7 @@ class StepReplay:
             parts.append((changes, filled))
         return joined(parts)
 
-    def _segments(self, steps: NDArray[np.void]) -> Iterator[tuple[tuple[Any, ...], slice]]:
+    def _segments(self, steps: Records) -> Iterator[tuple[tuple[Any, ...], slice]]:
         """Yield the kernel's arguments for the parts of a block in order, and move forward after each."""
         if not len(steps):
             return
@@ -190,7 +190,7 @@ class StepReplay:
             self._remembered = self.step
             at = stop
 
-    def recall(self, blocks: Iterable[NDArray[np.void]], first: int) -> None:
+    def recall(self, blocks: Iterable[Records], first: int) -> None:
         """Remember the training steps of the current episode before `step`, of which `first` is the first.
 
         The tables stay as they are.
@@ -210,7 +210,7 @@ class StepReplay:
             "episode went on learning; the Q-tables are known again from the next snapshot after it."
         )
 
-    def values_in(self, states: Array) -> NDArray[np.float64]:
+    def values_in(self, states: Array) -> Floats:
         """Return each learner's values in these states now, [states, learners, most actions]."""
         rows = self.empty_rows(len(states))
         for i, table in enumerate(self.tables):

@@ -25,7 +25,7 @@ from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
 from runner.recording.turns import is_taken
 from runner.replay.recorded import RecordedReset, calls
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Records
 from runner.util.extras import missing
 from runner.util.processes import raise_if_out_of_memory
 
@@ -56,11 +56,11 @@ class Start(NamedTuple):
 class Returned:
     """What an environment returned for recorded actions and resets, until it raised an error."""
 
-    rows: NDArray[np.void]
+    rows: Records
     """The recorded steps."""
     resets: Sequence[PlacedReset]
     """In order; each comes before its row."""
-    got: NDArray[np.void]
+    got: Records
     """Records with the fields of steps that come from the environment."""
     starts: list[Start] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
@@ -105,7 +105,7 @@ class Stepper:
         self._dtype = np.dtype([(self._after, steps[self._after]), *ends, *masks])
         self._first_dtype = resets["observation"]
 
-    def run(self, rows: NDArray[np.void], resets: Sequence[PlacedReset]) -> Returned:
+    def run(self, rows: Records, resets: Sequence[PlacedReset]) -> Returned:
         """Take recorded actions, until the environment raises an error.
 
         Args:
@@ -183,7 +183,7 @@ class Stepper:
         """Return the spaces of observation and action."""
         return self.env.observation_space, self.env.action_space
 
-    def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
+    def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:  # noqa: ARG002
         """Return a function that puts down steps.
 
         Args:
@@ -205,7 +205,7 @@ class Stepper:
 
         return fill
 
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
+    def actions(self, rows: Records) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
         column = rows["action"]
         if column.dtype.hasobject:
@@ -287,7 +287,7 @@ class GameStepper(Stepper):
             )
         return game_spaces(self.env)
 
-    def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:
+    def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:
         put, agents = filler(self._observation, seen), self.env.possible_agents
         masks = [got[name] for name in got.dtype.names or () if name.startswith("agents_")]
 
@@ -307,7 +307,7 @@ class GameStepper(Stepper):
         agents = self.env.agents
         return {agent: action[agent] for agent in agents} if all(map(action.__contains__, agents)) else None
 
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
+    def actions(self, rows: Records) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
         agents, column = self.env.possible_agents, rows["action"]
         by_agent: Any = self.action_space
@@ -400,7 +400,7 @@ class VectorStepper(Stepper):
         is_one = is_counted or not hasattr(self.env.unwrapped, "envs")
         return arguments | {"seed": first if is_one else [seeds.get(i) for i in range(self.n)]}
 
-    def _filler(self, seen: Array, ends: NDArray[np.void], got: NDArray[np.void]) -> Fill:  # noqa: ARG002
+    def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:  # noqa: ARG002
         rows = seen.reshape(len(seen) // self.n, self.n, *seen.shape[1:])
         put, put_last = filler(self._observation, rows, (self.n,)), filler(self._observation, seen)
         columns = [ends[name].reshape(-1, self.n) for name in _ENDS]
@@ -420,7 +420,7 @@ class VectorStepper(Stepper):
 
         return fill
 
-    def actions(self, rows: NDArray[np.void]) -> Sequence[Value]:
+    def actions(self, rows: Records) -> Sequence[Value]:
         """Return the actions of all environments as the vector takes them, for each of its steps."""
         space, n, column = self.action_space, self.n, np.array(rows["action"])
         if column.dtype.hasobject:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
@@ -17,6 +16,7 @@ from runner.recording.messages import Message, frame_place
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.spaces import Value, least_number
 from runner.replay.recorded import RecordedReset, reset_of
+from runner.util.arrays import Ints, Records
 
 if TYPE_CHECKING:
     from runner.replay.engine import RerunSteps  # loads Gymnasium
@@ -54,9 +54,7 @@ def transitions_of(recording: Recording, phase: str, episode: int, first: int = 
     yield from islice(tables.transitions(episode), first, None)
 
 
-def episode_blocks(
-    recording: Recording, phase: str, episode: int, first: int = 0
-) -> Iterator[NDArray[np.void]]:
+def episode_blocks(recording: Recording, phase: str, episode: int, first: int = 0) -> Iterator[Records]:
     """Yield an episode's steps from number `first` on in blocks, where they have one size.
 
     Raises:
@@ -78,7 +76,7 @@ def episode_blocks(
         )
 
 
-def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
+def steps_of(recording: Recording, phase: str, episode: int) -> Records:
     """Return an episode's steps as one array, where they have one size.
 
     Raises:
@@ -93,7 +91,7 @@ def steps_of(recording: Recording, phase: str, episode: int) -> NDArray[np.void]
 # --- of actions alone ---------------------------------------------------------------------------------
 
 
-def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.void]:
+def whole_steps(recording: Recording, phase: str, episode: int) -> Records:
     """Return the steps of an episode as `Phase.episode_steps` does, from its recorded actions.
 
     The environment is made again in a child process with limits, from what is installed. The last episodes
@@ -113,7 +111,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> NDArray[np.vo
 
 
 @lru_cache(4)
-def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np.void]:
+def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> Records:
     from runner.replay.environment import rerun_in_child  # loads Gymnasium
 
     with open_recording(path) as recording:
@@ -131,7 +129,7 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> NDArray[np
     return whole
 
 
-def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDArray[np.void]:
+def blank_steps(recording: Recording, phase: str, rows: Records) -> Records:
     """Return whole records of recorded actions, without states, observations and rewards."""
     topic = recording.phase(phase).steps.topic
     records = np.zeros(len(rows), recording.layout.rows(topic))
@@ -141,7 +139,7 @@ def blank_steps(recording: Recording, phase: str, rows: NDArray[np.void]) -> NDA
     return records
 
 
-def whole_records(recording: Recording, steps: RerunSteps) -> NDArray[np.void]:
+def whole_records(recording: Recording, steps: RerunSteps) -> Records:
     """Return rerun steps as whole records, but for the states before them.
 
     Raises:
@@ -155,8 +153,8 @@ def whole_records(recording: Recording, steps: RerunSteps) -> NDArray[np.void]:
 
 def put_states(
     recording: Recording,
-    records: NDArray[np.void],
-    states: NDArray[np.int64],
+    records: Records,
+    states: Ints,
     resets: Iterable[tuple[int, RecordedReset]],
 ) -> None:
     """Put the state before each step into whole records, where they have states.

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.errors import NotInRecording, RecordingError
@@ -22,6 +21,7 @@ from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 from runner.replay.checkpoints import CHECKPOINT_STEPS, Checkpoints
 from runner.replay.step_replay import NO_ROWS, StepReplay, Trace
+from runner.util.arrays import Floats, Records
 
 NEAR_STEPS: Final = 200_000
 """`TableReplay.seek` replays this many steps rather than load a snapshot on the way."""
@@ -40,7 +40,7 @@ class TableReplay(StepReplay):
         self._load(*self._nearest(step))
         self.advance(step)
 
-    def rows(self, stop: int) -> NDArray[np.float64]:
+    def rows(self, stop: int) -> Floats:
         """Replay up to a step, and return the values that the learners saw on the way.
 
         Returns:
@@ -51,7 +51,7 @@ class TableReplay(StepReplay):
         self.advance(stop, rows=seen)
         return seen
 
-    def updates(self, stop: int, learner: int) -> NDArray[np.void]:
+    def updates(self, stop: int, learner: int) -> Records:
         """Replay up to a step, and return what decides the weights of a learner's updates on the way.
 
         Returns:
@@ -106,7 +106,7 @@ class TableReplay(StepReplay):
         at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
         return (at, name_tables(tables, self.kinds)) if at > nearest[0] else nearest
 
-    def advance(self, stop: int, rows: NDArray[np.float64] = NO_ROWS, trace: Trace | None = None) -> None:
+    def advance(self, stop: int, rows: Floats = NO_ROWS, trace: Trace | None = None) -> None:
         """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them.
 
         Raises:
@@ -118,7 +118,7 @@ class TableReplay(StepReplay):
             traced = None if trace is None else Trace(trace.updates[filled], trace.learner)
             self.apply(part, rows[filled], trace=traced)
 
-    def blocks(self, stop: int) -> Iterator[NDArray[np.void]]:
+    def blocks(self, stop: int) -> Iterator[Records]:
         """Yield the recorded steps from here to a later one; each block must be applied before the next.
 
         Raises:
@@ -158,7 +158,7 @@ class TableReplay(StepReplay):
         )
 
 
-def tables_at(recording: Recording, step: int) -> list[NDArray[np.float64]]:
+def tables_at(recording: Recording, step: int) -> list[Floats]:
     """Return the tables after `step` training steps, one float64 [states, actions] per learner."""
     return TableReplay(recording, step).tables
 

@@ -34,6 +34,10 @@ OWN_ONLY: Final = "DUALTAXI_OWN_ONLY"
 """The variable of a process, and of its children, that make only what their user recorded; if not empty."""
 _SAFE_PATH: Final = "PYTHONSAFEPATH"
 _HASH_SEED: Final = "PYTHONHASHSEED"
+Report = Callable[[int], None]
+"""Takes how much was done so far, such as a number of steps."""
+Stop = Callable[[], bool]
+"""Returns whether to stop."""
 Args = ParamSpec("Args")
 Result = TypeVar("Result")
 

@@ -30,10 +30,11 @@ from runner.analysis.compare.moments import (
     uneven_ends,
     window_notes,
 )
-from runner.analysis.compare.statistics import Estimate, Values
+from runner.analysis.compare.statistics import Estimate
 from runner.analysis.groups import Group
 from runner.analysis.series import full_name, points_of, title_of
 from runner.errors import RunnerError
+from runner.util.arrays import Floats
 
 THRESHOLDS: Final = 101
 
@@ -232,7 +233,7 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     )
 
 
-def _group(label: str, values: Measured, thresholds: Values, sign: float) -> GroupResult:
+def _group(label: str, values: Measured, thresholds: Floats, sign: float) -> GroupResult:
     numbers = np.array(list(values.by_seed.values()))
     share, low, high = (
         column.tolist() for column in statistics.share_at_least(sign * numbers, sign * thresholds)

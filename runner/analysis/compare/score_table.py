@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from runner.analysis.compare.statistics import Values
 from runner.errors import RunnerError
+from runner.util.arrays import Floats
 
 MIN_MAX: Final = "minmax"
 """Stands for a normalisation by the worst and the best value of each environment."""
@@ -26,7 +26,7 @@ class Bounds:
     zero: float
     one: float
 
-    def score(self, values: Values) -> Values:
+    def score(self, values: Floats) -> Floats:
         """Return the normalised scores of values."""
         return (values - self.zero) / (self.one - self.zero)
 

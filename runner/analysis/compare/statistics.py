@@ -18,11 +18,9 @@ from types import ModuleType
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from runner.util.arrays import Floats
 from runner.util.extras import require
-
-Values = NDArray[np.float64]
 
 CONFIDENCE: Final = 0.95
 RESAMPLES: Final = 10_000
@@ -62,12 +60,12 @@ def require_scipy() -> ModuleType:
     return stats
 
 
-def median(values: Values) -> float:
+def median(values: Floats) -> float:
     """Return the median."""
     return bounded(float(np.median(values)))
 
 
-def interquartile_mean(values: Values) -> Estimate:
+def interquartile_mean(values: Floats) -> Estimate:
     """Return the mean of the middle half of the values, and its interval; nan for fewer than four."""
     if len(values) < FEWEST_FOR_IQM:
         return Estimate()
@@ -75,7 +73,7 @@ def interquartile_mean(values: Values) -> Estimate:
     return Estimate(bounded(float(iqm(values, -1))), bounded(float(low)), bounded(float(high)))
 
 
-def iqm_band(values: Values) -> tuple[Values, Values, Values]:
+def iqm_band(values: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the IQM of runs at each position of a curve, and its interval: (IQM, low, high).
 
     The values are float64 [runs, positions], NaN where a run has none; each position has at least one. Where
@@ -101,7 +99,7 @@ def iqm_band(values: Values) -> tuple[Values, Values, Values]:
 
 
 @lru_cache(maxsize=64)
-def _weights(n: int, resamples: int, cut: int = 0) -> Values:
+def _weights(n: int, resamples: int, cut: int = 0) -> Floats:
     """Return the weight of each of n sorted values in the mean of each resample, [resamples, n].
 
     The mean leaves out the `cut` lowest and the `cut` highest values of the resample.
@@ -116,8 +114,8 @@ def _weights(n: int, resamples: int, cut: int = 0) -> Values:
 
 
 def stratified(
-    strata: Sequence[Values], statistic: Callable[[Sequence[Values]], Values], cells: int = 0
-) -> tuple[Values, Values, Values]:
+    strata: Sequence[Floats], statistic: Callable[[Sequence[Floats]], Floats], cells: int = 0
+) -> tuple[Floats, Floats, Floats]:
     """Return a statistic of several samples and its percentile bootstrap interval: (value, low, high).
 
     Each sample, float64 [n, columns] with equal columns, is resampled by itself; the interval is nan if no
@@ -131,7 +129,7 @@ def stratified(
     resamples = RESAMPLES if columns == 1 else _BAND_RESAMPLES
     batch = max(1, _BATCH // max(cells, sum(map(len, strata))))
     rng = np.random.default_rng(_SEED)
-    drawn: list[list[Values]] = [[] for _ in range(columns)]
+    drawn: list[list[Floats]] = [[] for _ in range(columns)]
     for start in range(0, resamples, batch):
         size = min(batch, resamples - start)
         rows = [rng.integers(len(sample), size=(len(sample), size)) for sample in strata]
@@ -142,7 +140,7 @@ def stratified(
     return value, ends[0], ends[1]
 
 
-def bootstrap_means(values: Values) -> list[Estimate]:
+def bootstrap_means(values: Floats) -> list[Estimate]:
     """Return the mean of each row, and its percentile bootstrap interval; all rows are resampled alike.
 
     The values are of the same seeds in each row, [rows, seeds]; of one seed the interval is nan.
@@ -156,7 +154,7 @@ def bootstrap_means(values: Values) -> list[Estimate]:
     return [Estimate(*row) for row in rows]
 
 
-def bootstrap_ratio(numerator: Values, denominator: Values) -> Estimate:
+def bootstrap_ratio(numerator: Floats, denominator: Floats) -> Estimate:
     """Return the ratio of two means over the same seeds, [seeds], and its percentile bootstrap interval."""
     n, value = len(numerator), float(numerator.mean() / denominator.mean()) if denominator.any() else np.nan
     if n < 2 or np.isnan(value):
@@ -168,7 +166,7 @@ def bootstrap_ratio(numerator: Values, denominator: Values) -> Estimate:
     return Estimate(value, float(low), float(high))
 
 
-def improvement(a: Values, b: Values) -> Estimate:
+def improvement(a: Floats, b: Floats) -> Estimate:
     """Return the probability that a run of A has a higher value than one of B; equal ones count half.
 
     The interval is the score interval of R. G. Newcombe, "Confidence intervals for an effect size measure
@@ -205,7 +203,7 @@ def simultaneous(samples: Sequence[Sequence[float]]) -> list[Estimate]:
     return estimates
 
 
-def _standard_error(values: Values) -> float:
+def _standard_error(values: Floats) -> float:
     """Return the standard error of the IQM, from the winsorized variance."""
     n = len(values)
     cut = n // 4
@@ -215,7 +213,7 @@ def _standard_error(values: Values) -> float:
     return float(winsorized.std(ddof=1) * np.sqrt((n - 1) / (left * (left - 1))))
 
 
-def share_at_least(values: Values, thresholds: Values) -> tuple[Values, Values, Values]:
+def share_at_least(values: Floats, thresholds: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the share of values that are at least each threshold, and its interval: (share, low, high)."""
     above = (values >= thresholds[:, np.newaxis]).astype(np.float64)
     share = above.mean(axis=1)
@@ -229,9 +227,9 @@ def bounded(value: float) -> float:
     return float(np.copysign(np.inf, value)) if abs(value) > NEVER / 1e6 else value
 
 
-def iqm(values: Values, axis: int) -> Values:
+def iqm(values: Floats, axis: int) -> Floats:
     """Return the interquartile mean along an axis."""
-    trimmed: Values = require_scipy().trim_mean(values, 0.25, axis=axis)
+    trimmed: Floats = require_scipy().trim_mean(values, 0.25, axis=axis)
     return trimmed
 
 
@@ -254,7 +252,7 @@ def _highest_probability(value: float, m: int, n: int) -> float:
     return float(brentq(contradiction, start, 1.0)) if contradiction(start) < 0 else 1.0
 
 
-def _interval(values: Values, statistic: Callable[..., Values]) -> tuple[Values, Values]:
+def _interval(values: Floats, statistic: Callable[..., Floats]) -> tuple[Floats, Floats]:
     """Return the percentile bootstrap interval of a statistic over the last axis."""
     result = require_scipy().bootstrap(
         (values,),

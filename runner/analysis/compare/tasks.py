@@ -28,10 +28,11 @@ from runner.analysis.compare.moments import (
     uneven_ends,
 )
 from runner.analysis.compare.score_table import MIN_MAX, Bounds
-from runner.analysis.compare.statistics import Estimate, Values
+from runner.analysis.compare.statistics import Estimate
 from runner.analysis.groups import Group, grouped, metrics_of
 from runner.analysis.series import RunSeries, full_name, points_of, title_of
 from runner.errors import RunnerError
+from runner.util.arrays import Floats
 from runner.util.humanize import listed
 
 POINTS: Final = 101
@@ -187,7 +188,7 @@ def compare_tasks(
 
 def _values(
     group: Group, metric: tuple[str, str], moment: Moment, groups: Sequence[Group], notes: list[str]
-) -> Iterator[tuple[str, Values]]:
+) -> Iterator[tuple[str, Floats]]:
     """Yield each environment of a group with the values of its seeds, in the order of the seeds."""
     for task in dict.fromkeys(run.environment for run in group.runs):
         in_task = replace(group, label=f"{group.label} in {task}", runs=tuple(_runs([group], [task])))
@@ -195,7 +196,7 @@ def _values(
             yield task, np.array(list(by_seed.values()))
 
 
-def _common_tasks(by_label: Mapping[str, Mapping[str, Values]], notes: list[str]) -> list[str]:
+def _common_tasks(by_label: Mapping[str, Mapping[str, Floats]], notes: list[str]) -> list[str]:
     """Return the environments in which all groups have values; `notes` gets the others."""
     all_tasks = list(dict.fromkeys(task for by_task in by_label.values() for task in by_task))
     tasks = [task for task in all_tasks if all(task in by_task for by_task in by_label.values())]
@@ -214,7 +215,7 @@ def _common_tasks(by_label: Mapping[str, Mapping[str, Values]], notes: list[str]
 
 def _bounds(
     tasks: Sequence[str],
-    by_label: Mapping[str, Mapping[str, Values]],
+    by_label: Mapping[str, Mapping[str, Floats]],
     table: Mapping[str, Bounds] | None,
     lower_is_better: bool,
     notes: list[str],
@@ -263,7 +264,7 @@ def _seed_notes(results: Sequence[AlgorithmResult]) -> Iterator[str]:
 
 
 def _result(
-    label: str, scores: Mapping[str, Values], thresholds: Values, curves: Sequence[Values]
+    label: str, scores: Mapping[str, Floats], thresholds: Floats, curves: Sequence[Floats]
 ) -> AlgorithmResult:
     """Return the statistics of an algorithm; `curves` has [seeds, positions] for each environment."""
     strata = [values[:, np.newaxis] for values in scores.values()]
@@ -290,21 +291,21 @@ def _result(
     )
 
 
-def _iqm(drawn: Sequence[Values]) -> Values:
+def _iqm(drawn: Sequence[Floats]) -> Floats:
     return statistics.iqm(np.concatenate(drawn), 0)
 
 
 def _estimate(
-    strata: Sequence[Values], statistic: Callable[[Sequence[Values]], Values], cells: int = 0
+    strata: Sequence[Floats], statistic: Callable[[Sequence[Floats]], Floats], cells: int = 0
 ) -> Estimate:
     value, low, high = statistics.stratified(strata, statistic, cells)
     return Estimate(float(value[0]), float(low[0]), float(high[0]))
 
 
-def _improvement(a: Mapping[str, Values], b: Mapping[str, Values]) -> Estimate:
+def _improvement(a: Mapping[str, Floats], b: Mapping[str, Floats]) -> Estimate:
     """Return the mean over environments of the probability that a run of A scores higher; ties count half."""
 
-    def probability(drawn: Sequence[Values]) -> Values:
+    def probability(drawn: Sequence[Floats]) -> Floats:
         pairs = zip(drawn[::2], drawn[1::2], strict=True)
         signs = [np.sign(ours[:, np.newaxis] - theirs).mean(axis=(0, 1)) for ours, theirs in pairs]
         return np.asarray(0.5 + 0.5 * np.mean(signs, axis=0))
@@ -318,12 +319,12 @@ def _runs(groups: Sequence[Group], tasks: Sequence[str]) -> list[RunSeries]:
 
 
 def _curves(
-    group: Group, metric: tuple[str, str], bounds: Mapping[str, Bounds], positions: Values
-) -> list[Values]:
+    group: Group, metric: tuple[str, str], bounds: Mapping[str, Bounds], positions: Floats
+) -> list[Floats]:
     """Return the scores of a group's seeds at each position, [seeds, positions] for each environment."""
     curves = []
     for task, scale in bounds.items():
-        seeds: dict[Seed, list[Values]] = {}
+        seeds: dict[Seed, list[Floats]] = {}
         for run in _runs([group], [task]):
             if points := points_of(run, *metric, aligned=True):
                 values = np.interp(positions, list(points), list(points.values()))

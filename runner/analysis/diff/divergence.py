@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluations_of
@@ -25,9 +24,8 @@ from runner.recording.spaces import Value, decode
 from runner.replay.recorded import ended_episode
 from runner.replay.steps import episode_blocks
 from runner.runs.branches import BranchOrigin
+from runner.util.arrays import Flags, Records
 from runner.util.differences import differing_rows
-
-Block = NDArray[np.void]
 
 _NOT_COMPARED: Final = ("step", "environment")
 _CHOICE: Final = ("explored", "acted")
@@ -91,14 +89,14 @@ class Divergence:
 
 
 def first_difference(
-    a: Iterator[Block], b: Iterator[Block], fields: tuple[str, ...] = FIELDS
-) -> tuple[Block | None, Block | None]:
+    a: Iterator[Records], b: Iterator[Records], fields: tuple[str, ...] = FIELDS
+) -> tuple[Records | None, Records | None]:
     """Return the first records, a block of one each, in which two streams of records differ.
 
     A stream that ends before the other has None in place of its record; None twice if both are the same.
     """
-    left: Block | None = None
-    right: Block | None = None
+    left: Records | None = None
+    right: Records | None = None
     while True:
         left = left if left is not None and len(left) else next(a, None)
         right = right if right is not None and len(right) else next(b, None)
@@ -112,7 +110,7 @@ def first_difference(
         left, right = left[n:], right[n:]
 
 
-def differing_steps(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDArray[np.bool_]:
+def differing_steps(a: Records, b: Records, fields: tuple[str, ...] = FIELDS) -> Flags:
     """Return which of two equally long blocks of records differ in any of the fields."""
     if a.dtype == b.dtype and not a.dtype.hasobject and "digest" not in (a.dtype.names or ()):
         left, right = (
@@ -126,7 +124,7 @@ def differing_steps(a: Block, b: Block, fields: tuple[str, ...] = FIELDS) -> NDA
     return differs
 
 
-def _differs(a: Block, b: Block, name: str) -> NDArray[np.bool_]:
+def _differs(a: Records, b: Records, name: str) -> Flags:
     """Return where one field differs; rewards of other numbers of learners are compared summed."""
     left, right = a[name], b[name]
     if name in ("explored", "rewards") and a["rewards"].shape != b["rewards"].shape:
@@ -176,7 +174,7 @@ def unbroken(recording: Recording) -> tuple[int, int]:
     return steps, episodes
 
 
-def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Block] | None:
+def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Records] | None:
     """Return the steps of some trials; None unless all of them are there."""
     ends = recording.eval.episodes.array(first, first + trials)
     if not trials or len(ends) < trials:
@@ -189,7 +187,7 @@ def _trial_steps(recording: Recording, first: int, trials: int) -> Iterator[Bloc
 
 
 def _divergence(
-    phase: str, a_steps: Iterator[Block], b_steps: Iterator[Block], fields: tuple[str, ...] = FIELDS
+    phase: str, a_steps: Iterator[Records], b_steps: Iterator[Records], fields: tuple[str, ...] = FIELDS
 ) -> Divergence | None:
     """Return where two streams of steps differ."""
     left, right = first_difference(a_steps, b_steps, fields)

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from runner.analysis.diff.divergence import FIELDS, Block, differing_steps, unbroken
+from runner.analysis.diff.divergence import FIELDS, differing_steps, unbroken
 from runner.environments.mdp import Mdp
 from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
 from runner.recording.reader import Recording
+from runner.util.arrays import Ints, Records
 
 _MAX_STATES: Final = 5
 """States that are named."""
@@ -21,8 +21,6 @@ _BATCH_EPISODES: Final = 4096
 _BATCH_STEPS: Final = 1 << 15
 _ALIGNED: Final = FIELDS[2:]
 """The fields compared of steps of the same time in the same episode."""
-
-Lengths = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,7 @@ class VisitsDiff:
     """The states whose shares of all steps differ most."""
 
 
-def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Lengths, Lengths]]:
+def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Ints, Ints]]:
     """Return how far the training of two runs is the same, and the visits to each state, [S], of either."""
     left, right = _Steps(a), _Steps(b)
     episodes = equal_episodes = equal_steps = compared = 0
@@ -83,7 +81,7 @@ def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Lengths
     return overlap, (left.count_all_visits(), right.count_all_visits())
 
 
-def visits_diff(mdp: Mdp, a: Lengths, b: Lengths) -> VisitsDiff:
+def visits_diff(mdp: Mdp, a: Ints, b: Ints) -> VisitsDiff:
     """Return how two runs' visits to states, [S] each, differ."""
     shares = [visits / max(visits.sum(), 1) for visits in (a, b)]
     apart = np.abs(shares[0] - shares[1])
@@ -97,7 +95,7 @@ def visits_diff(mdp: Mdp, a: Lengths, b: Lengths) -> VisitsDiff:
     )
 
 
-def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Lengths, Lengths]]:
+def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Ints, Ints]]:
     """Yield the lengths of successive episodes of both runs, in batches of about `_BATCH_STEPS` steps.
 
     An episode longer than that comes alone.
@@ -128,10 +126,10 @@ class _Steps:
     def __init__(self, recording: Recording) -> None:
         self._path = recording.path
         self._blocks = recording.train.steps.blocks()
-        self._rest: Block = np.empty(0, recording.train.steps.row_dtype)
+        self._rest: Records = np.empty(0, recording.train.steps.row_dtype)
         self._visits = np.zeros(recording.mdp.states, np.int64)
 
-    def take(self, count: int) -> Block:
+    def take(self, count: int) -> Records:
         """Return the next steps."""
         parts = [self._rest[:0]]
         while count > 0:
@@ -149,7 +147,7 @@ class _Steps:
         for first in range(0, count, _BATCH_STEPS):
             self.take(min(_BATCH_STEPS, count - first))
 
-    def count_all_visits(self) -> NDArray[np.int64]:
+    def count_all_visits(self) -> Ints:
         """Read to the end, and return how often each state was acted in, [S]."""
         while self._read_block():
             pass
@@ -170,7 +168,7 @@ class _Steps:
         return True
 
 
-def _agreement(left: _Steps, right: _Steps, ours: Lengths, theirs: Lengths) -> Lengths:
+def _agreement(left: _Steps, right: _Steps, ours: Ints, theirs: Ints) -> Ints:
     """Return, for each of the next episodes, how many steps agree with the other's of the same time."""
     common = np.minimum(ours, theirs)
     if len(ours) == 1:  # it may be longer than a batch
@@ -188,7 +186,7 @@ def _agreement(left: _Steps, right: _Steps, ours: Lengths, theirs: Lengths) -> L
     return np.bincount(episode[agree_at], minlength=len(common))
 
 
-def _agreeing_pairs(left: Block, right: Block, ours: Lengths, theirs: Lengths) -> NDArray[np.int64]:
+def _agreeing_pairs(left: Records, right: Records, ours: Ints, theirs: Ints) -> Ints:
     """Return which of the pairs of steps (`ours` in `left`, `theirs` in `right`) agree in all but number."""
     if len(left) == len(right) == len(ours):
         return np.flatnonzero(~differing_steps(left, right, _ALIGNED))
@@ -199,6 +197,6 @@ def _agreeing_pairs(left: Block, right: Block, ours: Lengths, theirs: Lengths) -
     return agree[~differing_steps(pairs[0], pairs[1], _ALIGNED)]
 
 
-def _without_fields(steps: Block) -> NDArray[np.void]:
+def _without_fields(steps: Records) -> Records:
     """Return steps as plain bytes: NumPy copies fields one by one, and this ten times as fast."""
     return steps.view(f"V{steps.itemsize}")

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words, states_in_words
 from runner.errors import RecordingError
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
+from runner.util.arrays import Floats, Ints
 
 _MAX_CELLS: Final = 5
 """Cells with the largest differences that are listed."""
@@ -47,7 +47,7 @@ class TableDiff:
     """Where the difference is largest."""
 
 
-def table_diffs(a: Recording, b: Recording, visits: NDArray[np.int64] | None) -> Iterator[TableDiff]:
+def table_diffs(a: Recording, b: Recording, visits: Ints | None) -> Iterator[TableDiff]:
     """Yield the differences of the tables, of the same shapes, that both runs have snapshots of.
 
     `visits` is how often each state was acted in, [S], both runs together.
@@ -89,7 +89,7 @@ def _moment(table: QTable) -> tuple[int, int]:
     return table.episode, table.table
 
 
-def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: NDArray[np.float64]) -> list[CellDiff]:
+def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: Floats) -> list[CellDiff]:
     flat = apart.reshape(-1)
     # Faster than sorting all cells, for each snapshot.
     least = np.partition(flat, -_MAX_CELLS)[-_MAX_CELLS] if flat.size > _MAX_CELLS else 0.0
