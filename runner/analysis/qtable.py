@@ -276,7 +276,7 @@ def _add_state(description: TablesDescription, recording: Recording, replay: Tab
     for i, (agent, named) in enumerate(zip(replay.agents, replay.named_tables, strict=True)):
         q = named["q"]
         names = joint if q.shape[1] == mdp.joint_actions else of_agents[i] if of_agents else range(q.shape[1])
-        greedy = int(replay.greedy[i, state])
+        greedy = int(replay.learner.tables.greedy[i, state])
         for value in _action_values(agent, names, q[state], greedy, history.visits[i]):
             action = value["action"]
             if (changed := int(history.changed_step[i, action])) >= 0:

@@ -241,7 +241,7 @@ class _Branches:
         if not self._learns:
             return [()] * self._mdp.joint_actions
         rows = [table[state] for table in self._tables.tables]
-        own = self._tables.own_actions
+        own = self._tables.learner.model.own_action
         return [
             tuple(float(row[action]) for row, action in zip(rows, actions, strict=True))
             for actions in own.tolist()

@@ -36,7 +36,7 @@ from runner.recording.liveness import owner
 from runner.recording.metadata import REQUIRED_RECORDS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.reference import Reference
-from runner.recording.writer import RecordingFile, storage_error
+from runner.recording.writer import RecordingFile, writing
 from runner.replay.trust import require_may_train
 from runner.runs.code import CodeCollector
 from runner.runs.listing import run_at
@@ -209,7 +209,7 @@ def _opened(
     with storage_errors(path):
         if not described:
             path.unlink(missing_ok=True)
-        file = RecordingFile.reopen(path, contents) if described else RecordingFile(path)
+        file = RecordingFile(path, contents=contents if described else None)
     with file:
         if not described:
             describe(file, job, run, learner)
@@ -217,11 +217,8 @@ def _opened(
             number = 1 + sum(name.startswith("resume/") for name in contents.metadata)
             accepted = {key: f"{then} -> {now}" for key, (then, now) in changes.items()}
             note = {**provenance(), "accepted_changes": json.dumps(accepted, sort_keys=True)}
-            try:
+            with writing(file):
                 file.add_metadata(f"resume/{number}", note)
-            except OSError as error:
-                file.cut_back()
-                raise storage_error(file, error) from error
         yield file
 
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, SupportsFloat
 
 import numpy as np
+from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from runner.environments.layers import final_observations
@@ -18,7 +19,7 @@ from runner.environments.mdp import Mdp, step_counts
 from runner.errors import RecordingError
 from runner.loops.description import Copied, Described
 from runner.loops.generators import States
-from runner.loops.values import as_given, require_reset, warn_user
+from runner.loops.values import as_given, warn_user
 from runner.recording import schema
 from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
 from runner.recording.gym_values import (
@@ -48,10 +49,6 @@ _OF_AGENTS: Final = ("acted", "agents_terminated", "agents_truncated")
 """The columns that have a bit for each agent; steps of one environment alone have none of them."""
 _TRUE: Final = b"\1"
 _NO_STATES: Final[States] = {}
-
-
-def _columns_of_agents(steps: np.dtype[np.void]) -> tuple[str, ...]:
-    return tuple(name for name in _OF_AGENTS if name in (steps.names or ()))
 
 
 class StepBuffer:
@@ -84,7 +81,9 @@ class StepBuffer:
             described.layout.has_turns,
         )
         self._batch = () if mode is None else (self._n,)
-        self._of_agents = _columns_of_agents(recorder.dtype(self._topics.steps))
+        self._of_agents: tuple[str, ...] = tuple(
+            name for name in _OF_AGENTS if name in (recorder.dtype(self._topics.steps).names or ())
+        )
         self._learners = recorder.dtype(self._topics.episodes)["returns"].shape[0]
         self._log = EpisodeLog(self._n, self._learners, self._mdp, self._has_turns, zero=-0.0)
         self._dtype = recorder.dtype(self._topics.resets)["observation"]
@@ -467,7 +466,11 @@ class StepBuffer:
         Raises:
             ResetNeeded: there was no reset.
         """
-        require_reset(self.resets, self._phase)
+        if not self.resets:  # the state before the step would be unknown
+            raise ResetNeeded(
+                f"phase {self._phase!r}: the recording has seen no reset of this environment yet: call "
+                "reset() first"
+            )
         self._first_action(action)
         room, n = max(1, self._recorder.capacity(self._topics.steps) // self._n), self._n
         self._room = self._full_at = room

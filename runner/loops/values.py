@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from gymnasium.error import ResetNeeded
 
 from runner.errors import ConfigError, RecordingError
 from runner.recording import schema
@@ -130,18 +129,6 @@ def check_phase(phase: str) -> None:
     """
     if phase not in schema.PHASES:
         raise ConfigError(f"phase: found {phase!r}, expected one of {', '.join(schema.PHASES)}")
-
-
-def require_reset(resets: int, phase: str) -> None:
-    """Refuse the first step of a phase that has no reset: the state before it would be unknown.
-
-    Raises:
-        ResetNeeded: `resets` is zero.
-    """
-    if not resets:
-        raise ResetNeeded(
-            f"phase {phase!r}: the recording has seen no reset of this environment yet: call reset() first"
-        )
 
 
 def warn_user(message: str) -> None:

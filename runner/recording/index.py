@@ -40,10 +40,10 @@ from runner.recording.records import (
     LARGE,
     MAX_NAME_BYTES,
     MAX_NAMED,
+    MAX_UNPACKED_RATIO,
     Place,
     RawRecord,
     bytes_of,
-    check_unpacked_size,
     most_bytes,
     raw_records,
 )
@@ -66,6 +66,8 @@ T = TypeVar("T")
 
 MAX_CHUNKS: Final = 1 << 21
 """The most chunks that a recording is read with: a chunk of steps holds 256 or more."""
+_ALWAYS_UNPACKED: Final = 1 << 30
+"""Bytes that a file of any size may declare to hold."""
 _PIECE: Final = 1 << 20
 _CHUNK_INDEX_HEAD: Final = struct.Struct("<QQQQI")
 _OFFSET_ENTRY: Final = struct.Struct("<HQ")
@@ -184,7 +186,10 @@ class Index:
             RecordingError: they do.
         """
         unpacked = int(self.chunks.columns["uncompressed_size"].sum(dtype=np.uint64))
-        check_unpacked_size(self.size, unpacked, path)
+        if unpacked > self.size * MAX_UNPACKED_RATIO + _ALWAYS_UNPACKED:
+            raise RecordingError(
+                f"{path}: {self.size:,} bytes declare to hold {unpacked:,}; made to exhaust memory."
+            )
 
     def add(self, raw: RawRecord) -> None:
         """Add a record of the data section, of which the beginning suffices, or of the summary.

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
@@ -54,8 +54,12 @@ class Layout:
 
     @cached_property
     def has_states(self) -> bool:
-        """Whether its steps are over states; else over values of its spaces."""
-        return not self.spaces or over_states(json.loads(self.spaces))
+        """Whether its steps are over states: both spaces are `Discrete`; else over values of its spaces."""
+        spaces = json.loads(self.spaces or "null")
+        return not spaces or all(
+            spaces[name].get("type") == "Discrete" and is_whole(spaces[name].get("n"), 1, _MAX_STATES)
+            for name in ("observation", "action")
+        )
 
     @cached_property
     def varies(self) -> bool:
@@ -106,14 +110,6 @@ class Layout:
 def layout_of(kind: str, learners: int, events: int, spaces: str = "", has_turns: bool = False) -> Layout:
     """Return a layout, the same one each time: what follows from it is computed once."""
     return Layout(kind, learners, events, spaces, has_turns)
-
-
-def over_states(spaces: Mapping[str, Any]) -> bool:
-    """Return whether steps in these spaces are recorded over states: both spaces are `Discrete`."""
-    return all(
-        spaces[name].get("type") == "Discrete" and is_whole(spaces[name].get("n"), 1, _MAX_STATES)
-        for name in ("observation", "action")
-    )
 
 
 def _with_values(message: MessageType, *values: Field) -> MessageType:

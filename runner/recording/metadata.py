@@ -32,7 +32,7 @@ from runner.recording.maker import MAKER_RECORD, EnvironmentMaker
 from runner.recording.packed_arrays import pack_array, unpack_array
 from runner.recording.records import MAX_METADATA_BYTES
 from runner.recording.spaces import leaves_of
-from runner.recording.writer import RecordingFile, storage_error
+from runner.recording.writer import RecordingFile, writing
 from runner.util.arrays import Array
 from runner.util.stored import Count, stored_as
 from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_too_deep, without_surrogates
@@ -94,13 +94,12 @@ def run_metadata(
     }
 
 
-def check_file(run: Mapping[str, str], index: Index, path: str) -> None:
-    """Check the metadata record `run` of a file, and that it has the schemas and channels of such a run.
+def check_file(layout: Layout, index: Index, path: str) -> None:
+    """Check that a file has the schemas and channels of a layout.
 
     Raises:
-        RecordingError: it is of another version, is damaged, or has another schema or channel.
+        RecordingError: it has another schema or channel.
     """
-    layout = layout_of_run(run, path)
     expected = beginning_of(layout)
     topics = {channel.id: channel for channel in expected.channels}
     if schema.TRAIN_EXTRA in layout.topics:
@@ -340,7 +339,7 @@ def write_description(
     maker: EnvironmentMaker | None = None,
 ) -> None:
     """Write what makes a recording self-contained; `maker` is how a loop's environment was made."""
-    try:
+    with writing(file):
         file.begin(layout_of_run(run, str(file.path)))
         file.add_metadata("run", run)
         file.add_metadata("config", _json_entry(config))
@@ -349,27 +348,20 @@ def write_description(
             file.add_metadata(MAKER_RECORD, maker.to_metadata())
         for name, (media_type, data) in environment.items():
             file.add_attachment(name, media_type, data)
-    except OSError as error:
-        file.cut_back()
-        raise storage_error(file, error) from error
 
 
 def write_maker(file: RecordingFile, phase: str, maker: EnvironmentMaker) -> None:
     """Write how the environment of a phase was made, if it has one of its own."""
-    try:
+    with writing(file):
         file.add_metadata(f"{MAKER_RECORD}/{phase}", maker.to_metadata())
-    except OSError as error:
-        raise storage_error(file, error) from error
 
 
 def write_result(
     file: RecordingFile, status: str, result: Mapping[str, object], *, synced: bool = True
 ) -> None:
     """Write how the run ended, the index and the summary; `synced` is as for `RecordingFile.finish`."""
-    try:
+    with writing(file):
         file.finish("result", _json_entry({"status": status, **result}), synced=synced)
-    except OSError as error:
-        raise storage_error(file, error) from error
 
 
 def _json_entry(value: Mapping[str, object]) -> dict[str, str]:

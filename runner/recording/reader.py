@@ -79,7 +79,7 @@ class Recording(RunDescription):
         self.file = RecordStore(path)
         super().__init__(path, self.file)
         try:
-            check_file(self.run, self.file.index, str(path))
+            check_file(self.layout, self.file.index, str(path))
         except BaseException:
             self.close()
             raise
@@ -438,14 +438,12 @@ class Phase:
         Raises:
             RecordingError: it is damaged.
         """
-        last = 0
+        stop, shard_maker = 0, None
         for shard in self._recording.shards:
-            last += shard.environments
-            if environment < last:
-                if (maker := self._recording._maker(f"{SHARD_MAKER}/{shard.name}")) is not None:
-                    return maker
-                break
-        return self.own_maker or self._recording.maker
+            start, stop = stop, stop + shard.environments
+            if start <= environment < stop:
+                shard_maker = self._recording._maker(f"{SHARD_MAKER}/{shard.name}")
+        return shard_maker or self.own_maker or self._recording.maker
 
     @property
     def own_maker(self) -> EnvironmentMaker | None:

@@ -15,7 +15,7 @@ from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, McapRecord, Metadata
+from mcap.records import McapRecord, Metadata
 from mcap.writer import MCAP0_MAGIC
 from numpy.lib.stride_tricks import sliding_window_view
 
@@ -45,8 +45,6 @@ MAX_NAMED: Final = 4096
 MAX_NAME_BYTES: Final = 256
 MAX_UNPACKED_RATIO: Final = 1000
 """How many bytes a byte of the file may declare to hold; files with more are made to exhaust memory."""
-_ALWAYS_UNPACKED: Final = 1 << 30
-"""Bytes that a file of any size may declare to hold."""
 UNREADABLE: Final = (struct.error, ValueError, KeyError, McapError)
 """What parsing damaged records raises."""
 _IN_DATA: Final = frozenset(
@@ -210,16 +208,6 @@ def walk(stream: BinaryIO, size: int) -> Iterator[RawRecord]:
             return
 
 
-def check_unpacked_size(size: int, unpacked: int, path: str) -> None:
-    """Refuse chunks that declare far more bytes than those of any recording of the file's size.
-
-    Raises:
-        RecordingError: they do.
-    """
-    if unpacked > size * MAX_UNPACKED_RATIO + _ALWAYS_UNPACKED:
-        raise RecordingError(f"{path}: {size:,} bytes declare to hold {unpacked:,}; made to exhaust memory.")
-
-
 def _read_chunk(body: bytes, offset: int) -> ReadChunk:
     """Return the chunk in a record, after comparing its checksum and looking at each of its messages."""
     where = f"chunk at {offset}"
@@ -344,11 +332,6 @@ def bytes_of(*records: McapRecord) -> bytes:
     for record in records:
         record.write(builder)
     return bytes(builder.end())
-
-
-def attachment_record(name: str, media_type: str, data: bytes) -> bytes:
-    """Return an attachment's record; its times are 0, because times of day belong to the provenance."""
-    return bytes_of(Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data))
 
 
 def metadata_of(body: bytes) -> MetadataRecord:

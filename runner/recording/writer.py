@@ -6,14 +6,15 @@ of a long recording, are encoded by `chunks`; the many small records of a short 
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO, Self
 
 from isal.isal_zlib import crc32
-from mcap.records import Header
+from mcap.records import Attachment, Header
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
@@ -26,7 +27,6 @@ from runner.recording.records import (
     Place,
     Record,
     asks_for_indexes,
-    attachment_record,
     bytes_of,
     copied_chunk,
     metadata_record,
@@ -40,16 +40,27 @@ _LIBRARY = f"dualtaxi {__version__}"
 class RecordingFile:
     """A recording that is written: append records, then `finish`. Not thread-safe."""
 
-    def __init__(self, path: Path, layout: Layout | None = None) -> None:
-        """Create the file; one that exists is never overwritten.
+    def __init__(self, path: Path, layout: Layout | None = None, contents: Index | None = None) -> None:
+        """Create the file, which must not exist; with `contents`, open it to be continued.
 
         Args:
-            layout: of the run; None if `begin` follows, before anything else is written.
+            layout: of a new run; None if `begin` follows, before anything else is written.
+            contents: the good records of a recording, as `integrity.survey` found them; what follows the last
+                whole chunk is cut off.
 
         Raises:
-            OSError: it exists, or cannot be created.
+            OSError: it exists, or cannot be written.
         """
-        self._set(path, path.open("xb", buffering=0), Index())
+        self.path, self._index = path, contents or Index()
+        self._stream: BinaryIO = path.open("xb" if contents is None else "r+b", buffering=0)
+        self._crc = 0
+        self._indexed = True
+        self._later: dict[int, Beginning] = {}
+        """Schemas and channels that are written before the first chunk of a channel, by its id."""
+        if contents is not None:
+            self._crc = checksum(self._stream, 0, contents.end)
+            self.cut_back()
+            return
         try:
             self._append(MCAP0_MAGIC + bytes_of(Header(PROFILE, _LIBRARY)))
             if layout is not None:
@@ -58,22 +69,6 @@ class RecordingFile:
             self._stream.close()
             path.unlink(missing_ok=True)
             raise
-
-    @classmethod
-    def reopen(cls, path: Path, contents: Index) -> RecordingFile:
-        """Open a recording to resume it: what follows its last whole chunk is cut off.
-
-        Args:
-            contents: its good records, as `integrity.survey` found them.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        file = cls.__new__(cls)
-        file._set(path, path.open("r+b", buffering=0), contents)
-        file._crc = checksum(file._stream, 0, contents.end)
-        file.cut_back()
-        return file
 
     def begin(self, layout: Layout) -> None:
         """Append the schemas and channels of a run."""
@@ -86,13 +81,6 @@ class RecordingFile:
     def declare(self, beginning: Beginning) -> None:
         """State schemas and channels; they are written before the first chunk of one of the channels."""
         self._later |= {channel.id: beginning for channel in beginning.channels}
-
-    def _set(self, path: Path, stream: BinaryIO, index: Index) -> None:
-        self.path, self._stream, self._index = path, stream, index
-        self._crc = 0
-        self._indexed = True
-        self._later: dict[int, Beginning] = {}
-        """Schemas and channels that are written before the first chunk of a channel, by its id."""
 
     @property
     def size(self) -> int:
@@ -112,8 +100,9 @@ class RecordingFile:
         self._index.add_metadata(name, self._append(metadata_record(name, entries)))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Append an attachment."""
-        self._index.add_attachment(name, self._append(attachment_record(name, media_type, data)), media_type)
+        """Append an attachment; its times are 0, because times of day belong to the provenance."""
+        record = Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        self._index.add_attachment(name, self._append(bytes_of(record)), media_type)
 
     def copy(self, record: Record) -> None:
         """Append a record of another recording; the times and the message index of a chunk are made again."""
@@ -216,3 +205,17 @@ def storage_error(file: RecordingFile, error: OSError) -> StorageError:
         f"{file.path}: writing failed ({reason}) after {file.size:,} bytes. What was written is kept and "
         "can be read; free some disk, or choose another --recordings."
     )
+
+
+@contextlib.contextmanager
+def writing(file: RecordingFile) -> Iterator[None]:
+    """Raise an `OSError` of the block as a `StorageError`; no piece of a record stays.
+
+    Raises:
+        StorageError: there was one.
+    """
+    try:
+        yield
+    except OSError as error:
+        file.cut_back()
+        raise storage_error(file, error) from error

@@ -39,7 +39,7 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     before = replay.begin_watch(watch).q
     for steps in replay.blocks(step):
         changes = replay.watch(steps, watch)
-        _count(visits, replay.own_actions[steps["action"][steps["state"] == state]])
+        _count(visits, replay.learner.model.own_action[steps["action"][steps["state"] == state]])
         values = np.concatenate([before, changes.q])
         bits = values.view(np.int64)
         rows, cells = np.nonzero(bits[1:] != bits[:-1])

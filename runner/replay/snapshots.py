@@ -53,14 +53,14 @@ class DerivedTables(Generic[S]):
 
     def at(self, step: int, table: int) -> Floats | None:
         """Return a table after `step` training steps, a view; None if the steps do not determine it."""
-        tables = self._replay.snapshot()
+        tables = self._replay.learner.snapshot()
         is_here = self._known and step == self._replay.step and 0 <= table < len(tables)
         return tables[table] if is_here else None
 
     def give(self, step: int, table: int, values: Floats) -> None:
         """Set a table to its recorded values; once all tables of a step are set, they are known again."""
         replay = self._replay
-        tables = replay.snapshot()
+        tables = replay.learner.snapshot()
         if not 0 <= table < len(tables) or tables[table].shape != values.shape:
             return  # it is archived as it is, but nothing can be derived from it
         if step != replay.step:
@@ -69,7 +69,7 @@ class DerivedTables(Generic[S]):
         self._given.add(table)
         self._known |= len(self._given) == len(tables)
         tables[table] = values
-        replay.rewind(step, name_tables(tables, replay.kinds))
+        replay.rewind(step, name_tables(tables, replay.learner.kinds))
 
     def _apply(self, steps: Records) -> None:
         if not len(steps):

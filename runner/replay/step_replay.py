@@ -61,59 +61,36 @@ class StepReplay:
     def __init__(self, config: Mapping[str, object], mdp: Mdp, seed: int, where: str) -> None:
         self._mdp = mdp
         self._where = where
-        self._learner = Learner(from_mapping(config), mdp, seed)
+        self.learner = Learner(from_mapping(config), mdp, seed)
+        """The learner with the tables at `step`."""
         self.step = 0
         """Training steps that the tables have learned from."""
         self._remembered = 0
         """The step up to which the learners remember the episode."""
 
     @property
-    def learner(self) -> Learner:
-        """The learner with the tables at `step`."""
-        return self._learner
-
-    @property
     def agents(self) -> tuple[str, ...]:
         """The names of the learners."""
-        return self._learner.agents
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """The names of what each learner holds, in the order of a snapshot."""
-        return self._learner.kinds
+        return self.learner.agents
 
     @property
     def tables(self) -> list[Floats]:
         """The Q-tables at `step`, [states, actions] per learner: views that `apply` changes."""
-        return [self._learner.table(i) for i in range(len(self.agents))]
+        return [self.learner.table(i) for i in range(len(self.agents))]
 
     @property
     def named_tables(self) -> list[NamedTables]:
         """All tables of each learner at `step`, by name: views that `apply` changes; `q` is its Q-table."""
-        return [self._learner.named_tables(i) for i in range(len(self.agents))]
-
-    @property
-    def own_actions(self) -> NDArray[np.int32]:
-        """Each learner's part of a joint action, [joint actions, learners]."""
-        return self._learner.model.own_action
-
-    @property
-    def greedy(self) -> NDArray[np.int32]:
-        """The greedy actions at `step`, [learners, states]: the lowest of the best ones."""
-        return self._learner.tables.greedy
-
-    def snapshot(self) -> list[Floats]:
-        """Return all tables in the order of a snapshot, the tables of a kind together: views."""
-        return self._learner.snapshot()
+        return [self.learner.named_tables(i) for i in range(len(self.agents))]
 
     def rewind(self, step: int, tables: list[NamedTables]) -> None:
         """Set all tables to the tables of a step."""
-        self._learner.set_tables(tables)
+        self.learner.set_tables(tables)
         self.step = step
 
     def empty_rows(self, count: int) -> Floats:
         """Return an array for the values seen in `count` steps: nan, [count, learners, most actions]."""
-        widths = self._learner.model.width
+        widths = self.learner.model.width
         return np.full((count, len(widths), max(widths)), np.nan)
 
     def apply(
@@ -146,7 +123,7 @@ class StepReplay:
     def begin_watch(self, watch: Watch) -> WatchedValues:
         """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""
         changes = empty_changes(watch, 1)
-        begin(self._learner.model, self._learner.tables, watch, changes)
+        begin(self.learner.model, self.learner.tables, watch, changes)
         return changes
 
     def watch(self, steps: Records, watch: Watch) -> WatchedValues:
@@ -176,15 +153,15 @@ class StepReplay:
                 f"those from {self.step} on; `dualtaxi verify` checks the whole recording."
             )
         self._mdp.check_steps(steps, self._where)
-        if self._learner.algorithm.remember and self._remembered != self.step and (t := int(steps["t"][0])):
+        if self.learner.algorithm.remember and self._remembered != self.step and (t := int(steps["t"][0])):
             self._recall(t)
         records = steps.view(np.recarray)
         records.flags.writeable = False  # as a file's are: the kernel is compiled once
         at = 0
         while at < len(steps):
-            segment = self._learner.segment_at(self.step)
+            segment = self.learner.segment_at(self.step)
             stop = min(len(steps), at + segment.stop - self.step)
-            learner, part = self._learner, slice(at, stop)
+            learner, part = self.learner, slice(at, stop)
             yield (learner.seed, learner.model, learner.tables, segment.rules, records[part]), part
             self.step += stop - at
             self._remembered = self.step
@@ -221,7 +198,7 @@ class StepReplay:
         """Fill a probe with the values and greedy actions as they are now, for all of its rows."""
         _check_probe(probe, self._mdp)
         for k in range(len(probe.states)):
-            kernel.read_states(self._learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
+            kernel.read_states(self.learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
 
     def _lost(self, next_step: int) -> RecordingError:
         return RecordingError(

@@ -92,7 +92,7 @@ class TableReplay(StepReplay):
 
     def _nearest(self, step: int) -> tuple[int, list[NamedTables]]:
         """Return the last snapshot at or before a step, or a checkpoint between them; and its step."""
-        nearest = _snapshot_before(self._recording, step, self.kinds)
+        nearest = _snapshot_before(self._recording, step, self.learner.kinds)
         if nearest is None:
             raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
         shapes, expected = (
@@ -103,8 +103,8 @@ class TableReplay(StepReplay):
             raise RecordingError(f"{self._where}: found Q-tables of shape {shapes}, expected {expected}.")
         if step - nearest[0] <= CHECKPOINT_STEPS:
             return nearest
-        at, tables = self._checkpoints.nearest(step, [table.shape for table in self.snapshot()])
-        return (at, name_tables(tables, self.kinds)) if at > nearest[0] else nearest
+        at, tables = self._checkpoints.nearest(step, [table.shape for table in self.learner.snapshot()])
+        return (at, name_tables(tables, self.learner.kinds)) if at > nearest[0] else nearest
 
     def advance(self, stop: int, rows: Floats = NO_ROWS, trace: Trace | None = None) -> None:
         """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them.
@@ -134,7 +134,7 @@ class TableReplay(StepReplay):
                 yield part
                 is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
                 if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
-                    self._checkpoints.save(self.step, self.snapshot())
+                    self._checkpoints.save(self.step, self.learner.snapshot())
         self._checkpoints.prune()
         if self.step < stop:
             raise self._lost(stop)

@@ -19,7 +19,7 @@ from typing import Final
 
 from runner.errors import StorageError
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD, MAX_CODE_BYTES, MAX_FILES, Code, patch_parts
-from runner.recording.writer import RecordingFile, storage_error
+from runner.recording.writer import RecordingFile, writing
 from runner.runs.git import GIT_SECONDS, NotRecorded, Repository, read_repository
 from runner.runs.provenance import is_code_wanted
 from runner.runs.redaction import SETTINGS_FILES, is_secret_file, redacted_text
@@ -190,14 +190,11 @@ class CodeCollector:
                 missing = f"what differs from the commit: reading it took more than {WAIT_SECONDS:g} s"
                 entries |= self._commit | {"git.not_recorded": missing}
             code = RecordedCode(entries)
-        try:
+        with writing(file):
             file.add_metadata(CODE_RECORD, code.entries)
             self.entries = code.entries  # from here on it is not tried again
             if code.attachment:
                 file.add_attachment(CODE_ATTACHMENT, "application/zstd", code.attachment)
-        except OSError as error:
-            file.cut_back()
-            raise storage_error(file, error) from error
 
 
 # --- what is collected --------------------------------------------------------------------------------------

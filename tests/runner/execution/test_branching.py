@@ -133,7 +133,7 @@ def test_settings_change_from_the_step_on(parent_of, tmp_path, mode, algorithm, 
         replay = TableReplay(recording)
         for each in (step // 2, step, step + 1, branch.summary.train_steps):
             replay.advance(each)
-        tables = replay.snapshot()
+        tables = replay.learner.snapshot()
         last = [table.values for table in recording.snapshots(0, len(tables))][-len(tables) :]
     for replayed, recorded in zip(tables, last, strict=True):
         assert np.array_equal(replayed, recorded)

@@ -239,7 +239,7 @@ def altered_without_result(source, target, change):
     data = source.with_suffix(".finished")
     data.write_bytes(source.read_bytes())
     contents = survey(data, keep_result=True)
-    with RecordingFile.reopen(data, contents) as file:
+    with RecordingFile(data, contents=contents) as file:
         file.finish("result", {"json": "{}"})
     return altered(data, target, schema.TRAIN_METRICS_TOPIC, change)
 

@@ -101,7 +101,7 @@ def test_the_greedy_action_is_the_first_of_the_best(run, steps):
     with open_recording(run.recording) as recording:
         replay = TableReplay(recording, steps // 2)
         for i, table in enumerate(replay.tables):
-            assert np.array_equal(replay.greedy[i], table.argmax(axis=1))
+            assert np.array_equal(replay.learner.tables.greedy[i], table.argmax(axis=1))
 
 
 @pytest.mark.parametrize("share", [0, 0.3, 1])
@@ -126,14 +126,14 @@ def empty(recording):
 def history_by_hand(recording, visits, state):
     """Return visits, last changing step and its episode, from the tables before and after each visit."""
     replay = TableReplay(recording)
-    shape = replay.own_actions.shape[1], max(table.shape[1] for table in replay.tables)
+    shape = replay.learner.model.own_action.shape[1], max(table.shape[1] for table in replay.tables)
     counts, steps, episodes = np.zeros(shape, int), np.full(shape, -1), np.full(shape, -1)
     for record in visits:
         replay.advance(int(record["step"]))
         before = [table[state].copy() for table in replay.tables]
         replay.advance(int(record["step"]) + 1)
         for i, table in enumerate(replay.tables):
-            counts[i, replay.own_actions[record["action"], i]] += 1
+            counts[i, replay.learner.model.own_action[record["action"], i]] += 1
             changed = table[state] != before[i]
             steps[i, : len(changed)][changed] = record["step"]
             episodes[i, : len(changed)][changed] = record["episode"]
