@@ -12,7 +12,6 @@ import importlib
 import json
 import os
 import sys
-from collections.abc import Sequence
 from typing import IO, Final
 
 import click
@@ -20,7 +19,6 @@ import click
 from runner.cli.command import CommandGroup
 from runner.errors import (
     ConfigError,
-    ConfigProblem,
     ExitCode,
     OutOfResources,
     RunnerError,
@@ -129,9 +127,12 @@ Exit codes:
 
 
 class Failure(click.ClickException):
-    """A `RunnerError` or usage error, printed without a traceback; with --json as a line of JSON."""
+    """A `RunnerError` or usage error, about a run or not, printed without a traceback.
 
-    def __init__(self, error: RunnerError | click.ClickException, as_json: bool) -> None:
+    With --json it is a line of JSON, in the form of the service's API.
+    """
+
+    def __init__(self, error: RunnerError | click.ClickException, run: str = "") -> None:
         if isinstance(error, click.ClickException):
             super().__init__(error.format_message())
             self.exit_code = error.exit_code  # type: ignore[misc]  # Click's own classes do so
@@ -139,15 +140,19 @@ class Failure(click.ClickException):
             super().__init__(full_message(error))
             self.exit_code = exit_code_of(error)  # type: ignore[misc]
         self.problems = error.problems if isinstance(error, ConfigError) else ()
-        self.as_json = as_json
+        self.run, self.as_json = run, click.get_current_context().meta[_AS_JSON]
 
     def show(self, file: IO[str] | None = None) -> None:
         """Print the message; each of several problems has a line, which begins with its place."""
-        lines = self.message.count("\n") + 1
+        message = f"{self.run}: {self.message}" if self.run else self.message
+        lines = message.count("\n") + 1
         head = f"{lines} problems\n" if self.problems and lines > 1 else ""
-        text = f"Error: {head}{self.message}"
+        text = f"Error: {head}{message}"
         if self.as_json:
-            text = error_as_json(self.message, self.exit_code, self.problems)
+            problems = [problem._asdict() for problem in self.problems]
+            about = {"run": self.run} if self.run else {}
+            error = {"message": message, "exit_code": self.exit_code, **about, "problems": problems}
+            text = json.dumps({"error": error})
         click.echo(printable(text), file=file or sys.stderr)
 
 
@@ -177,12 +182,6 @@ def _of_the_system(error: Exception) -> RunnerError | None:
     for note in getattr(error, "__notes__", []):
         found.add_note(note)
     return found
-
-
-def error_as_json(message: str, exit_code: int, problems: Sequence[ConfigProblem] = (), **more: str) -> str:
-    """Return an error as a line of JSON, in the form of the service's API, with further keys."""
-    located = [problem._asdict() for problem in problems]
-    return json.dumps({"error": {"message": message, "exit_code": exit_code, **more, "problems": located}})
 
 
 class LazyGroup(CommandGroup):
@@ -229,7 +228,6 @@ class LazyGroup(CommandGroup):
 
     def invoke(self, ctx: click.Context) -> object:
         """Run the command; errors that a user can correct have no traceback."""
-        as_json = ctx.meta[_AS_JSON]
         try:
             result = super().invoke(ctx)
             sys.stdout.flush()
@@ -241,16 +239,16 @@ class LazyGroup(CommandGroup):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise click.exceptions.Exit(ExitCode.OK) from None
         except RunnerError as error:
-            raise Failure(error, as_json) from error
+            raise Failure(error) from error
         except (OSError, MemoryError, RuntimeError) as error:
             if (understood := _of_the_system(error)) is None:
                 raise
-            raise Failure(understood, as_json) from error
+            raise Failure(understood) from error
         except click.exceptions.NoArgsIsHelpError:
             raise
         except click.ClickException as error:
             error.message = printable(error.message)  # type: ignore[misc]  # final by name alone
-            raise (Failure(error, as_json) if as_json else error) from error
+            raise (Failure(error) if ctx.meta[_AS_JSON] else error) from error
 
 
 @click.group(

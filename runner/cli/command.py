@@ -12,7 +12,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import click
 
@@ -20,6 +20,8 @@ from runner.errors import nearest
 from runner.util.plugins import plugin_names
 
 _MAX_SHORT_HELP = 200
+_FORMS: Final = {"json": "Print JSON.", "csv": "Print CSV.", "markdown": "Print Markdown."}
+"""Forms of a reply, each an option with this help."""
 
 Declared = Any
 """The default of a parameter, which stands for values of the parameter's own type."""
@@ -77,7 +79,8 @@ class Command(click.Command):
     """A command of a function; its help keeps the lines of its examples.
 
     The defaults of the function's parameters declare them, unless they are `declared`; `params` are further
-    ones, which the function does not get.
+    ones, which the function does not get. The function returns a `Reply` or yields several; it is printed
+    as text, or in the form that --json or another of the `forms` demands.
     """
 
     def __init__(
@@ -86,11 +89,14 @@ class Command(click.Command):
         callback: Callable[..., object],
         declared: Mapping[str, Declared] | None = None,
         params: Sequence[click.Parameter] = (),
+        forms: Sequence[str] = ("json",),
         **attributes: Any,
     ) -> None:
         call = _Record(callback, declared)
-        super().__init__(name, callback=call, params=[*call.parameters(), *params], **attributes)
+        flags = [click.Option([f"as_{form}", f"--{form}"], is_flag=True, help=_FORMS[form]) for form in forms]
+        super().__init__(name, callback=call, params=[*call.parameters(), *params, *flags], **attributes)
         self.help = _with_examples(self.help)
+        self.forms = forms
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments; where settings can be changed, an unknown option is probably one of them."""
@@ -103,6 +109,16 @@ class Command(click.Command):
             name = error.option_name.lstrip("-").replace("-", "_")
             message = f"{error.message} A setting is changed by --set {name}=VALUE."
             raise click.NoSuchOption(error.option_name, message, error.possibilities, ctx) from None
+
+    def invoke(self, ctx: click.Context) -> None:
+        """Call the function, and print its replies in the form that the options name."""
+        forms = [form for form in self.forms if ctx.params[f"as_{form}"]]
+        if len(forms) > 1:
+            raise click.UsageError(f"--{forms[0]} and --{forms[1]} exclude each other: choose one.")
+        if replies := super().invoke(ctx):
+            from runner.cli.output import print_replies
+
+            ctx.exit(print_replies(replies, *forms))
 
 
 class CommandGroup(click.Group):

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.cli.command import Declared, argument, option, record
-from runner.cli.output import print_written
 from runner.cli.parameter_types import (
     AXIS,
     COUNT,
@@ -75,8 +74,6 @@ set_option: Final = option(
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as evaluation.trials=50; may be repeated.",
 )
-json_option: Final = option("--json", is_flag=True, help="Print JSON.")
-markdown_option: Final = option("--markdown", is_flag=True, help="Print Markdown.")
 html_option: Final = option(
     "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead."
 )
@@ -218,22 +215,17 @@ def output_option(default: str, metavar: str = "FILE") -> Declared:
 
 @dataclass(frozen=True)
 class Writing:
-    """Where a command writes files made from runs, and how it reports them."""
+    """Where a command writes files made from runs."""
 
     output: Path | None
     default: str
     """The path without --output, in which NAME-RUN stands for the run."""
     force: bool
     recordings: Path | None
-    as_json: bool
 
     def path(self, file_stem: str = "") -> Path:
         """Return the path to write; `file_stem` is that of the run."""
         return self.output or Path(self.default.replace("NAME-RUN", file_stem))
-
-    def report(self, text: str, *paths: Path, **more: object) -> None:
-        """Print what was written, see `print_written`."""
-        print_written(text, self.as_json, *paths, **more)
 
 
 def writing_options(default: str, metavar: str = "FILE") -> Declared:
@@ -243,9 +235,8 @@ def writing_options(default: str, metavar: str = "FILE") -> Declared:
         output: Path | None = output_option(default, metavar),
         force: bool = force_option,
         recordings: Path | None = recordings_option,
-        as_json: bool = json_option,
     ) -> Writing:
-        return Writing(output, default, force, recordings, as_json)
+        return Writing(output, default, force, recordings)
 
     return record(writing)
 

@@ -1,4 +1,4 @@
-"""Print results: JSON on stdout, tables fitted to the terminal, notices on stderr.
+"""Print replies: JSON on stdout, tables fitted to the terminal, notices on stderr.
 
 All that commands print goes through `echo` and `console`: what is not ours, such as the name of a run, may
 hold control characters of terminals, which are shown escaped.
@@ -10,13 +10,15 @@ import csv
 import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
-from runner.analysis.sections import markdown
+from runner.analysis.sections import Grid, Section, markdown
+from runner.errors import ExitCode
 from runner.export.places import require_new
 from runner.util.humanize import printable
 from runner.util.values import finite
@@ -26,8 +28,6 @@ if TYPE_CHECKING:  # imported when something is drawn
     from rich.segment import Segment
     from rich.table import Table
     from rich.text import Text
-
-    from runner.analysis.sections import Grid, Section
 
 SHRUNK: Final = 10
 """Minimum characters of a shrinking column."""
@@ -41,22 +41,62 @@ def echo(text: object, err: bool = False, nl: bool = True) -> None:
     click.echo(printable(str(text)), err=err, nl=nl)
 
 
-def echo_csv(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
-    """Print a table of any length as CSV."""
-    sys.stdout.writelines(map(printable, csv_lines(columns, rows)))
+class Remark(str):
+    """A part of a reply's text that is said on stderr."""
+
+    __slots__ = ()
 
 
-def print_json(value: object, indent: int | None = 1) -> None:
-    """Print a value as JSON on stdout; None for `indent` makes it one line. NaN and infinity become null."""
-    echo(json.dumps(finite(value), indent=indent, allow_nan=False))
+if TYPE_CHECKING:
+    Part = str | Mapping[str, str] | Grid | Section | RenderableType
+    """What a reply's text consists of: lines, names and values, tables, sections."""
 
 
-def print_result(as_json: bool, value: object, *parts: RenderableType) -> None:
-    """Print a result as JSON, or as lines and tables."""
-    if as_json:
-        print_json(value)
-    else:
-        draw(*parts)
+@dataclass(frozen=True)
+class Reply:
+    """What a command replies. Only the form that is printed is iterated over."""
+
+    data: Mapping[str, object] | Iterable[str] = ()
+    """What --json prints: an object, or the parts of a text."""
+    text: Iterable[Part] = ()
+    csv: Iterable[str] = ()
+    """Lines of CSV, which stand for the text where there is none."""
+    page: str = ""
+    """A line about a page that was written: it stands for the text, and is said on stderr in other forms."""
+    notes: Iterable[str] = ()
+    """Notices on stderr, after the reply in any form."""
+    exit_code: int = ExitCode.OK
+
+
+def print_replies(replies: Reply | Iterable[Reply], form: str = "text") -> int:
+    """Print the replies of a command in a form, each as soon as it is there; return the exit code."""
+    code = 0
+    for reply in [replies] if isinstance(replies, Reply) else replies:
+        if reply.page:
+            echo(reply.page, err=form != "text")
+        if form == "json":
+            data = reply.data
+            parts = [json.dumps(finite(data), indent=1) + "\n"] if isinstance(data, Mapping) else data
+            sys.stdout.writelines(map(printable, parts))
+        elif form == "markdown":
+            text = [*reply.text]
+            echo("\n".join(markdown([part for part in text if isinstance(part, Section)])))
+            draw(*[part for part in text if isinstance(part, Remark)])
+        elif form == "csv" or reply.text == ():
+            sys.stdout.writelines(map(printable, reply.csv))
+        elif not reply.page:
+            for part in reply.text:
+                draw(part)
+        sys.stdout.flush()
+        for note in reply.notes:
+            say(note)
+        code = max(code, reply.exit_code)
+    return code
+
+
+def json_lines(rows: Iterable[object]) -> Iterator[str]:
+    """Yield values as JSON, a line each. NaN and infinity become null."""
+    return (json.dumps(finite(row), allow_nan=False) + "\n" for row in rows)
 
 
 def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
@@ -88,15 +128,12 @@ def csv_lines(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Itera
     yield from map(write, rows)
 
 
-def print_written(text: str, as_json: bool, *paths: Path, **more: object) -> None:
-    """Print what a command wrote: a text, or an object with the list `files`, of each its path and bytes.
+def written(text: str, *paths: Path, **more: object) -> Reply:
+    """Return what a command wrote: a text, or an object with the list `files`, of each its path and bytes.
 
     All files of a folder are listed; `more` are further keys of the object.
     """
-    if as_json:
-        print_json({"files": files_written(*paths)} | more)
-    else:
-        echo(text)
+    return Reply({"files": files_written(*paths)} | more, [text])
 
 
 def files_written(*paths: Path) -> list[dict[str, object]]:
@@ -139,8 +176,26 @@ def console(stderr: bool = False) -> Console:
     return drawn
 
 
-def draw(*parts: RenderableType) -> None:
-    """Print tables and lines on stdout; without trailing blanks unless stdout is a terminal."""
+def draw(*parts: Part) -> None:
+    """Print lines and tables on stdout, remarks on stderr."""
+    for part in parts:
+        if isinstance(part, Remark):
+            say(part)
+        elif isinstance(part, str):
+            echo(part)
+        elif isinstance(part, Section):
+            _render(facts(part.facts) if part.facts else title(part.title), *part.sentences)
+            draw(*part.grids, *map(patch_text, part.diffs))
+        elif isinstance(part, Mapping):
+            _render(facts(part))
+        elif isinstance(part, Grid):
+            _render(grid_table(part))
+        else:
+            _render(part)
+
+
+def _render(*parts: RenderableType) -> None:
+    """Print on stdout what Rich draws; without trailing blanks unless stdout is a terminal."""
     drawn = console()
     if drawn.is_terminal:
         for part in parts:
@@ -190,28 +245,25 @@ def table(
     Columns whose headings are in `left` are aligned to the left, as text is, others to the right; those in
     `shrinking` are truncated where a terminal is too narrow.
     """
-    return _table([(heading, heading in left, heading in shrinking) for heading in headings], rows)
-
-
-def grid_table(grid: Grid, shrinking: bool = False) -> Table:
-    """Return a grid as a table, numbers aligned to the right; its columns may shrink on a narrow terminal."""
-    columns = zip(grid.headings, grid.numeric, strict=True)
-    return _table([(heading, not is_number, shrinking) for heading, is_number in columns], grid.rows)
-
-
-def _table(columns: Sequence[tuple[str, bool, bool]], rows: Iterable[Iterable[str]]) -> Table:
-    """Return a table of columns: heading, whether it is aligned to the left, whether it may shrink."""
     from rich.align import Align
     from rich.table import Table
 
     drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    for heading, is_left, shrinks in columns:
-        side: Literal["left", "right"] = "left" if is_left else "right"
+    for heading in headings:
+        side: Literal["left", "right"] = "left" if heading in left else "right"
         header = Align(heading, side, vertical="bottom")
-        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=not shrinks)
+        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=heading not in shrinking)
     for row in rows:
         drawn.add_row(*row)
     return drawn
+
+
+def grid_table(grid: Grid) -> Table:
+    """Return a grid as a table, numbers aligned to the right; its columns shrink on a narrow terminal."""
+    columns = zip(grid.headings, grid.numeric, strict=True)
+    left = tuple(heading for heading, is_number in columns if not is_number)
+    shrinking = grid.headings if console().is_terminal else ()
+    return table(*grid.headings, rows=grid.rows, left=left, shrinking=shrinking)
 
 
 def facts(pairs: Mapping[str, str]) -> Table:
@@ -256,22 +308,6 @@ def patch_text(lines: Iterable[str]) -> Text:
 def on_one_line(text: str) -> str:
     """Return a text as a cell of a table that has a line for each row."""
     return printable(text.replace("\n", " ").replace("\t", " "))
-
-
-# --- sections of comparisons ------------------------------------------------------------------------------
-
-
-def print_sections(sections: Sequence[Section], as_markdown: bool) -> None:
-    """Print sections as tables, or as Markdown."""
-    if as_markdown:
-        echo("\n".join(markdown(sections)))
-        return
-    for section in sections:
-        draw(facts(section.facts) if section.facts else title(section.title), *section.sentences)
-        for part in section.grids:
-            draw(grid_table(part, shrinking=console().is_terminal))
-        for lines in section.diffs:
-            draw(patch_text(lines))
 
 
 def require_page(path: Path, force: bool) -> None:

@@ -1,4 +1,4 @@
-"""What commands on recorded runs share: find them, work on them, print what came of it."""
+"""What commands on recorded runs share: find them, work on them, reply what came of it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.archive.places import at_hand
-from runner.cli.output import draw, facts, print_json, say
+from runner.cli.output import Reply, say
 from runner.cli.progress import progress_line, steps_line
-from runner.errors import RecordingError, RunnerError, RunNotFound
+from runner.errors import ExitCode, RecordingError, RunnerError, RunNotFound
 from runner.recording.run_file import has_environment
 from runner.runs.resolve import find_run, find_runs
 from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, recordings_folder
@@ -172,7 +172,7 @@ def job_progress(label: str, episodes: int) -> Iterator[tuple[Report, Interrupt]
         yield report, interrupt
 
 
-# --- printing ---------------------------------------------------------------------------------------------
+# --- replying ---------------------------------------------------------------------------------------------
 
 
 def identity(run: Run) -> dict[str, object]:
@@ -181,12 +181,13 @@ def identity(run: Run) -> dict[str, object]:
     return {"run_id": run.run_id, "name": run.name, "seed": run.seed, "status": run.status, "path": path}
 
 
-def print_run(run: Run, as_json: bool, rows: dict[str, str], **more: object) -> None:
-    """Print a run that is over and its results, with further rows or keys of the JSON object."""
-    if as_json:
-        print_json(run_as_json(run) | more)
-    else:
-        draw(facts(run_facts(run) | rows))
+def run_reply(run: Run, rows: dict[str, str], interrupted: str = "", **more: object) -> Reply:
+    """Return a run that is over and its results, with further rows or keys of the JSON object.
+
+    `interrupted` says what can be done if the run was interrupted now.
+    """
+    notes, code = ([interrupted], ExitCode.INTERRUPTED) if interrupted else ([], ExitCode.OK)
+    return Reply(run_as_json(run) | more, [run_facts(run) | rows], notes=notes, exit_code=code)
 
 
 def run_as_json(run: Run) -> Json:
@@ -218,17 +219,15 @@ def _summary(run: Run) -> JsonView:
         return {**recording.done(), **run.summary}
 
 
-def print_received(run: Run, digest: str, existing: str, as_json: bool, **more: object) -> None:
-    """Print a run that was imported or downloaded.
+def received(run: Run, digest: str, existing: str, **more: object) -> Reply:
+    """Return a run that was imported or downloaded.
 
     `existing` is what was in the folder before, such as `this content`, empty if the run is new; `more` are
     further keys of the JSON object.
     """
     if existing:
         say(f"Run {run.run_id} is there already with {existing}; nothing was written.")
-    if as_json:
-        print_json(identity(run) | {"already": bool(existing), "content_digest": digest} | more)
-        return
+    values = identity(run) | {"already": bool(existing), "content_digest": digest} | more
     file = f"{run.recording}  {size(run.recording.stat().st_size)}"
     title = f"{run.run_id}  {run.title}, {run.status}"
-    draw(facts({"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}))
+    return Reply(values, [{"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}])

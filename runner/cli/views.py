@@ -7,13 +7,10 @@ from pathlib import Path
 from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     force_option,
-    json_option,
-    markdown_option,
     recordings_option,
-    require_one,
     run_argument,
 )
-from runner.cli.output import draw, facts, files_written, print_json, print_sections, say
+from runner.cli.output import Remark, Reply, files_written
 from runner.cli.parameter_types import FILE, INDEX, ExpressionText
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import command_for, compilation_notice, find_recorded
@@ -27,13 +24,10 @@ def command_of(view: View) -> Command:
     def call(
         run_name: str,
         recordings: Path | None,
-        as_json: bool,
-        as_markdown: bool,
         output: Path | None = None,
         force: bool = False,
         **values: object,
-    ) -> None:
-        require_one("as_json", "as_markdown")
+    ) -> Reply:
         if output is not None:
             require_new(output, force)
         run = find_recorded(run_name, recordings)
@@ -42,18 +36,16 @@ def command_of(view: View) -> Command:
         line = steps_line if view.counts_steps else stage_line
         with compilation_notice(), line(view.stage) as report, open_recording(run.recording) as recording:
             answer = view.compute(recording, **values, **({"report": report} if view.counts_steps else {}))
-        if output is not None:
-            with new_file(output, force) as temporary, temporary.open("wb") as stream:
-                answer.write(stream)
-        if as_json:
-            files = {} if output is None else {"files": files_written(output)}
-            print_json(answer.as_json() | files)
-            return
-        print_sections(answer.sections(), as_markdown)
-        if answer.step_to_look_at is not None and not as_markdown:
-            draw(facts({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))}))
-        if output is not None:
-            say(f"Written: {output.absolute()}")
+        data, text = answer.as_json(), [*answer.sections()]
+        if answer.step_to_look_at is not None:
+            text.append({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))})
+        if output is None:
+            return Reply(data, text)
+        with new_file(output, force) as temporary, temporary.open("wb") as stream:
+            answer.write(stream)
+        return Reply(
+            data | {"files": files_written(output)}, [*text, Remark(f"Written: {output.absolute()}")]
+        )
 
     declared = {
         "run_name": run_argument,
@@ -62,12 +54,8 @@ def command_of(view: View) -> Command:
     if view.file_ending:
         output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=view.file_help)
         declared |= {"output": output, "force": force_option}
-    declared |= {
-        "recordings": recordings_option,
-        "as_json": json_option,
-        "as_markdown": markdown_option,
-    }
-    return Command(view.name, call, declared, help=view.help)
+    declared["recordings"] = recordings_option
+    return Command(view.name, call, declared, forms=("json", "markdown"), help=view.help)
 
 
 def _declared(given: Input, view: View) -> Declared:

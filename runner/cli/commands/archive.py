@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,11 +10,11 @@ import click
 
 from runner.archive.places import default_target
 from runner.cli.command import Command, argument, option
-from runner.cli.options import json_option, recordings_option, runs_argument
-from runner.cli.output import draw, facts, print_json, say
+from runner.cli.options import recordings_option, runs_argument
+from runner.cli.output import Remark, Reply, json_lines, say
 from runner.cli.parameter_types import RunName
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import compilation_notice, find, print_received, print_run
+from runner.cli.runs import compilation_notice, find, received, run_reply
 from runner.errors import RunnerError
 from runner.runs.run import recordings_folder
 from runner.util.humanize import size
@@ -37,8 +38,7 @@ def archive_command(
     ),
     dry_run: bool = option("--dry-run", is_flag=True, help="Report the sizes, but write and change nothing."),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Iterator[Reply]:
     """Archive runs losslessly as Parquet, which DuckDB, pandas and Polars read (docs/archive.md).
 
     An archived run takes a tenth of the space. With --remove its recording is removed, but the run stays
@@ -61,30 +61,25 @@ def archive_command(
     for run in left or runs:
         with compilation_notice(), steps_line(f"archiving {run.run_id}") as report:
             archived = archive_run(run, target, remove, report, dry_run)
-        _print_archived(archived, dry_run, as_json)
+        yield _reply(archived, dry_run)
 
 
-def _print_archived(archived: Archived, dry_run: bool, as_json: bool) -> None:
+def _reply(archived: Archived, dry_run: bool) -> Reply:
     run, manifest = archived.run, archived.manifest
     topics = manifest.topics
     steps = sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
-    if as_json:
-        print_json(
-            {
-                "run_id": run.run_id,
-                "name": run.name,
-                "place": archived.place,
-                "content_digest": manifest.digest,
-                "steps": steps,
-                "bytes": manifest.size,
-                "recording_bytes": archived.recording_bytes,
-                "new": archived.new,
-                "removed": archived.removed,
-                "dry_run": dry_run,
-            },
-            indent=None,
-        )
-        return
+    values = {
+        "run_id": run.run_id,
+        "name": run.name,
+        "place": archived.place,
+        "content_digest": manifest.digest,
+        "steps": steps,
+        "bytes": manifest.size,
+        "recording_bytes": archived.recording_bytes,
+        "new": archived.new,
+        "removed": archived.removed,
+        "dry_run": dry_run,
+    }
     per_step = f", {manifest.size / steps:.2f} bytes per step" if steps else ""
     fate = "removed" if archived.removed else "kept"
     state = "" if archived.new else "  (existed already, undamaged)"
@@ -94,17 +89,15 @@ def _print_archived(archived: Archived, dry_run: bool, as_json: bool) -> None:
         "size": f"{size(manifest.size)}{per_step}; the recording: {size(archived.recording_bytes)}, {fate}",
         "digest": manifest.digest,
     }
-    draw(facts(rows))
-    if dry_run:
-        say("Nothing was kept: a dry run.")
+    remarks = [Remark("Nothing was kept: a dry run.")] if dry_run else []
+    return Reply(json_lines([values]), [rows, *remarks])
 
 
 @click.command("restore", cls=Command)
 def restore_command(
     run_name: str = argument(metavar="RUN|ARCHIVE", type=RunName()),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Restore the recording of an archived run, with the same content digest.
 
     ARCHIVE is the folder or URL of one run's archive: it becomes a run of the recordings folder again, even
@@ -126,7 +119,7 @@ def restore_command(
             run = restore_place(place, recordings_folder(recordings), report)
         else:
             run = restore_run(find(run_name, recordings), report)
-    print_run(run, as_json, {})
+    return run_reply(run, {})
 
 
 @click.command("import", cls=Command)
@@ -134,8 +127,7 @@ def import_command(
     file: Path = argument(metavar="FILE", type=click.Path(path_type=Path)),
     as_new: bool = option("--as-new", is_flag=True, help="Give the run a new id."),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Import FILE, a recording from elsewhere, into the folder of runs.
 
     FILE was written by `dualtaxi export mcap`, or is any recording. Every byte is checked before the run
@@ -156,4 +148,4 @@ def import_command(
     run, digest = imported.run, imported.content_digest
     is_same = run.summary.get("content_digest", digest) == digest
     existing = ("this content" if is_same else "this content and more") if imported.already else ""
-    print_received(run, digest, existing, as_json, anonymous=imported.anonymous)
+    return received(run, digest, existing, anonymous=imported.anonymous)

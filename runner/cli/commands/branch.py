@@ -14,12 +14,11 @@ from click.core import ParameterSource
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.jobs import job_option
-from runner.cli.options import json_option, recordings_option, run_argument, set_option, trust_option
-from runner.cli.output import draw, facts, grid_table, print_json, print_result, say
+from runner.cli.options import recordings_option, run_argument, set_option, trust_option
+from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import COUNT, INDEX, STEP
 from runner.cli.progress import steps_line
-from runner.cli.runs import command_for, compilation_notice, find_recorded, print_run, run_facts
-from runner.errors import ExitCode
+from runner.cli.runs import command_for, compilation_notice, find_recorded, run_facts, run_reply
 from runner.runs.run import Run
 from runner.util.humanize import counted, number
 
@@ -76,8 +75,7 @@ def branch_command(
     ),
     trust: bool = trust_option,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Change one step of RUN, and record what follows as a run of its own, with the same draws.
 
     A run that was trained here is retrained, the same up to the step. There the agents take other
@@ -114,8 +112,7 @@ def branch_command(
         )
     if run.can_train_again and ("all" in actions or at.after is not None):
         _refuse_what_training_takes()
-        _print_what_if(run, at, actions, as_json)
-        return
+        return _what_if(run, at, actions)
     from runner.api import Interrupt, interruptible
     from runner.debugging.branch import branch
     from runner.execution.branching import TrainingBranch
@@ -149,9 +146,8 @@ def branch_command(
     if actions and _repeats(run, branched_run):
         say(f"Note: {' and '.join(actions)} is the recorded action at {at}; nothing is changed by it.")
     if isinstance(branched_run, TrainingBranch):
-        _print_training(run, branched_run, as_json)
-    else:
-        _print_episode(run, branched_run, as_json)
+        return _trained(run, branched_run)
+    return _played(run, branched_run)
 
 
 def _refuse_what_training_takes() -> None:
@@ -188,7 +184,7 @@ def _action(actions: tuple[str, ...], run: Run) -> object:
     return actions[0] if actions else None
 
 
-def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
+def _trained(parent: Run, branch: TrainingBranch) -> Reply:
     run = branch.run
     results = [each.summary.last_evaluation for each in (parent, run)]
     success = [None if each is None else each.values.get("success_percent") for each in results]
@@ -203,13 +199,12 @@ def _print_training(parent: Run, branch: TrainingBranch, as_json: bool) -> None:
         compared = "more" if more > 0 else "fewer"
         rows["trained"] = f"for {total} in all, {abs(more):,} {compared} than the parent"
     rows["next"] = command_for(parent, "diff", run.run_id)
-    print_run(run, as_json, rows, origin=asdict(branch.origin), at=str(branch.at))
-    if run.status == "interrupted":
-        say(f"Interrupted: what was recorded is kept; `{command_for(run, 'resume')}` trains the rest.")
-        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
+    stopped = f"Interrupted: what was recorded is kept; `{command_for(run, 'resume')}` trains the rest."
+    interrupted = stopped if run.status == "interrupted" else ""
+    return run_reply(run, rows, interrupted, origin=asdict(branch.origin), at=str(branch.at))
 
 
-def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
+def _played(parent: Run, branch: Branch) -> Reply:
     from runner.debugging.branch import RAN_OUT
 
     if branch.outcome.end == RAN_OUT:
@@ -217,27 +212,25 @@ def _print_episode(parent: Run, branch: Branch, as_json: bool) -> None:
             "The branch outlived the recorded actions, and stopped with the last of them. "
             "--policy random, constant or MODULE:FUNCTION plays on to an end."
         )
-    if as_json:
-        both = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
-        print_json({"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both)
-        return
-
     outcomes = (("parent", parent.run_id, branch.parent), ("branch", branch.run.run_id, branch.outcome))
     played = [
         (name, run, each.returns_in_words, f"{each.length:,}", each.end) for name, run, each in outcomes
     ]
-    grid = grid_table(Grid(("", "run", "return", "length", "end"), played))
+    grid = Grid(("", "run", "return", "length", "end"), played)
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
-    draw(facts(rows), grid, facts({"next": command_for(parent, "diff", branch.run.run_id)}))
+    both = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
+    return Reply(
+        {"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both,
+        [rows, grid, {"next": command_for(parent, "diff", branch.run.run_id)}],
+    )
 
 
-def _print_what_if(run: Run, at: EpisodeRef, actions: tuple[str, ...], as_json: bool) -> None:
-    """Print where joint actions at a step lead: each of those that are named, or all."""
+def _what_if(run: Run, at: EpisodeRef, actions: tuple[str, ...]) -> Reply:
+    """Return where joint actions at a step lead: each of those that are named, or all."""
     from runner.debugging.what_if import what_if
 
     with compilation_notice():
         result = what_if(run, at=at, actions=actions)
-    head = facts({"run": f"{run.run_id}  {run.title}"} | result.facts)
-    print_result(as_json, result.as_json(), head, "", grid_table(result.grid))
-    for note in () if as_json else result.notes:
-        say(f"Note: {note}.")
+    head = {"run": f"{run.run_id}  {run.title}"} | result.facts
+    remarks = [Remark(f"Note: {note}.") for note in result.notes]
+    return Reply(result.as_json(), [head, "", result.grid, *remarks])

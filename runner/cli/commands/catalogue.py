@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import click
 
@@ -15,12 +15,11 @@ from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     filter_argument,
     folders_option,
-    json_option,
     limit_option,
     recordings_option,
     run_argument,
 )
-from runner.cli.output import draw, facts, print_json, print_result, say, table, title
+from runner.cli.output import Remark, Reply, say, table, title
 from runner.cli.runs import find
 from runner.errors import ExitCode, RunnerError
 from runner.runs.catalogue.columns import with_same_as
@@ -28,8 +27,12 @@ from runner.runs.run import label
 from runner.util.humanize import UNKNOWN, duration, size
 
 if TYPE_CHECKING:
+    from runner.cli.output import Part
     from runner.runs.catalogue.index import CatalogueIndex
     from runner.runs.catalogue.usage import Sums, Usage
+
+_LARGEST: Final = 20
+"""Runs in the text of `du` by default."""
 
 
 @click.command("label", cls=Command)
@@ -46,8 +49,7 @@ def label_command(
         "--untag", multiple=True, metavar="TAG", help="Remove a tag; may be repeated."
     ),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Change the name, note and tags of RUN, and show them.
 
     They are stored in labels.json next to the recording, which stays as it is. A run tagged `keep` is never
@@ -69,9 +71,8 @@ def label_command(
     values = {"run_id": run.run_id, "name": shown_name, "tags": list(labels.tags), "note": labels.note}
     tag_list = " ".join(labels.tags) or UNKNOWN
     rows = {"run": run.run_id, "name": shown_name, "tags": tag_list, "note": labels.note or UNKNOWN}
-    print_result(as_json, values, facts(rows))
-    if missing:
-        say(f"Run {run.run_id} had no tag {', '.join(missing)}.")
+    notes = [f"Run {run.run_id} had no tag {', '.join(missing)}."] if missing else []
+    return Reply(values, [rows], notes=notes)
 
 
 @click.command("mark", cls=Command)
@@ -84,8 +85,7 @@ def mark_command(
         "--unmark", multiple=True, metavar="MARK", help="Remove a mark by its id; may be repeated."
     ),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Mark a STEP of RUN with a TEXT, and list the marks of the run.
 
     A STEP is EPISODE:T, eval:N:TRIAL:T, step:N, or typical, best, worst or last. Marks are stored in
@@ -108,7 +108,7 @@ def mark_command(
     rows = [(mark.id, mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
     grid = table("mark", "step", "text", "tags", rows=rows, left=("mark", "step", "text", "tags"))
     values = {"run_id": run.run_id, "marks": [mark.as_row() for mark in run.marks]}
-    print_result(as_json, values, grid if rows else f"Run {run.run_id} has no marks.")
+    return Reply(values, [grid if rows else f"Run {run.run_id} has no marks."])
 
 
 def _from_stdin() -> str:
@@ -122,9 +122,8 @@ def _from_stdin() -> str:
 def du_command(
     words: tuple[str, ...] = filter_argument,
     recordings: tuple[Path, ...] = folders_option,
-    limit: int | None = limit_option("20, with --json all"),
-    as_json: bool = json_option,
-) -> None:
+    limit: int | None = limit_option(f"{_LARGEST}, with --json all"),
+) -> Reply:
     """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
 
     It counts recordings; exports made by `view` and recordings restored from archives, both kept in the
@@ -140,28 +139,24 @@ def du_command(
     from runner.runs.catalogue.usage import usage_of
 
     chosen = parse(" ".join(words))
-    if limit is None and not as_json:
-        limit = 20
     largest, sums = usage_of(lambda work: look(recordings, work, say), chosen, limit or None)
     freeable = sums.freeable(recordings)
-    if as_json:
-        runs = [
-            {
-                "run_id": usage.row["id"],
-                **{key: usage.row[key] for key in ("name", "status", "same_as")},
-                "path": str(Path(usage.row["root"], usage.row["entry"])),
-                **usage.bytes,
-            }
-            for usage in largest
-        ]
-        print_json({"runs": runs, "total": sums.bytes, "freeable": freeable})
-    elif sums.runs:
-        _draw(largest, sums, freeable)
-    else:
-        say(f"No run in {', '.join(map(str, recordings))} matches." if words else "No runs yet.")
+    runs = (
+        {
+            "run_id": usage.row["id"],
+            **{key: usage.row[key] for key in ("name", "status", "same_as")},
+            "path": str(Path(usage.row["root"], usage.row["entry"])),
+            **usage.bytes,
+        }
+        for usage in largest
+    )
+    nothing = f"No run in {', '.join(map(str, recordings))} matches." if words else "No runs yet."
+    shown = largest[:_LARGEST] if limit is None else largest
+    text = _text(shown, sums, freeable) if sums.runs else [Remark(nothing)]
+    return Reply({"runs": [*runs], "total": sums.bytes, "freeable": freeable}, text)
 
 
-def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> None:
+def _text(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Iterator[Part]:
     from runner.runs.catalogue.usage import FREED_BY
 
     total = sums.bytes
@@ -181,14 +176,15 @@ def _draw(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Non
         rest = {kind: total[kind] - sum(usage.bytes[kind] for usage in largest) for kind in kinds}
         grid.add_row(f"{sums.runs - len(largest):,} more", "", "", *cells(rest))
     grid.add_row("all", "", "", *cells(total), style="bold")
-    draw(grid)
+    yield grid
     reasons = {
         FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
         for kind, count in freeable.items()
         if count
     }
     if reasons:
-        draw(title("Could be freed"), facts(reasons))
+        yield title("Could be freed")
+        yield reasons
 
 
 class _Contents(NamedTuple):
@@ -209,7 +205,7 @@ def index_command() -> None:
 
 
 @index_command.command("rebuild")
-def rebuild(recordings: tuple[Path, ...] = folders_option, as_json: bool = json_option) -> None:
+def rebuild(recordings: tuple[Path, ...] = folders_option) -> Reply:
     """Rebuild the index from the runs in the recordings folder.
 
     This is never required: commands notice changes by themselves, and the index holds nothing of its own.
@@ -226,26 +222,23 @@ def rebuild(recordings: tuple[Path, ...] = folders_option, as_json: bool = json_
     statuses, copies, problems = look(recordings, _contents, say, rebuild=True)
     took, runs = time.monotonic() - began, statuses.total()
     counts = dict(sorted(statuses.items()))
-    if as_json:
-        print_json(
-            {
-                "runs": runs,
-                "same_content": copies,
-                "statuses": counts,
-                "problems": problems,
-                "seconds": round(took, 3),
-                "index": str(index_path()),
-            }
-        )
-    else:
-        listed = ", ".join(f"{count:,} {status}" for status, count in counts.items())
-        rows = {"runs": f"{runs:,}" + (f": {listed}" if listed else "")}
-        if copies:
-            rows["same"] = f"{copies:,} of them recorded the same content as an earlier run"
-        draw(facts(rows | {"took": duration(took), "index": str(index_path())}))
-        for problem in problems:
-            say(problem)
-    raise click.exceptions.Exit(ExitCode.DIFFERENT if problems else ExitCode.OK)
+    values = {
+        "runs": runs,
+        "same_content": copies,
+        "statuses": counts,
+        "problems": problems,
+        "seconds": round(took, 3),
+        "index": str(index_path()),
+    }
+    listed = ", ".join(f"{count:,} {status}" for status, count in counts.items())
+    rows = {
+        "runs": f"{runs:,}" + (f": {listed}" if listed else ""),
+        "same": f"{copies:,} of them recorded the same content as an earlier run" if copies else "",
+        "took": duration(took),
+        "index": str(index_path()),
+    }
+    code = ExitCode.DIFFERENT if problems else ExitCode.OK
+    return Reply(values, [rows, *map(Remark, problems)], exit_code=code)
 
 
 def _contents(index: CatalogueIndex) -> _Contents:

@@ -15,7 +15,6 @@ from runner.cli.options import (
     checkpoint_option,
     episode_option,
     force_option,
-    json_option,
     output_option,
     policy_option,
     recordings_option,
@@ -23,7 +22,7 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import csv_lines, draw, echo, files_written, print_json, say, table
+from runner.cli.output import Remark, Reply, csv_lines, table, written
 from runner.cli.progress import stage_line
 from runner.cli.runs import find_recorded
 from runner.export.places import new_file, write_text_new
@@ -37,9 +36,7 @@ _LEFT: Final = ("checkpoint", "phase", "format", "digest", "content")
 
 
 @click.command("checkpoints", cls=Command)
-def checkpoints_command(
-    run_name: str = run_argument, recordings: Path | None = recordings_option, as_json: bool = json_option
-) -> None:
+def checkpoints_command(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Reply:
     """List the checkpoints of RUN, which a loop recorded by `rec.checkpoint(name, ...)`.
 
     Examples:
@@ -47,12 +44,6 @@ def checkpoints_command(
       dualtaxi checkpoints cartpole --json
     """
     checkpoints = find_recorded(run_name, recordings).checkpoints()
-    if as_json:
-        print_json({"checkpoints": [checkpoint.as_json() for checkpoint in checkpoints]})
-        return
-    if not checkpoints:
-        say("There are no checkpoints; a loop records one by rec.checkpoint(name, value).")
-        return
     rows = (
         (
             each.reference,
@@ -65,7 +56,11 @@ def checkpoints_command(
         )
         for each in checkpoints
     )
-    draw(table(*_HEADINGS, rows=rows, left=_LEFT))
+    nothing = Remark("There are no checkpoints; a loop records one by rec.checkpoint(name, value).")
+    return Reply(
+        {"checkpoints": [checkpoint.as_json() for checkpoint in checkpoints]},
+        [table(*_HEADINGS, rows=rows, left=_LEFT) if checkpoints else nothing],
+    )
 
 
 @click.group("checkpoint", cls=CommandGroup)
@@ -84,8 +79,7 @@ def get_command(
     output: Path | None = output_option("NAME-STEP.FORMAT"),
     force: bool = force_option,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Write a checkpoint of RUN into a file, after comparing its digest.
 
     @STEP is the last checkpoint at or before that step, NAME@STEP the last one of that name; @latest is the
@@ -104,10 +98,8 @@ def get_command(
     checkpoint.check()
     with new_file(path, force) as temporary:
         shutil.copyfile(checkpoint.path, temporary)
-    if as_json:
-        print_json(checkpoint.as_json() | {"files": files_written(path)})
-    else:
-        echo(f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}")
+    text = f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}"
+    return written(text, path, **checkpoint.as_json())
 
 
 @click.command("values", cls=Command)
@@ -123,8 +115,7 @@ def values_command(
     force: bool = force_option,
     trust: bool = trust_option,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Compute what the agent of a checkpoint of RUN returns at each step of a recorded episode.
 
     --policy names a function of yours that takes the checkpoint's content (arrays by name, or bytes) and the
@@ -154,18 +145,19 @@ def values_command(
     for name, values in along.values.items():
         columns |= _columns(name, values)
     rows = list(zip(*columns.values(), strict=True))
+    about = {
+        "run_id": run.run_id,
+        "phase": at.phase,
+        "episode": number,
+        "checkpoint": chosen.as_json(),
+        "policy": policy,
+        "steps": [dict(zip(columns, row, strict=True)) for row in rows],
+    }
     if output is not None:
         write_text_new(output, force, "".join(csv_lines(columns, rows)))
-    if as_json:
-        facts = {"phase": at.phase, "episode": number, "checkpoint": chosen.as_json(), "policy": policy}
-        steps = [dict(zip(columns, row, strict=True)) for row in rows]
-        files = [] if output is None else files_written(output)
-        print_json({"run_id": run.run_id, **facts, "steps": steps, "files": files})
-    elif output is not None:
-        echo(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps")
-    else:
-        shown = ((f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows)
-        draw(table(*columns, rows=shown))
+        return written(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps", output, **about)
+    shown = ((f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows)
+    return Reply(about | {"files": []}, [table(*columns, rows=shown)])
 
 
 def _columns(name: str, values: Any) -> dict[str, list[object]]:

@@ -15,14 +15,11 @@ from runner.cli.options import (
     compared_argument,
     force_option,
     html_option,
-    json_option,
-    markdown_option,
     normalise_option,
     recordings_option,
-    require_one,
     target_option,
 )
-from runner.cli.output import echo, print_json, print_sections, require_page, say
+from runner.cli.output import Reply, require_page
 from runner.cli.parameter_types import INDEX, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_all_recorded, find_recorded
@@ -41,7 +38,7 @@ if TYPE_CHECKING:
     from runner.analysis.series import RunSeries
 
 
-@click.command("compare", cls=Command)
+@click.command("compare", cls=Command, forms=("json", "markdown"))
 def compare_command(
     run_names: tuple[str, ...] = compared_argument,
     by: str | None = option(
@@ -67,12 +64,10 @@ def compare_command(
     ),
     target: tuple[str, float] | None = target_option(multiple=False),
     normalise: str | None = normalise_option,
-    as_json: bool = json_option,
-    as_markdown: bool = markdown_option,
     html: Path | None = html_option,
     force: bool = force_option,
     recordings: Path | None = recordings_option,
-) -> None:
+) -> Reply:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 
     Runs that differ in nothing but the seed are one group; the name of several runs stands for all of them,
@@ -102,7 +97,6 @@ def compare_command(
     from runner.analysis.compare.statistics import require_scipy
     from runner.analysis.series import series_of
 
-    require_one("as_json", "as_markdown")
     require_scipy()
     if html is not None:
         require_page(html, force)
@@ -121,14 +115,10 @@ def compare_command(
         made = _compare(series, by, chosen, read_at, normalise, html is not None)
         if html is not None:
             write_text_new(html, force, made.page)
-    if html is not None:
-        for note in made.result.notes:
-            say(f"Note: {note}.")
-        (say if as_json else echo)(f"{html}: {made.contents}")
-    if as_json:
-        print_json(dataclasses.asdict(made.result))
-    elif html is None:
-        print_sections(made.sections, as_markdown)
+    if html is None:
+        return Reply(dataclasses.asdict(made.result), made.sections)
+    notes = [f"Note: {note}." for note in made.result.notes]
+    return Reply(dataclasses.asdict(made.result), made.sections, page=f"{html}: {made.contents}", notes=notes)
 
 
 class _Made(NamedTuple):
@@ -171,13 +161,11 @@ def _compare(
     )
 
 
-@click.command("diff", cls=Command)
+@click.command("diff", cls=Command, forms=("json", "markdown"))
 def diff_command(
     a: str = argument(metavar="A", type=RunName()),
     b: str = argument(metavar="B", type=RunName()),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-    as_markdown: bool = markdown_option,
     html: Path | None = html_option,
     force: bool = force_option,
     ignore: tuple[str, ...] = option(
@@ -193,7 +181,7 @@ def diff_command(
         help="Compare only settings and where training first diverges, not the tables.",
     ),
     targets: tuple[tuple[str, float], ...] = target_option(multiple=True),
-) -> None:
+) -> Reply:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
     --all also shows what is equal. Exit code 0 if both have the same content, 1 if not.
@@ -207,24 +195,26 @@ def diff_command(
     from runner.analysis.diff.sections import sections
     from runner.recording.reader import open_recording
 
-    require_one("as_json", "as_markdown")
     if html is not None:
         require_page(html, force)
     left, right = find_recorded(a, recordings), find_recorded(b, recordings)
-    with open_recording(left.recording) as recording_a, open_recording(right.recording) as recording_b:
-        with compilation_notice(), stage_line("comparing") as stage:
-            difference = differences.diff(recording_a, recording_b, dict(targets), first)
-            difference = difference if first else differences.with_seconds(difference, left, right)
-            difference = differences.without_ignored(difference, ignore, everything)
-            if html is not None:
-                from runner.export.reports.diff import render_diff
-
-                stage("drawing the page")
-                write_text_new(html, force, render_diff(difference, recording_a, recording_b))
+    with (
+        open_recording(left.recording) as recording_a,
+        open_recording(right.recording) as recording_b,
+        compilation_notice(),
+        stage_line("comparing") as stage,
+    ):
+        difference = differences.diff(recording_a, recording_b, dict(targets), first)
+        difference = difference if first else differences.with_seconds(difference, left, right)
+        difference = differences.without_ignored(difference, ignore, everything)
         if html is not None:
-            (say if as_json or as_markdown else echo)(f"{html}: {size(html.stat().st_size)}")
-    if as_json:
-        print_json(differences.as_json(difference))
-    elif html is None or as_markdown:
-        print_sections(sections(difference, everything), as_markdown)
-    raise click.exceptions.Exit(ExitCode.OK if difference.same_content else ExitCode.DIFFERENT)
+            from runner.export.reports.diff import render_diff
+
+            stage("drawing the page")
+            write_text_new(html, force, render_diff(difference, recording_a, recording_b))
+    return Reply(
+        differences.as_json(difference),
+        sections(difference, everything),
+        page="" if html is None else f"{html}: {size(html.stat().st_size)}",
+        exit_code=ExitCode.OK if difference.same_content else ExitCode.DIFFERENT,
+    )

@@ -13,15 +13,12 @@ import click
 from runner.cli.command import Command, argument, option
 from runner.cli.jobs import job_option
 from runner.cli.options import (
-    json_option,
-    markdown_option,
     ray_option,
     recordings_option,
-    require_one,
     trust_option,
     workers_option,
 )
-from runner.cli.output import draw, facts, print_json, print_sections, say
+from runner.cli.output import Reply, say
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import total_line
 from runner.util.humanize import counted, duration
@@ -38,7 +35,7 @@ class _Planned(Exception):
         self.plan = plan
 
 
-@click.command("explain", cls=Command)
+@click.command("explain", cls=Command, forms=("json", "markdown"))
 @job_option
 def explain_command(
     a: str = argument(metavar="A"),
@@ -68,10 +65,8 @@ def explain_command(
         "--dry-run", is_flag=True, help="Show what would be trained and how long it takes, and stop."
     ),
     trust: bool = trust_option,
-    as_markdown: bool = markdown_option,
-    as_json: bool = json_option,
     recordings: Path | None = recordings_option,
-) -> None:
+) -> Reply:
     """Train mixtures of A and B to find which settings make the difference.
 
     A and B are runs, or configurations: files, or names of shipped ones. The same seeds and draws are
@@ -89,8 +84,6 @@ def explain_command(
     """
     from runner.debugging.explain import explain
     from runner.debugging.explanation import sections
-
-    require_one("as_json", "as_markdown")
 
     def planned(plan: SamplingPlan) -> None:
         if dry_run:
@@ -117,19 +110,13 @@ def explain_command(
             )
     except _Planned as stopped:
         plan = stopped.plan
-        if as_json:
-            times = {"seconds": plan.seconds, "most_seconds": plan.most_seconds}
-            print_json(dataclasses.asdict(plan) | times)
-        else:
-            draw(facts({"settings": str(plan.settings), "runs": _in_words(plan)}))
-        return
+        times = {"seconds": plan.seconds, "most_seconds": plan.most_seconds}
+        text = {"settings": str(plan.settings), "runs": _in_words(plan)}
+        return Reply(dataclasses.asdict(plan) | times, [text])
     except KeyboardInterrupt:
         say("Interrupted. What was trained is kept: the same command continues.")
         raise
-    if as_json:
-        print_json(explanation.as_json())
-    else:
-        print_sections(sections(explanation), as_markdown)
+    return Reply(explanation.as_json(), sections(explanation))
 
 
 def _in_words(plan: SamplingPlan) -> str:

@@ -10,7 +10,7 @@ import click
 from runner.cli.command import Command, CommandGroup, option
 from runner.cli.commands import export_film, export_tables, export_tools
 from runner.cli.options import Writing, run_argument, selection_options, writing_options
-from runner.cli.output import say
+from runner.cli.output import Reply, say, written
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import new_file, require_new
@@ -32,7 +32,7 @@ class ExportGroup(CommandGroup):
         """Return the command of an export that an installed package adds."""
         added = installed_export(name)
 
-        def call(run_name: str, to: Writing) -> None:
+        def call(run_name: str, to: Writing) -> Reply:
             from runner.recording.reader import open_recording
 
             run = find_recorded(run_name, to.recordings)
@@ -43,7 +43,7 @@ class ExportGroup(CommandGroup):
                 stage_line(f"exporting {run.run_id}"),
             ):
                 added.write(recording, temporary)
-            to.report(f"{path}  {size(path.stat().st_size)}", path)
+            return written(f"{path}  {size(path.stat().st_size)}", path)
 
         to = writing_options(f"NAME-RUN{added.ending}", f"FILE{added.ending}")
         return Command(name, call, {"run_name": run_argument, "to": to}, help=added.help)
@@ -63,7 +63,7 @@ def rerun(
     run_name: str = run_argument,
     selected: Request = selection_options,
     to: Writing = writing_options("exports/NAME-RUN.rrd", "FILE.rrd"),
-) -> None:
+) -> Reply:
     """Export RUN for the Rerun viewer, arranged and ready to look at.
 
     All metrics are exported. By default the steps are those of 20 training episodes spread from the first to
@@ -89,7 +89,7 @@ def rerun(
     print_selection(selection)
     took = duration(time.monotonic() - started)
     text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"
-    to.report(text, path, steps=selection.steps, left_out=selection.left_out)
+    return written(text, path, steps=selection.steps, left_out=selection.left_out)
 
 
 def print_selection(selection: Selection) -> None:
@@ -109,7 +109,7 @@ def mcap(
         "--anonymous", is_flag=True, help="Leave out host, user, command line and folder."
     ),
     to: Writing = writing_options("NAME-RUN.mcap"),
-) -> None:
+) -> Reply:
     """Write RUN into one MCAP file with its labels, for `dualtaxi import` on another machine.
 
     Every MCAP reader opens the file. The same run gives the same bytes. An interrupted run can be exported,
@@ -128,7 +128,7 @@ def mcap(
     for warning in exported.warnings:
         say(warning)
     text = f"{path}  {size(path.stat().st_size)}; `dualtaxi import {path}` takes it in"
-    to.report(text, path, anonymous=anonymous)
+    return written(text, path, anonymous=anonymous)
 
 
 for _command in (

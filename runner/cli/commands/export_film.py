@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from runner.cli.options import (
     trust_option,
     writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import Reply, say, written
 from runner.cli.parameter_types import GRID
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
@@ -66,7 +67,7 @@ def command(
     ),
     trust: bool = trust_option,
     to: Writing = writing_options("exports/NAME-RUN.mp4"),
-) -> None:
+) -> Reply:
     """Make a film of a recorded episode of RUN; the ending of the file chooses the format.
 
     Each frame has step, action, rewards and events written below it. What it shows is the best that there
@@ -129,15 +130,14 @@ def command(
         say(f"{cut} of {len(shown)} episodes are longer than the film, {longest:,} steps; --whole shows all.")
     what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
     facts = f"{made.frames:,} frames of {made.size[0]}x{made.size[1]}, {size(path.stat().st_size)}"
-    to.report(
+    reply = written(
         f"{path}: {what}, {opened[0].source}, {facts}",
         path,
         episodes=[one.title for one in shown],
         source=str(opened[0].source),
         frames=made.frames,
     )
-    if notes:
-        raise SystemExit(ExitCode.DIFFERENT)
+    return replace(reply, exit_code=ExitCode.DIFFERENT if notes else ExitCode.OK)
 
 
 def _ranked(recording: Recording, grid: tuple[int, int]) -> list[EpisodeRef]:

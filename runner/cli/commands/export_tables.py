@@ -6,7 +6,7 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import Writing, episodes_option, run_argument, writing_options
-from runner.cli.output import say
+from runner.cli.output import Reply, say, written
 from runner.cli.progress import count_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder
@@ -29,7 +29,7 @@ def csv(
     episodes: Ranges | None = episodes_option,
     gz: bool = option("--gz", is_flag=True, help="Compress each file with gzip."),
     to: Writing = writing_options("exports/NAME-RUN-csv", "FOLDER"),
-) -> None:
+) -> Reply:
     """Export RUN as CSV: steps.csv, episodes.csv and metrics.csv in a folder.
 
     Columns are named as the recording's fields; each agent's action and reward has its own. metrics.csv has
@@ -41,7 +41,7 @@ def csv(
       dualtaxi export csv k3v9m2xq --gz --phase eval -o trials
       dualtaxi export csv k3v9m2xq --episodes 0..20,2980.. --force
     """
-    _export("csv", run_name, phase, episodes, gz, to)
+    return _export("csv", run_name, phase, episodes, gz, to)
 
 
 @click.command("parquet", cls=Command, short_help=_HELP)
@@ -50,7 +50,7 @@ def parquet(
     phase: str | None = _phase_option,
     episodes: Ranges | None = episodes_option,
     to: Writing = writing_options("exports/NAME-RUN-parquet", "FOLDER"),
-) -> None:
+) -> Reply:
     """Export RUN as Parquet: steps.parquet, episodes.parquet and metrics.parquet in a folder.
 
     Columns are named as the recording's fields; each agent's action and reward has its own. For a loop there
@@ -61,12 +61,12 @@ def parquet(
       dualtaxi export parquet @latest
       dualtaxi export parquet k3v9m2xq --episodes 0..20 -o first
     """
-    _export("parquet", run_name, phase, episodes, False, to)
+    return _export("parquet", run_name, phase, episodes, False, to)
 
 
 def _export(
     form: str, run_name: str, phase: str | None, episodes: Ranges | None, gz: bool, to: Writing
-) -> None:
+) -> Reply:
     require("pyarrow", extra="archive", purpose=f"export {form}")
     from runner.export.tables import PATTERNS, left_out, write_tables
 
@@ -78,4 +78,4 @@ def _export(
         if form == "csv" and (large := left_out(recording)):
             say(f"Left out, as CSV cannot hold bytes: {', '.join(large)}; `export parquet` has them.")
     lines = [f"{path / name}  {size((path / name).stat().st_size)}, {n:,} rows" for name, n in rows.items()]
-    to.report("\n".join(lines), *(path / name for name in rows), rows=rows)
+    return written("\n".join(lines), *(path / name for name in rows), rows=rows)

@@ -11,7 +11,7 @@ from runner.cli.options import (
     run_argument,
     writing_options,
 )
-from runner.cli.output import say
+from runner.cli.output import Reply, say, written
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import opened_run
 from runner.export.places import new_folder
@@ -30,7 +30,7 @@ def minari(
     ),
     episodes: Ranges | None = episodes_option,
     to: Writing = writing_options("exports/minari", "FOLDER"),
-) -> None:
+) -> Reply:
     """Export the episodes of RUN as a Minari dataset: observations, actions, rewards, how each ended.
 
     An observation is a state, an action a joint action, a reward the sum over the learners; with several
@@ -49,21 +49,20 @@ def minari(
         path = folder / dataset_id(recording)
         total = recording.phase(phase).episodes.count()
         with new_folder(path, to.force, PATTERNS) as fresh, count_line("episodes", total) as report:
-            written = write_dataset(recording, fresh, phase, episodes or (), report)
-    for note in written.notes:
+            dataset = write_dataset(recording, fresh, phase, episodes or (), report)
+    for note in dataset.notes:
         say(note)
     text = (
-        f"{path}  {written.episodes:,} episodes, {written.steps:,} steps; read it by: "
+        f"{path}  {dataset.episodes:,} episodes, {dataset.steps:,} steps; read it by: "
         f"MINARI_DATASETS_PATH={folder} and minari.load_dataset('{path.name}')"
     )
-    counts = {"episodes": written.episodes, "steps": written.steps}
-    to.report(text, path, dataset=path.name, **counts)
+    return written(text, path, dataset=path.name, episodes=dataset.episodes, steps=dataset.steps)
 
 
 @click.command("tensorboard", cls=Command, short_help="An event file for TensorBoard.")
 def tensorboard(
     run_name: str = run_argument, to: Writing = writing_options("exports/tensorboard/NAME-RUN", "FOLDER")
-) -> None:
+) -> Reply:
     """Export RUN for TensorBoard: every metric, and length and return of each training episode.
 
     Each number is at its training step. TensorBoard itself keeps numbers as 32-bit floats, and shows a
@@ -84,4 +83,4 @@ def tensorboard(
         f"{path}  {count:,} numbers; view them by: "
         f"tensorboard --logdir {path.parent} --samples_per_plugin scalars=100000"
     )
-    to.report(text, path, numbers=count)
+    return written(text, path, numbers=count)

@@ -8,13 +8,13 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import filter_argument, folders_option, json_option, limit_option
-from runner.cli.output import aligned, console, csv_lines, draw, echo, json_list, on_one_line, say, table
+from runner.cli.options import filter_argument, folders_option, limit_option, require_one
+from runner.cli.output import Reply, aligned, console, csv_lines, json_list, on_one_line, say, table
 from runner.cli.parameter_types import INDEX
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
@@ -31,6 +31,7 @@ from runner.util.humanize import capitalised
 from runner.util.values import Json
 
 if TYPE_CHECKING:
+    from runner.cli.output import Part
     from runner.runs.catalogue.filters import Filter
     from runner.runs.catalogue.index import CatalogueIndex
 
@@ -81,16 +82,7 @@ Row = Json
 Render = Callable[[Iterable[Row], Sequence[str]], Iterator[str]]
 
 
-class _Query(NamedTuple):
-    """Which runs are listed, in which order."""
-
-    filter: Filter
-    sort: str
-    limit: int | None
-    offset: int
-
-
-@click.command("ls", cls=Command)
+@click.command("ls", cls=Command, forms=("csv", "json"))
 def ls_command(
     words: tuple[str, ...] = filter_argument,
     recordings: tuple[Path, ...] = folders_option,
@@ -101,9 +93,7 @@ def ls_command(
     limit: int | None = limit_option(f"{ON_A_TERMINAL} in a terminal's table, else all"),
     offset: int = option("--offset", type=INDEX, default=0, metavar="N", help="Skip the first N."),
     quiet: bool = option("-q", "--quiet", is_flag=True, help="Print ids only."),
-    as_csv: bool = option("--csv", is_flag=True, help="Print CSV."),
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """List the runs that match FILTER, or all, newest first.
 
     A filter is a list of words, searched for in id, name, configuration, tags and note, or a condition in
@@ -131,86 +121,100 @@ def ls_command(
     """  # noqa: D301 - Click's mark for preformatted text
     from runner.runs.catalogue.filters import parse
 
-    if sum((quiet, as_csv, as_json)) > 1:
-        raise click.UsageError("--quiet, --csv and --json exclude each other: choose one.")
-    chosen = parse(" ".join(words))
+    require_one("quiet", "as_csv", "as_json")
     shown = columns_of(columns) if columns else None
-    render: Render | None = _ids if quiet else _csv_lines if as_csv else _objects if as_json else None
-    if limit is None and render is None and sys.stdout.isatty():
-        limit = ON_A_TERMINAL
-    query = _Query(chosen, sort, limit or None, offset)
-    if render is not None:
-        columns_shown = ["id"] if quiet else shown or list(DEFAULT_JSON)
-        listed, total, problems = _stream(recordings, query, columns_shown, render)
-    else:
-        rows, total = _page(recordings, query, shown or _DEFAULT_COLUMNS)
-        listed, problems = len(rows), [row["problem"] for row in rows if row["problem"]]
+    listing = _Listing(recordings, parse(" ".join(words)), sort, limit, offset)
+    if quiet:
+        return Reply(csv=listing.lines(["id"], _ids), notes=listing.notes())
+    names = shown or list(DEFAULT_JSON)
+    return Reply(
+        listing.lines(names, _objects),
+        listing.table(shown),
+        listing.lines(names, _csv_lines),
+        notes=listing.notes(),
+    )
+
+
+class _Listing:
+    """The runs that match a filter; once one form of them is read, how many, and which are damaged."""
+
+    def __init__(
+        self, recordings: tuple[Path, ...], matching: Filter, sort: str, limit: int | None, offset: int
+    ) -> None:
+        self._recordings, self._filter, self._sort = recordings, matching, sort
+        self._limit, self._offset = limit, offset
+        self._total, self._listed = 0, 0
+        self._problems: list[str] = []
+
+    def lines(self, columns: Sequence[str], render: Render) -> Iterator[str]:
+        """Yield a text of the runs in bounded memory.
+
+        It goes to a temporary file first: the index is locked while it is read, and the reader of the output
+        may be slow.
+        """
+        from runner.runs.catalogue.index import look, order_of
+
+        order, limit = order_of(self._sort), self._limit or None
+        needed = needed_for([*columns, "same_as"] if "same_as" in columns else columns)
+
+        def work(index: CatalogueIndex) -> int:
+            spool.seek(0)
+            spool.truncate()
+            self._listed, self._problems = 0, []
+            rows: Iterable[Row]
+            if limit is None:
+                total = index.count(self._filter)
+                rows = islice(index.rows(self._filter, *order, columns=needed), self._offset, None)
+            else:
+                rows, total = index.page(self._filter, *order, limit=limit, offset=self._offset)
+            if "same_as" in columns:
+                rows = with_same_as(rows, index.originals())
+            spool.writelines(render(self._noted(rows), columns))
+            return total
+
+        with tempfile.SpooledTemporaryFile(_SPOOL_BYTES, "w+", encoding="utf-8", newline="") as spool:
+            self._total = look(self._recordings, work, say)
+            spool.seek(0)
+            while part := spool.read(_READ_BYTES):
+                yield part
+
+    def table(self, columns: Sequence[str] | None) -> Iterator[Part]:
+        """Yield a table of the runs, by default of the columns that are of interest here."""
+        from runner.runs.catalogue.index import look, order_of
+
+        order, needed = order_of(self._sort), needed_for([*(columns or _DEFAULT_COLUMNS), "same_as"])
+        limit = ON_A_TERMINAL if self._limit is None and sys.stdout.isatty() else self._limit or None
+
+        def work(index: CatalogueIndex) -> tuple[list[Row], int]:
+            rows, total = index.page(self._filter, *order, limit=limit, offset=self._offset, columns=needed)
+            return index.with_same_as(rows), total
+
+        found, self._total = look(self._recordings, work, say)
+        rows = [*self._noted(found)]
         if rows:
-            _print_table(rows, shown or _fitting(rows, _informative(rows, len(recordings))))
-    for problem in problems[:MAX_PROBLEMS]:
-        say(capitalised(problem))
-    if len(problems) > MAX_PROBLEMS:
-        say(f"{len(problems) - MAX_PROBLEMS:,} more runs are damaged: `dualtaxi ls 'status == \"damaged\"'`.")
-    _print_remainder(listed, total, offset, chosen, recordings)
+            yield _table(rows, columns or _fitting(rows, _informative(rows, len(self._recordings))))
 
-
-# --- reading ----------------------------------------------------------------------------------------------
-
-
-def _stream(
-    recordings: tuple[Path, ...], query: _Query, columns: Sequence[str], render: Render
-) -> tuple[int, int, list[str]]:
-    """Print runs in bounded memory; return how many, how many match, and the problems of damaged ones.
-
-    The text goes to a temporary file first: the index is locked while it is read, and the reader of the
-    output may be slow.
-    """
-    from runner.runs.catalogue.index import look, order_of
-
-    order = order_of(query.sort)
-    needed = needed_for([*columns, "same_as"] if "same_as" in columns else columns)
-    problems: list[str] = []
-
-    def with_problems(rows: Iterable[Row]) -> Iterator[Row]:
+    def _noted(self, rows: Iterable[Row]) -> Iterator[Row]:
+        """Yield rows, noting their number and the problems of damaged runs."""
         for row in rows:
-            problems.extend([row["problem"]] if row["problem"] else [])
+            self._listed += 1
+            self._problems += [row["problem"]] if row["problem"] else []
             yield row
 
-    def work(index: CatalogueIndex) -> int:
-        spool.seek(0)
-        spool.truncate()
-        problems.clear()
-        rows: Iterable[Row]
-        if query.limit is None:
-            total = index.count(query.filter)
-            rows = islice(index.rows(query.filter, *order, columns=needed), query.offset, None)
-        else:
-            rows, total = index.page(query.filter, *order, limit=query.limit, offset=query.offset)
-        if "same_as" in columns:
-            rows = with_same_as(rows, index.originals())
-        spool.writelines(render(with_problems(rows), columns))
-        return total
-
-    with tempfile.SpooledTemporaryFile(_SPOOL_BYTES, "w+", encoding="utf-8", newline="") as spool:
-        total = look(recordings, work, say)
-        spool.seek(0)
-        while part := spool.read(_READ_BYTES):
-            echo(part, nl=False)
-    left = max(total - query.offset, 0)
-    return left if query.limit is None else min(left, query.limit), total, problems
-
-
-def _page(recordings: tuple[Path, ...], query: _Query, columns: Sequence[str]) -> tuple[list[Row], int]:
-    """Return the rows to show, and how many match."""
-    from runner.runs.catalogue.index import look, order_of
-
-    order, needed = order_of(query.sort), needed_for([*columns, "same_as"])
-
-    def work(index: CatalogueIndex) -> tuple[list[Row], int]:
-        rows, total = index.page(query.filter, *order, limit=query.limit, offset=query.offset, columns=needed)
-        return index.with_same_as(rows), total
-
-    return look(recordings, work, say)
+    def notes(self) -> Iterator[str]:
+        """Yield problems of damaged runs; how many matching runs are not listed, or why none is."""
+        yield from map(capitalised, self._problems[:MAX_PROBLEMS])
+        if (more := len(self._problems) - MAX_PROBLEMS) > 0:
+            yield f"{more:,} more runs are damaged: `dualtaxi ls 'status == \"damaged\"'`."
+        folders = ", ".join(map(str, self._recordings))
+        if self._listed < self._total:
+            end = self._offset + self._listed
+            more_runs = f", --offset {end} the next" if self._listed > 0 and end < self._total else ""
+            yield f"Shown are {self._listed:,} of {self._total:,} runs; --limit 0 shows all{more_runs}."
+        elif not self._listed and self._filter.condition is not None:
+            yield f"No run in {folders} matches."
+        elif not self._listed:
+            yield f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one."
 
 
 # --- printing ---------------------------------------------------------------------------------------------
@@ -275,32 +279,16 @@ def _fitting(rows: Sequence[Row], columns: Sequence[str]) -> list[str]:
     return fitting
 
 
-def _print_table(rows: Sequence[Row], columns: Sequence[str]) -> None:
-    """Print a table, fitted to the terminal if there is one; ids are never truncated."""
+def _table(rows: Sequence[Row], columns: Sequence[str]) -> Part:
+    """Return a table, fitted to the terminal if there is one; ids are never truncated."""
     headings = [HEADINGS.get(column, column) for column in columns]
     left = [column not in FIELDS or FIELDS[column].kind in LEFT_KINDS for column in columns]
     cells = [[_cell(row, column) for column in columns] for row in rows]
     if not console().is_terminal:
-        echo("\n".join(aligned([headings, *cells], left)))
-        return
+        return "\n".join(aligned([headings, *cells], left))
     left_headings = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
-    draw(table(*headings, rows=cells, left=left_headings, shrinking=_SHRINKING))
+    return table(*headings, rows=cells, left=left_headings, shrinking=_SHRINKING)
 
 
 def _cell(row: Row, column: str) -> str:
     return on_one_line(as_text(row, column))
-
-
-def _print_remainder(
-    listed: int, total: int, offset: int, chosen: Filter, recordings: tuple[Path, ...]
-) -> None:
-    """Print how many matching runs are not listed, or why none is."""
-    folders = ", ".join(map(str, recordings))
-    if listed < total:
-        end = offset + listed
-        more = f", --offset {end} the next" if listed > 0 and end < total else ""
-        say(f"Shown are {listed:,} of {total:,} runs; --limit 0 shows all{more}.")
-    elif not listed and chosen.condition is not None:
-        say(f"No run in {folders} matches.")
-    elif not listed:
-        say(f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one.")

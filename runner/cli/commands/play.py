@@ -16,17 +16,17 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import (
     episode_options,
-    json_option,
     recordings_option,
     run_argument,
 )
-from runner.cli.output import console, echo, print_json, say
+from runner.cli.output import Remark, Reply, console, json_lines
 from runner.cli.runs import find_recorded
 
 if TYPE_CHECKING:
     from rich.text import Text
 
     from runner.analysis.episodes import EpisodeRef
+    from runner.cli.episode import ShownEpisode
 
 ReadKey = Callable[[float | None], str]
 """Waits for a key, at most a number of seconds; returns its meaning, empty if none was pressed."""
@@ -58,8 +58,7 @@ def play_command(
         help="Steps per second.",
     ),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Iterator[Reply]:
     """Replay a recorded episode of RUN, step by step, with actions and rewards.
 
     By default it is the typical trial of the last evaluation: the median by success, return and length; of
@@ -82,30 +81,37 @@ def play_command(
     from runner.export.values import Values
     from runner.recording.reader import open_recording
 
-    run, terminal = find_recorded(run_name, recordings), console()
-    with open_recording(run.recording) as recording, contextlib.ExitStack() as stack:
+    run = find_recorded(run_name, recordings)
+    with open_recording(run.recording) as recording:
         at = chosen.resolved(recording)
         played = ShownEpisode(recording, at, f"{run.title}: {at.title}")
-        if as_json:
-            for step in played.steps():
-                print_json(step, indent=None)
-            return
+        remarks = []
         if not recording.tabular and Values(recording).image:
-            say(f"Observations that are pictures are not shown: `dualtaxi export film {run_name}` does.")
-        if not terminal.is_terminal or terminal.is_dumb_terminal:
-            for frame in played.frames():
-                echo("\n".join(line.rstrip() for line in frame.plain.splitlines()) + "\n")
-            return
+            film = f"`dualtaxi export film {run_name}`"
+            remarks = [Remark(f"Observations that are pictures are not shown: {film} does.")]
+        yield Reply(json_lines(played.steps()), itertools.chain(remarks, _shown(played, speed)))
 
-        from rich.live import Live
-        from rich.text import Text
 
-        live = stack.enter_context(Live(console=terminal, auto_refresh=False, vertical_overflow="crop"))
+def _shown(played: ShownEpisode, speed: float) -> Iterator[str]:
+    """Play an episode on a terminal; elsewhere yield its frames."""
+    terminal = console()
+    if not terminal.is_terminal or terminal.is_dumb_terminal:
+        for frame in played.frames():
+            yield "\n".join(line.rstrip() for line in frame.plain.splitlines()) + "\n"
+        return
+
+    from rich.live import Live
+    from rich.text import Text
+
+    with (
+        Live(console=terminal, auto_refresh=False, vertical_overflow="crop") as live,
+        _key_reader() as read_key,
+    ):
 
         def show(frame: Text, keys: str) -> None:
             live.update(Text.assemble(frame, (f"\n{keys}" if keys else "", "dim")), refresh=True)
 
-        _play(played.frames(), 1 / speed, stack.enter_context(_key_reader()), show)
+        _play(played.frames(), 1 / speed, read_key, show)
 
 
 def _play(

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Iterator
+from itertools import chain, islice
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
-from runner.cli.options import folders_option, force_option, json_option, limit_option, require_one
-from runner.cli.output import console, draw, echo, echo_csv, grid_table, json_list, print_json, say
+from runner.cli.options import folders_option, force_option, limit_option, require_one
+from runner.cli.output import Remark, Reply, csv_lines, json_list, say
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
 from runner.util.extras import require
 from runner.util.humanize import counted, size
+
+if TYPE_CHECKING:
+    from runner.cli.output import Part
+    from runner.query.find import Found
+    from runner.query.sql import QueryResult
 
 _SHOWN: Final = 1000
 """The most rows of a table."""
@@ -30,12 +35,10 @@ _SECONDS: Final = 600
 _runs_option: Final = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`.")
 
 
-@click.command("sql", cls=Command)
+@click.command("sql", cls=Command, forms=("csv", "json"))
 def sql_command(
     query: str = argument(metavar="QUERY"),
     runs: str = _runs_option,
-    as_csv: bool = option("--csv", is_flag=True, help="Print CSV."),
-    as_json: bool = json_option,
     parquet: Path | None = option("--parquet", type=FILE, metavar="FILE", help="Write a file of Parquet."),
     force: bool = force_option,
     timeout: int = option(
@@ -45,7 +48,7 @@ def sql_command(
         "--memory", type=COUNT, default=500, show_default=True, metavar="MB", help="Limit of memory."
     ),
     recordings: tuple[Path, ...] = folders_option,
-) -> None:
+) -> Iterator[Reply]:
     """Ask the recorded runs, and every step of them, by one SELECT in the SQL of DuckDB.
 
     Each view has a column `run`, the id of the run.
@@ -82,23 +85,20 @@ def sql_command(
             )
             if parquet is not None:
                 with new_file(parquet, force) as temporary:
-                    rows = result.write_parquet(temporary)
-            elif not as_csv and not as_json:
-                shown = list(islice(result.rows(), _SHOWN + 1))
-        if parquet is not None:
-            echo(f"{parquet}  {size(parquet.stat().st_size)}, {rows:,} rows")
-        elif as_csv:
-            echo_csv(result.columns.names, ([csv_value(value) for value in row] for row in result.rows()))
-        elif as_json:
-            named = (dict(zip(result.columns.names, row, strict=True)) for row in result.rows())
-            for line in json_list("rows", named):
-                echo(line, nl=False)
-        else:
-            cells = [tuple(map(cell_of, row)) for row in shown[:_SHOWN]]
-            draw(grid_table(Grid(tuple(result.columns.names), cells), shrinking=console().is_terminal))
-            if len(shown) > _SHOWN:
-                say(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
-    _say_left_out(result.left_out)
+                    count = result.write_parquet(temporary)
+                text = f"{parquet}  {size(parquet.stat().st_size)}, {count:,} rows"
+                yield Reply(text=[text], notes=_left_out(result))
+                return
+            rows, names = result.rows(), result.columns.names
+            first = list(islice(rows, _SHOWN + 1))
+        cells = (tuple(map(cell_of, row)) for row in first[:_SHOWN])
+        more = Remark(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
+        yield Reply(
+            json_list("rows", (dict(zip(names, row, strict=True)) for row in chain(first, rows))),
+            [Grid(tuple(names), [*cells]), *[more] * (len(first) > _SHOWN)],
+            csv=csv_lines(names, (map(csv_value, row) for row in chain(first, rows))),
+            notes=_left_out(result),
+        )
 
 
 class _NoPandas:
@@ -130,12 +130,11 @@ def _told_how_far() -> Iterator[None]:
         raise
 
 
-def _say_left_out(left_out: Sequence[str]) -> None:
-    """Name the first runs that were left out."""
-    for sentence in left_out[:MAX_PROBLEMS]:
-        say(sentence)
-    if len(left_out) > MAX_PROBLEMS:
-        say(f"{len(left_out) - MAX_PROBLEMS:,} more runs are left out.")
+def _left_out(answered: QueryResult | Found) -> Iterator[str]:
+    """Yield the first runs that were left out, once all rows are read."""
+    yield from answered.left_out[:MAX_PROBLEMS]
+    if len(answered.left_out) > MAX_PROBLEMS:
+        yield f"{len(answered.left_out) - MAX_PROBLEMS:,} more runs are left out."
 
 
 @click.command("find", cls=Command)
@@ -164,9 +163,8 @@ def find_command(
         is_flag=True,
         help="Print ids only: a line RUN PHASE EPISODES for each run.",
     ),
-    as_json: bool = json_option,
     recordings: tuple[Path, ...] = folders_option,
-) -> None:
+) -> Reply:
     """Find the episodes of all recorded runs that match EXPRESSION.
 
     It is a condition in Python's syntax. Words alone are searched for in the id, name, tags and note of runs.
@@ -205,17 +203,17 @@ def find_command(
             expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )
     marked = found.mark(mark or "", tags=tags) if mark is not None or tags else None
-    if as_json:
-        print_json(found.as_json() | ({} if marked is None else {"marked": marked}))
-    else:
-        if quiet:
-            for (run, of_phase), episodes in found.episodes.items():
-                echo(f"{run} {of_phase} {','.join(map(str, episodes))}")
-        elif found.hits:
-            draw(grid_table(found.grid, shrinking=console().is_terminal))
-        say(found.sentence)
-        if len(found.hits) < found.count:
-            say(f"Shown are the first {len(found.hits):,}; --limit 0 shows all.")
-        if marked is not None:
-            say(f"Marked {counted(marked, 'episode')}; {len(found.hits) - marked:,} had this mark.")
-    _say_left_out(found.left_out)
+    text: list[Part] = [found.grid] if found.hits else []
+    if quiet:
+        text = [
+            f"{run} {of_phase} {','.join(map(str, episodes))}"
+            for (run, of_phase), episodes in found.episodes.items()
+        ]
+    text.append(Remark(found.sentence))
+    if len(found.hits) < found.count:
+        text.append(Remark(f"Shown are the first {len(found.hits):,}; --limit 0 shows all."))
+    if marked is not None:
+        had = len(found.hits) - marked
+        text.append(Remark(f"Marked {counted(marked, 'episode')}; {had:,} had this mark."))
+    values = found.as_json() | ({} if marked is None else {"marked": marked})
+    return Reply(values, text, notes=_left_out(found))

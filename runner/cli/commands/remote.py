@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import error_as_json, exit_code_of
+from runner.cli import Failure
 from runner.cli.command import CommandGroup, argument, option, record
-from runner.cli.options import json_option, limit_option, recordings_option, workers_option
-from runner.cli.output import draw, facts, print_json, print_result, say, table
+from runner.cli.options import limit_option, recordings_option, workers_option
+from runner.cli.output import Remark, Reply, say, table
 from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
-from runner.cli.runs import find_recorded, print_received
+from runner.cli.runs import find_recorded, received
 from runner.errors import ExitCode, RunnerError
 from runner.runs.run import Run, recordings_folder
 from runner.util.humanize import UNKNOWN, counted, size
@@ -105,8 +105,7 @@ def push(
     ),
     server: Server = server_options,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Upload runs to a server, which lists them once it has verified every byte.
 
     RUN may also be the path of a recording. An upload resumes after a broken connection, and a run that the
@@ -121,23 +120,19 @@ def push(
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
     runs: list[Json] = []
-    codes: list[int] = []
+    code = 0
     for name, upload in _outbox(server) if outbox else _named(names, server, recordings):
         try:
             with bytes_line(f"pushing {name}") as report:
                 runs.append(upload(report))
         except RunnerError as error:
-            codes.append(exit_code_of(error))
-            message = f"{name}: {error}"
-            say(error_as_json(message, codes[-1], run=name) if as_json else f"Error: {message}")
-    if as_json:
-        print_json({"runs": runs})
-    elif runs:
-        outcomes = {True: "was there already", False: "stored"}
-        rows = [(run["run_id"], run["name"], size(run["bytes"]), outcomes[run["already"]]) for run in runs]
-        draw(table("run", "name", "size", "", rows=rows, left=("run", "name", "")))
-    if codes:
-        raise click.exceptions.Exit(max(codes))
+            failure = Failure(error, name)
+            failure.show()
+            code = max(code, failure.exit_code)
+    outcomes = {True: "was there already", False: "stored"}
+    rows = [(run["run_id"], run["name"], size(run["bytes"]), outcomes[run["already"]]) for run in runs]
+    pushed = table("run", "name", "size", "", rows=rows, left=("run", "name", ""))
+    return Reply({"runs": runs}, [pushed] if runs else (), exit_code=code)
 
 
 def _named(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Upload]]:
@@ -177,8 +172,7 @@ def pull(
     run_name: str = argument(metavar="RUN"),
     server: Server = server_options,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Download RUN from a server into the folder of runs, with its tags and note.
 
     RUN is named as the server knows it: its id, the beginning of one, its name, or @latest. Every byte is
@@ -191,7 +185,7 @@ def pull(
     with server.client() as client, bytes_line(f"pulling {run_name}") as report:
         pulled = client.pull(run_name, recordings_folder(recordings), report)
     already = "this content" if pulled.already else ""
-    print_received(pulled.run, pulled.content_digest, already, as_json)
+    return received(pulled.run, pulled.content_digest, already)
 
 
 # --- jobs -------------------------------------------------------------------------------------------------
@@ -207,8 +201,7 @@ def submit(
         "all of the server", "Number of runs to do in parallel; only for sweeps."
     ),
     server: Server = server_options,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Submit the experiment or sweep in FILE to a server.
 
     The server checks it as `dualtaxi run` would, and queues it. The server's pages and `dualtaxi remote
@@ -230,13 +223,11 @@ def submit(
         say(f"Job {job.number}: {job.name}, {runs}; {client.url}/queue/{job.number}")
         if is_watched:
             job = _watched(client, job.number)
-    _print_job(job, as_json)
-    if is_watched and job.state != "finished":
-        raise click.exceptions.Exit(ExitCode.DIFFERENT)
+    return _reply(job, is_watched)
 
 
 @remote_command.command("jobs")
-def jobs(limit: int = limit_option(20), server: Server = server_options, as_json: bool = json_option) -> None:
+def jobs(limit: int = limit_option(20), server: Server = server_options) -> Reply:
     """List the jobs of a server, newest first.
 
     Example:
@@ -244,29 +235,26 @@ def jobs(limit: int = limit_option(20), server: Server = server_options, as_json
     """
     with server.client() as client:
         newest = client.jobs(limit or 1000)
-    if as_json:
-        print_json({"jobs": [_job_as_json(job) for job in newest]})
-    elif newest:
-        rows = [
-            (
-                str(job.number),
-                job.kind,
-                job.name,
-                job.state,
-                job.progress.text if job.progress else "",
-                f"{job.runs:,}",
-                str(job.workers),
-            )
-            for job in newest
-        ]
-        left = ("kind", "name", "state", "progress")
-        draw(table("job", *left, "runs", "workers", rows=rows, left=left, shrinking=("name",)))
-    else:
-        say("No jobs yet. `dualtaxi remote submit FILE` submits one.")
+    rows = (
+        (
+            str(job.number),
+            job.kind,
+            job.name,
+            job.state,
+            job.progress.text if job.progress else "",
+            f"{job.runs:,}",
+            str(job.workers),
+        )
+        for job in newest
+    )
+    left = ("kind", "name", "state", "progress")
+    listed = table("job", *left, "runs", "workers", rows=rows, left=left, shrinking=("name",))
+    nothing = Remark("No jobs yet. `dualtaxi remote submit FILE` submits one.")
+    return Reply({"jobs": [_job_as_json(job) for job in newest]}, [listed if newest else nothing])
 
 
 @remote_command.command("watch")
-def watch(number: int = _job_argument, server: Server = server_options, as_json: bool = json_option) -> None:
+def watch(number: int = _job_argument, server: Server = server_options) -> Reply:
     """Show the progress of JOB until it is over; Ctrl-C ends the watching, not the job.
 
     A broken connection is restored. Exit code 0 when the job finished, 1 when it failed or was cancelled.
@@ -275,21 +263,18 @@ def watch(number: int = _job_argument, server: Server = server_options, as_json:
       dualtaxi remote watch 12 --server http://localhost:8000
     """
     with server.client() as client:
-        job = _watched(client, number)
-    _print_job(job, as_json)
-    if job.state != "finished":
-        raise click.exceptions.Exit(ExitCode.DIFFERENT)
+        return _reply(_watched(client, number), must_finish=True)
 
 
 @remote_command.command("cancel")
-def cancel(number: int = _job_argument, server: Server = server_options, as_json: bool = json_option) -> None:
+def cancel(number: int = _job_argument, server: Server = server_options) -> Reply:
     """Cancel JOB, whether queued or running; what it has recorded is kept.
 
     Example:
       dualtaxi remote cancel 12 --server http://localhost:8000
     """
     with server.client() as client:
-        _print_job(client.cancel(number), as_json)
+        return _reply(client.cancel(number))
 
 
 @remote_command.command("resume")
@@ -299,15 +284,14 @@ def resume(
         "--accept-changes", is_flag=True, help="Resume although the code has changed."
     ),
     server: Server = server_options,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Resume JOB, which failed or was cancelled, as if it had never stopped.
 
     Example:
       dualtaxi remote resume 12 --server http://localhost:8000
     """
     with server.client() as client:
-        _print_job(client.resume(number, accept_changes), as_json)
+        return _reply(client.resume(number, accept_changes))
 
 
 def _watched(client: Client, number: int) -> RemoteJob:
@@ -323,11 +307,12 @@ def _watched(client: Client, number: int) -> RemoteJob:
     return client.job(number)
 
 
-def _print_job(job: RemoteJob, as_json: bool) -> None:
+def _reply(job: RemoteJob, must_finish: bool = False) -> Reply:
     runs = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())
     title = f"{job.number}  {job.name}, {job.state}"
     rows = {"job": title, "runs": runs or UNKNOWN, "error": job.error}
-    print_result(as_json, _job_as_json(job), facts(rows))
+    is_well = job.state == "finished" or not must_finish
+    return Reply(_job_as_json(job), [rows], exit_code=ExitCode.OK if is_well else ExitCode.DIFFERENT)
 
 
 def _job_as_json(job: RemoteJob) -> dict[str, object]:

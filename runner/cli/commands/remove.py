@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -12,8 +12,8 @@ import click
 
 from runner.archive.places import archive_place
 from runner.cli.command import Command, option
-from runner.cli.options import filter_argument, folders_option, json_option, recordings_option, runs_argument
-from runner.cli.output import aligned, console, draw, echo, print_json, say, table
+from runner.cli.options import filter_argument, folders_option, recordings_option, runs_argument
+from runner.cli.output import Remark, Reply, aligned, console, say, table
 from runner.cli.parameter_types import INDEX
 from runner.cli.runs import find
 from runner.errors import RunnerError
@@ -23,6 +23,7 @@ from runner.util.humanize import UNKNOWN, ago, counted, number, size
 from runner.util.values import Json
 
 if TYPE_CHECKING:
+    from runner.cli.output import Part
     from runner.runs.catalogue.removal import Removal
 
 _MAX_DRAWN: Final = 1000
@@ -48,8 +49,7 @@ def rm_command(
     yes: bool = _yes_option,
     dry_run: bool = _dry_run_option,
     foreign: bool = _foreign_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Iterator[Reply]:
     """Remove runs and their recordings, after confirmation.
 
     If a run is running or tagged `keep`, or its folder holds files that no run writes, nothing is removed.
@@ -68,7 +68,7 @@ def rm_command(
     refused = [f"run {each.run_id} stays: {each.refusal}." for each in removals if each.refusal]
     if refused:
         raise RunnerError("\n".join([*refused, "Nothing was removed."]))
-    _carry_out(removals, {}, foreign, yes, dry_run, as_json)
+    yield from _carry_out(removals, {}, foreign, yes, dry_run)
 
 
 @click.command("prune", cls=Command)
@@ -95,8 +95,7 @@ def prune_command(
     dry_run: bool = _dry_run_option,
     yes: bool = _yes_option,
     foreign: bool = _foreign_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Iterator[Reply]:
     """Remove the runs that match FILTER (as in `dualtaxi ls`) and all options, after confirmation.
 
     At least one of them must be given. --keep-last keeps the newest runs of each configuration name, counted
@@ -115,7 +114,7 @@ def prune_command(
     if explanations:
         if words or older_than is not None or keep_last is not None or statuses or foreign:
             raise click.UsageError("--explanations removes all of them: leave out FILTER and other criteria.")
-        _prune_explanations(recordings, dry_run, yes, as_json)
+        yield from _prune_explanations(recordings, dry_run, yes)
         return
     try:
         seconds = None if older_than is None else seconds_of(older_than)
@@ -135,43 +134,38 @@ def prune_command(
         counts = ", ".join(f"{count:,} {reason}" for reason, count in sorted(protected.items()))
         say(f"Left alone: {counts}.")
     removals = [each for each in removals if not each.refusal]
-    if not removals and not as_json:
-        say("There is nothing to remove.")
-        return
-    _carry_out(removals, refusals, foreign, yes, dry_run, as_json)
+    yield from _carry_out(removals, refusals, foreign, yes, dry_run)
 
 
-def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool, as_json: bool) -> None:
+def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool) -> Iterator[Reply]:
     """Show what explanations trained, ask, and remove it."""
     from runner.debugging.explanation_files import remove_trained, trained_in
 
     explanations = [each for folder in recordings for each in trained_in(folder)]
     rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
     freed = sum(each.bytes for each in explanations)
-    if not explanations and not as_json:
-        say("There is nothing to remove.")
-        return
-    if not as_json:
-        cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in explanations]
-        draw(table("explanation", "runs", "frees", rows=cells, left=("explanation",)))
-        for run in (run for each in explanations for run in each.runs if run.refusal):
-            say(f"Run {run.run_id} stays: {run.refusal}.")
     what = counted(len(explanations), "explanation")
-    if explanations and not dry_run:
-        _confirm(f"Remove {what} for good, and free {size(freed)}?", yes)
-        for each in explanations:
-            remove_trained(each)
-    _print_removed(what, {"dry_run": dry_run, "freed": freed, "removed": rows}, as_json)
+    if explanations:
+        cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in explanations]
+        stay = [run for each in explanations for run in each.runs if run.refusal]
+        notices = [Remark(f"Run {run.run_id} stays: {run.refusal}.") for run in stay]
+        grid = table("explanation", "runs", "frees", rows=cells, left=("explanation",))
+        yield Reply(text=[grid, *notices])
+        if not dry_run:
+            _confirm(f"Remove {what} for good, and free {size(freed)}?", yes)
+            for each in explanations:
+                remove_trained(each)
+    yield _removed(what if explanations else "", {"dry_run": dry_run, "freed": freed, "removed": rows})
 
 
-def _print_removed(what: str, result: Json, as_json: bool) -> None:
-    """Print what was removed, or would be."""
-    if as_json:
-        print_json(result)
+def _removed(what: str, result: Json) -> Reply:
+    """Return what was removed, or would be; `what` is empty if that is nothing."""
+    text = f"Removed {what}, freed {size(result['freed'])}."
+    if not what:
+        text = Remark("There is nothing to remove.")
     elif result["dry_run"]:
-        say(f"Nothing was removed; it would free {size(result['freed'])}.")
-    else:
-        echo(f"Removed {what}, freed {size(result['freed'])}.")
+        text = Remark(f"Nothing was removed; it would free {size(result['freed'])}.")
+    return Reply(result, [text])
 
 
 def _confirm(question: str, yes: bool) -> None:
@@ -183,9 +177,9 @@ def _confirm(question: str, yes: bool) -> None:
 
 
 def _carry_out(
-    removals: Sequence[Removal], kept: dict[str, str], foreign: bool, yes: bool, dry_run: bool, as_json: bool
-) -> None:
-    """Show the removals, ask, carry them out and print what was freed.
+    removals: Sequence[Removal], kept: dict[str, str], foreign: bool, yes: bool, dry_run: bool
+) -> Iterator[Reply]:
+    """Show the removals, ask, carry them out and say what was freed.
 
     None of the removals is refused; `kept` has the reason for each run that stays, by id, for programs.
 
@@ -196,10 +190,8 @@ def _carry_out(
 
     contents, failures = contents_freed(removals), dict[str, str]()
     freed = sum(removal.freed for removal in removals) + contents
-    if removals and not as_json:
-        _draw(removals)
-        if contents:
-            say(f"Checkpoints that no other run refers to go too: {size(contents)}.")
+    if removals:
+        yield Reply(text=_preview(removals, contents))
     if removals and not dry_run:
         runs = "this run" if len(removals) == 1 else f"these {len(removals):,} runs"
         _confirm(f"Remove {runs} for good, and free {size(freed)}?", yes)
@@ -232,13 +224,14 @@ def _carry_out(
         "removed": removed,
         "kept": reasons,
     }
-    if removals or as_json or not failures:
-        _print_removed(counted(len(removals), "run"), result, as_json)
+    reply = _removed(counted(len(removals), "run") if removals else "", result)
+    yield Reply(result) if failures and not removals else reply
     if failures:
         raise RunnerError("\n".join(failures.values()))
 
 
-def _draw(removals: Sequence[Removal]) -> None:
+def _preview(removals: Sequence[Removal], contents: int) -> Iterator[Part]:
+    """Yield the table of the removals, and what else is removed or stays."""
     rows = [
         (
             removal.run_id,
@@ -252,12 +245,12 @@ def _draw(removals: Sequence[Removal]) -> None:
         for removal in removals
     ]
     if console().is_terminal and len(removals) <= _MAX_DRAWN:
-        draw(table(*_HEADINGS, rows=rows, left=_LEFT, shrinking=("name",)))
+        yield table(*_HEADINGS, rows=rows, left=_LEFT, shrinking=("name",))
     else:
-        echo("\n".join(aligned([_HEADINGS, *rows], [heading in _LEFT for heading in _HEADINGS])))
-    for removal in removals:
-        if removal.is_archived:
-            say(_archive_notice(removal.run()))
+        yield "\n".join(aligned([_HEADINGS, *rows], [heading in _LEFT for heading in _HEADINGS]))
+    yield from (Remark(_archive_notice(removal.run())) for removal in removals if removal.is_archived)
+    if contents:
+        yield Remark(f"Checkpoints that no other run refers to go too: {size(contents)}.")
 
 
 def _archive_notice(run: Run) -> str:

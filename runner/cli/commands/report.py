@@ -17,7 +17,7 @@ from runner.cli.options import (
     normalise_option,
     writing_options,
 )
-from runner.cli.output import require_page, say
+from runner.cli.output import Reply, require_page, say, written
 from runner.cli.parameter_types import EPISODE, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
@@ -40,7 +40,7 @@ def plot_command(
     style: CurveStyle = curve_options,
     normalise: str | None = normalise_option,
     to: Writing = writing_options("exports/plot.png", "FILE.png|svg|pdf"),
-) -> None:
+) -> Reply:
     """Draw every metric of one or several runs over an axis, in one figure; or a sweep.
 
     Runs that differ in nothing but the seed are drawn as one line, their interquartile mean, with its 95 %
@@ -80,8 +80,7 @@ def plot_command(
         _refuse_style(axis, style)
         if normalise is not None:
             raise click.UsageError("--normalise: found a sweep, expected runs.")
-        _plot_sweep(run_names[0], folder, to)
-        return
+        return _plot_sweep(run_names[0], folder, to)
     series = []
     runs = find_all_recorded(run_names, folder)
     with count_line("runs read", len(runs)) as progress:
@@ -92,8 +91,7 @@ def plot_command(
                     say(shortcoming)
             progress(len(series))
     if normalise is not None:
-        _plot_tasks(series, normalise, to)
-        return
+        return _plot_tasks(series, normalise, to)
     groups = groups_of(series)
     for note in duplicates(groups):
         say(sentence(note))
@@ -104,10 +102,10 @@ def plot_command(
         save(curves_sheet(groups, panels, style), path)
     count = sum(len(group.runs) for group in groups)
     text = f"{output}: {counted(len(panels), 'metric')} of {counted(count, 'run')}"
-    to.report(text, output, metrics=len(panels), runs=count)
+    return written(text, output, metrics=len(panels), runs=count)
 
 
-def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> None:
+def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> Reply:
     from runner.analysis.compare.score_table import scores_of
     from runner.analysis.compare.tasks import compare_algorithms
     from runner.export.plots.image import save
@@ -122,7 +120,7 @@ def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> None:
     for note in comparison.notes:
         say(f"Note: {note}.")
     text = f"{output}: {len(comparison.algorithms)} groups in {len(comparison.tasks)} environments"
-    to.report(text, output, groups=len(comparison.algorithms), environments=len(comparison.tasks))
+    return written(text, output, groups=len(comparison.algorithms), environments=len(comparison.tasks))
 
 
 def _refuse_style(axis: Axis, style: CurveStyle) -> None:
@@ -134,7 +132,7 @@ def _refuse_style(axis: Axis, style: CurveStyle) -> None:
         raise click.UsageError("--lines, --smooth, --log-x, --log-y: found a sweep, expected runs.")
 
 
-def _plot_sweep(name: str, recordings: Path, to: Writing) -> None:
+def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
     from runner.export.plots.image import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
@@ -147,7 +145,7 @@ def _plot_sweep(name: str, recordings: Path, to: Writing) -> None:
     with stage_line("drawing"), new_file(to.path(), to.force) as path:
         save(sweep_sheet(f"Sweep {name}", picture, groups, panel), path)
     count = len(picture.trials)
-    to.report(f"{to.path()}: the sweep {name}, {count} trials", to.path(), sweep=name, trials=count)
+    return written(f"{to.path()}: the sweep {name}, {count} trials", to.path(), sweep=name, trials=count)
 
 
 @click.command("report", cls=Command)
@@ -171,7 +169,7 @@ def report_command(
     axis: Axis = axis_option,
     style: CurveStyle = curve_options,
     to: Writing = writing_options("exports/report.html", "FILE.html"),
-) -> None:
+) -> Reply:
     """Write one self-contained page about one or several runs, or about a sweep.
 
     It has the plots, what was learned before, in the middle of and after training, all evaluations, the
@@ -195,8 +193,7 @@ def report_command(
         if episodes or trials:
             raise click.UsageError("the page of a sweep shows no episode: leave out --episode and --eval.")
         _refuse_style(axis, style)
-        _report_sweep(run_names[0], folder, to)
-        return
+        return _report_sweep(run_names[0], folder, to)
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
     with stage_line("reading") as progress:
         page, notes = render_report(paths, [*episodes, *trials], progress, axis, style)
@@ -204,10 +201,10 @@ def report_command(
     for note in notes:
         say(note)
     text = f"{output}: {size(output.stat().st_size)}, {counted(len(paths), 'run')}"
-    to.report(text, output, runs=len(paths))
+    return written(text, output, runs=len(paths))
 
 
-def _report_sweep(name: str, recordings: Path, to: Writing) -> None:
+def _report_sweep(name: str, recordings: Path, to: Writing) -> Reply:
     from runner.sweep.charts import render_sweep
     from runner.sweep.results import results_of
     from runner.sweep.state import read_sweep
@@ -216,4 +213,4 @@ def _report_sweep(name: str, recordings: Path, to: Writing) -> None:
     with stage_line("drawing"):
         write_text_new(to.path(), to.force, render_sweep(results, recordings))
     output = to.path()
-    to.report(f"{output}: {size(output.stat().st_size)}, the sweep {name}", output, sweep=name)
+    return written(f"{output}: {size(output.stat().st_size)}, the sweep {name}", output, sweep=name)

@@ -13,13 +13,12 @@ from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
     checkpoint_option,
-    json_option,
     policy_option,
     recordings_option,
     run_argument,
     trust_option,
 )
-from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.output import Reply, console, say
 from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line
 from runner.cli.runs import (
@@ -27,10 +26,10 @@ from runner.cli.runs import (
     find,
     find_recorded,
     job_progress,
-    print_run,
     require_over,
     run_as_json,
     run_facts,
+    run_reply,
 )
 from runner.errors import ExitCode, RecordingError
 from runner.runs.run import Run, recordings_folder
@@ -47,8 +46,7 @@ def resume_command(
     accept_changes: bool = accept_changes_option,
     trust: bool = trust_option,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Resume RUN, which was interrupted or failed, as if it had never stopped.
 
     The run is retrained without recording, which is quick, and compared byte for byte with its recording;
@@ -70,13 +68,11 @@ def resume_command(
         _announce(run)
     with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
         run = resume(run, accept_changes, report, interrupt, trust)
-    if as_json or not was_finished:
-        print_run(run, as_json, {"next": command_for(run, "show")})
     if was_finished:
-        say(f"Run {run.run_id} is finished; there is nothing to do.")
-    if interrupt.came and run.status == "interrupted":
-        say(f"Interrupted again; `{command_for(run, 'resume')}` continues from there.")
-        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
+        return Reply(run_as_json(run), notes=[f"Run {run.run_id} is finished; there is nothing to do."])
+    again = f"Interrupted again; `{command_for(run, 'resume')}` continues from there."
+    is_interrupted = interrupt.came and run.status == "interrupted"
+    return run_reply(run, {"next": command_for(run, "show")}, again if is_interrupted else "")
 
 
 def _announce(run: Run) -> None:
@@ -93,8 +89,7 @@ def rerecord_command(
     run_name: str = run_argument,
     recordings: Path | None = recordings_option,
     trust: bool = trust_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Record the steps of RUN, which was recorded without them.
 
     A job (recording.steps: none) is retrained. The environment of a loop (steps="actions") takes the
@@ -119,11 +114,11 @@ def rerecord_command(
     else:
         with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
             run = rerecord(run, report, interrupt, trust=trust)
-    if as_json or not had_steps:
-        proof = "the content digest is the one that the run had"
-        print_run(run, as_json, {"proof": proof, "next": command_for(run, "play")})
     if had_steps:
-        say(f"Run {run.run_id} leaves no steps out; there is nothing to do.")
+        note = f"Run {run.run_id} leaves no steps out; there is nothing to do."
+        return Reply(run_as_json(run), notes=[note])
+    proof = "the content digest is the one that the run had"
+    return run_reply(run, {"proof": proof, "next": command_for(run, "play")})
 
 
 TRIALS: Final = 200
@@ -162,8 +157,7 @@ def evaluate_command(
     policy: str | None = policy_option,
     trust: bool = trust_option,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Evaluate the trained Q-table of RUN greedily in new episodes.
 
     The table at any step can be evaluated. The episodes are recorded as a separate run, whose configuration
@@ -197,28 +191,25 @@ def evaluate_command(
             )
         if step is not None or start != "random":
             raise click.UsageError("--step and --start are for runs that were trained here, not for loops.")
-        _evaluate_checkpoint(
-            source, recordings, checkpoint, policy, trials or LOOP_TRIALS, seed, trust, as_json
+        return _evaluate_checkpoint(
+            source, recordings, checkpoint, policy, trials or LOOP_TRIALS, seed, trust
         )
-        return
     to_play = None if start == "each" else trials or TRIALS
     start_state: Start = int(start) if start.isdecimal() else "random"
     with job_progress("", 0) as (report, interrupt):
         folder = recordings_folder(recordings)
         run = evaluate(source, folder, step, to_play, start_state, seed, report, interrupt, trust)
     origin = run.file.config["initial_q"]
-    if as_json:
-        print_json(run_as_json(run) | {"origin": origin})
-    elif run.status == "finished":
-        with open_recording(run.recording) as recording:
-            successes = recording.environment["success_events"]
-            grid = evaluation_table(evaluation_records(recording), successes, console())
-        table = f"of run {origin['run']} after {origin['step']:,} training steps"
-        play = command_for(run, "play", "--eval 0:0")
-        draw(grid, "", facts(run_facts(run) | {"table": table, "next": play}))
-    if interrupt.came and run.status == "interrupted":
-        say(f"Interrupted: the episodes so far are kept; `{command_for(run, 'resume')}` plays the rest.")
-        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
+    values = run_as_json(run) | {"origin": origin}
+    if run.status != "finished":
+        note = f"Interrupted: the episodes so far are kept; `{command_for(run, 'resume')}` plays the rest."
+        return Reply(values, notes=[note], exit_code=ExitCode.INTERRUPTED)
+    with open_recording(run.recording) as recording:
+        successes = recording.environment["success_events"]
+        grid = evaluation_table(evaluation_records(recording), successes, console())
+    table = f"of run {origin['run']} after {origin['step']:,} training steps"
+    play = command_for(run, "play", "--eval 0:0")
+    return Reply(values, [grid, "", run_facts(run) | {"table": table, "next": play}])
 
 
 def _evaluate_checkpoint(
@@ -229,9 +220,8 @@ def _evaluate_checkpoint(
     trials: int,
     seed: int,
     trust: bool,
-    as_json: bool,
-) -> None:
-    """Play a checkpoint of a loop, and print the run that it was recorded in."""
+) -> Reply:
+    """Play a checkpoint of a loop, and return the run that it was recorded in."""
     from runner.loops.policies import play_checkpoint
     from runner.recording.metrics import spread_of
     from runner.recording.reader import open_recording
@@ -259,4 +249,4 @@ def _evaluate_checkpoint(
         "mean length": number(means.get("mean_length")) + spread.get("length", ""),
         "next": command_for(run, "show"),
     }
-    print_run(run, as_json, results, origin=origin, spread=spreads)
+    return run_reply(run, results, origin=origin, spread=spreads)

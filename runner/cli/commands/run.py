@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,8 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.jobs import job_option
-from runner.cli.options import config_argument, json_option, recordings_option, set_option, workers_option
-from runner.cli.output import console, draw, facts, print_json, say
+from runner.cli.options import config_argument, recordings_option, set_option, workers_option
+from runner.cli.output import Reply, console, json_lines, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
@@ -22,8 +23,7 @@ from runner.util.humanize import amount, size
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
-    from rich.console import RenderableType
-
+    from runner.cli.output import Part
     from runner.config import ExperimentConfig
     from runner.config.job import Job
 
@@ -39,8 +39,7 @@ def run_command(
     name: str | None = option("--name", help="Name of the run.  [default: the configuration's name]"),
     workers: int = workers_option(1),
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Iterator[Reply]:
     """Train, evaluate and record the experiment CONFIG: a file, or a shipped one (`dualtaxi config ls`).
 
     Each run gets a folder with a recording of every step. Several seeds make one run each, one after the
@@ -64,18 +63,18 @@ def run_command(
     experiment = experiment_of(config, overrides, seed)
     run_name, folder = checked_name(name), recordings_folder(recordings)
     if workers > 1:
-        _run_parallel(experiment, folder, run_name, workers, as_json)
+        yield from _run_parallel(experiment, folder, run_name, workers)
         return
     for number, job in enumerate(jobs_in(experiment, folder)):
         run, is_interrupted = _run_one(job, folder, run_name, number)
-        _print_run(run, number, as_json)
+        yield _reply(run, number)
         if is_interrupted:
             episodes = f"{run.summary['episodes']:,} of {experiment.episodes:,} episodes"
-            say(f"Interrupted: {episodes} are kept in {run.recording}.")
+            notes = [f"Interrupted: {episodes} are kept in {run.recording}."]
             if run.status == "interrupted":
-                say(f"`{command_for(run, 'resume')}` continues from there.")
-            _print_not_begun(experiment, number + 1)
-            raise click.exceptions.Exit(ExitCode.INTERRUPTED)
+                notes.append(f"`{command_for(run, 'resume')}` continues from there.")
+            yield _interrupted(notes, experiment, number + 1)
+            return
 
 
 def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run, bool]:
@@ -101,10 +100,8 @@ def _run_one(job: Job, folder: Path, name: str | None, number: int) -> tuple[Run
     return run, interrupt.came
 
 
-def _run_parallel(
-    config: ExperimentConfig, folder: Path, name: str | None, workers: int, as_json: bool
-) -> None:
-    """Run the seeds of an experiment in parallel, and print each run."""
+def _run_parallel(config: ExperimentConfig, folder: Path, name: str | None, workers: int) -> Iterator[Reply]:
+    """Run the seeds of an experiment in parallel."""
     from runner.api import interruptible, jobs_in, run_parallel
     from runner.environments.loading import load_mdp
 
@@ -119,13 +116,14 @@ def _run_parallel(
         for run in run_parallel(jobs_in(config, folder), folder, name, workers, interrupt):
             runs.append(run)
             report(len(runs))
-            _print_run(run, len(runs) - 1, as_json)
+            yield _reply(run, len(runs) - 1)
     if interrupt.came:
-        for run in runs:
-            if run.status == "interrupted":
-                say(f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` continues from there.")
-        _print_not_begun(config, len(runs))
-        raise click.exceptions.Exit(ExitCode.INTERRUPTED)
+        notes = [
+            f"Interrupted: {run.recording}; `{command_for(run, 'resume')}` continues from there."
+            for run in runs
+            if run.status == "interrupted"
+        ]
+        yield _interrupted(notes, config, len(runs))
 
 
 def _announce(config: ExperimentConfig, folder: Path) -> None:
@@ -157,35 +155,36 @@ def _is_interactive() -> bool:
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
-def _print_not_begun(config: ExperimentConfig, begun: int) -> None:
-    """Print which seeds were not begun, if any."""
+def _interrupted(notes: list[str], config: ExperimentConfig, begun: int) -> Reply:
+    """Return notes of an interrupted command, with the seeds that were not begun."""
     if left := len(config.seeds) - begun:
-        say(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
+        notes.append(f"Not begun: {left} of {len(config.seeds)} seeds, from {config.seeds[begun]} on.")
+    return Reply(notes=notes, exit_code=ExitCode.INTERRUPTED)
 
 
-def _print_run(run: Run, number: int, as_json: bool) -> None:
-    """Print a run that is over: its evaluations, facts and what to type next."""
+def _reply(run: Run, number: int) -> Reply:
+    return Reply(json_lines([run_as_json(run)]), _text(run, number))
+
+
+def _text(run: Run, number: int) -> Iterator[Part]:
+    """Yield a run that is over: its evaluations, facts and what to type next."""
     from runner.analysis.evaluations import evaluation_records
     from runner.cli.evaluations import evaluation_table, spread
     from runner.recording.reader import open_recording
 
-    if as_json:
-        print_json(run_as_json(run), indent=None)
-        sys.stdout.flush()
-        return
     with open_recording(run.recording) as recording:
         records = evaluation_records(recording)
         successes = recording.environment["success_events"]
-    parts: list[RenderableType] = [""] if number > 0 else []
+    if number > 0:
+        yield ""
     if records:
         shown = spread(records)
-        parts.append(evaluation_table(shown, successes, console()))
+        yield evaluation_table(shown, successes, console())
         if len(shown) < len(records):
             show = command_for(run, "show")
-            parts.append(f"{len(shown)} of {len(records)} evaluations; `{show}` has all.")
-        parts.append("")
-    draw(*parts, facts(_result(run, records[-1].episode if records else None)))
-    sys.stdout.flush()
+            yield f"{len(shown)} of {len(records)} evaluations; `{show}` has all."
+        yield ""
+    yield _result(run, records[-1].episode if records else None)
 
 
 def _result(run: Run, evaluated: int | None) -> dict[str, str]:

@@ -16,7 +16,7 @@ from runner.util.extras import require
 from runner.util.files import storage_errors
 
 
-@click.command("serve", cls=Command)
+@click.command("serve", cls=Command, forms=())
 def serve_command(
     recordings: tuple[Path, ...] = served_folders_option,
     host: str = option(

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import click
 from click.shell_completion import get_completion_class
 
 from runner.cli.command import Command, CommandGroup, argument
-from runner.cli.options import config_argument, json_option, output_option, set_option
-from runner.cli.output import draw, echo, print_json, print_written, say, table
+from runner.cli.options import config_argument, output_option, set_option
+from runner.cli.output import Remark, Reply, echo, files_written, table
 from runner.cli.parameter_types import DIRECTORY, SHIPPED
 
 
 @click.command("init", cls=Command)
-def init_command(
-    folder: Path = argument(metavar="[FOLDER]", default=".", type=DIRECTORY), as_json: bool = json_option
-) -> None:
+def init_command(folder: Path = argument(metavar="[FOLDER]", default=".", type=DIRECTORY)) -> Reply:
     """Create a folder to start in, with configs/, recordings/ and a README of what to type.
 
     FOLDER defaults to the current one. Existing files are left as they are.
@@ -31,15 +30,13 @@ def init_command(
     existing: list[str] = []
     for path, is_new in start_folder(folder):
         (made if is_new else existing).append(str(path))
-    if as_json:
-        print_json({"folder": str(folder.absolute()), "made": made, "kept": existing})
-        return
-    for name in made:
-        echo(name)
+    text = [*made]
     if existing:
-        say(f"{len(existing)} of {len(made) + len(existing)} existed already and were left as they are.")
+        kept = f"{len(existing)} of {len(made) + len(existing)} existed already and were left as they are."
+        text.append(Remark(kept))
     change = "" if folder == Path() else f"cd {folder} && "
-    say(f"Next: {change}dualtaxi run configs/quick.yaml")
+    text.append(Remark(f"Next: {change}dualtaxi run configs/quick.yaml"))
+    return Reply({"folder": str(folder.absolute()), "made": made, "kept": existing}, text)
 
 
 @click.group("config", cls=CommandGroup)
@@ -55,7 +52,7 @@ def config_command() -> None:
 
 
 @config_command.command("ls")
-def ls(as_json: bool = json_option) -> None:
+def ls() -> Reply:
     """List the shipped experiments, for `run`, and sweeps, for `sweep run`.
 
     Example:
@@ -63,24 +60,20 @@ def ls(as_json: bool = json_option) -> None:
     """
     from runner.config.shipped import shipped
 
-    if as_json:
-        configs = [
-            {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
-            for each in shipped().values()
-        ]
-        print_json({"configs": configs})
-        return
     headings = ("name", "kind", "about")
-    rows = ((each.name, each.kind, each.about) for each in shipped().values())
-    draw(table(*headings, rows=rows, left=headings, shrinking=("about",)))
+    rows = [(each.name, each.kind, each.about) for each in shipped().values()]
+    configs = [
+        {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
+        for each in shipped().values()
+    ]
+    return Reply({"configs": configs}, [table(*headings, rows=rows, left=headings, shrinking=("about",))])
 
 
 @config_command.command("copy")
 def copy(
     name: str = argument(metavar="NAME", type=SHIPPED),
     output: Path | None = output_option("NAME.yaml"),
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Copy the shipped experiment NAME into a file of your own, to change it.
 
     Examples:
@@ -92,15 +85,12 @@ def copy(
     experiment = find_shipped(name)
     target = output or Path(f"{name}.yaml")
     copy_shipped(experiment, target)
-    print_written(str(target), as_json, target, name=name)
-    if not as_json:
-        say(f"Next: {experiment.command.rpartition(' ')[0]} {target}")
+    following = Remark(f"Next: {experiment.command.rpartition(' ')[0]} {target}")
+    return Reply({"files": files_written(target), "name": name}, [str(target), following])
 
 
 @config_command.command("check")
-def check(
-    config: Path = config_argument, overrides: tuple[str, ...] = set_option, as_json: bool = json_option
-) -> None:
+def check(config: Path = config_argument, overrides: tuple[str, ...] = set_option) -> Reply:
     """Check CONFIG, a file or a shipped experiment, and print it with every value spelled out.
 
     The output is a configuration again. All problems are reported at once, with file, line, column and key;
@@ -113,17 +103,12 @@ def check(
     from runner.config import load
 
     experiment = load(config, overrides)
-    if as_json:
-        print_json({"file": str(config), "config": experiment.to_mapping()})
-    else:
-        echo(f"# {config} is fine. Spelled out:")
-        echo(experiment.to_yaml(), nl=False)
+    text = f"# {config} is fine. Spelled out:\n{experiment.to_yaml().removesuffix(chr(10))}"
+    return Reply({"file": str(config), "config": experiment.to_mapping()}, [text])
 
 
 @config_command.command("schema")
-def schema(
-    as_json: bool = json_option,  # noqa: ARG001 - a schema is JSON anyway
-) -> None:
+def schema() -> Reply:
     """Print the JSON Schema of configuration files, with which editors check and complete them.
 
     It is JSON with or without --json.
@@ -133,10 +118,11 @@ def schema(
     """
     from runner.config import json_schema
 
-    print_json(json_schema(), indent=2)
+    text = json.dumps(json_schema(), indent=2)
+    return Reply(iter((text, "\n")), [text])
 
 
-@click.command("completion", cls=Command)
+@click.command("completion", cls=Command, forms=())
 def completion_command(shell: str = argument(type=click.Choice(["bash", "zsh", "fish"]))) -> None:
     """Print the script that makes SHELL complete commands, options, files and the names of runs.
 

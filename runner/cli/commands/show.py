@@ -3,41 +3,28 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.analysis.sections import Grid
+from runner.analysis.sections import Grid, Section
 from runner.cli.command import Command, option
-from runner.cli.options import json_option, recordings_option, run_argument
-from runner.cli.output import (
-    console,
-    draw,
-    echo,
-    facts,
-    grid_table,
-    on_one_line,
-    patch_text,
-    print_json,
-    say,
-    title,
-)
+from runner.cli.options import recordings_option, run_argument
+from runner.cli.output import Reply, console, on_one_line, patch_text, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
 from runner.runs.branches import Origin, origin_in
 from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, ago, counted, duration, number, size
-from runner.util.values import JsonView
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from runner.analysis.summary import RecordedExtras, RunDetails
+    from runner.cli.output import Part
+    from runner.recording.code import Code
     from runner.recording.maker import Shard
-    from runner.recording.reader import Recording
     from runner.recording.run_file import Summary
 
 MAX_PROCESSES: Final = 16
@@ -50,11 +37,10 @@ MAX_CYCLES: Final = 8
 def show_command(
     run_name: str = run_argument,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
     code: bool = option(
         "--code", is_flag=True, help="Print the code that ran: commit, script, and a patch for `git apply`."
     ),
-) -> None:
+) -> Reply:
     """Show a run: its evaluations, tables, configuration and provenance.
 
     --code prints the code that ran; `git checkout COMMIT && dualtaxi show RUN --code | git apply` restores
@@ -80,26 +66,20 @@ def show_command(
 
     run = restored(find(run_name, recordings, newest=True))
     if code:
-        _print_code(run, as_json)
-        return
+        return _code(run)
     details = describe_run(run, say)
     folders = [] if run.stands_alone else [run.folder.parent]
     branches = look(folders, lambda index: index.branches(run.run_id), say)
-    if as_json:
-        origin = origin_in(details.config)
-        print_json(
-            details.as_json()
-            | {"origin": None if origin is None else asdict(origin)}
-            | {"branches": {name: asdict(each) for name, each in branches.items()}}
-        )
-    else:
-        draw(*_parts(details, branches))
-        if details.evaluations:
-            _draw_random_policy(run)
+    origin = origin_in(details.config)
+    values = {
+        "origin": None if origin is None else asdict(origin),
+        "branches": {name: asdict(each) for name, each in branches.items()},
+    }
+    return Reply(details.as_json() | values, _text(details, branches))
 
 
-def _print_code(run: Run, as_json: bool) -> None:
-    """Print the code of a run: facts as comments, which `git apply` ignores, and a patch."""
+def _code(run: Run) -> Reply:
+    """Return the code of a run."""
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
@@ -109,9 +89,12 @@ def _print_code(run: Run, as_json: bool) -> None:
             for key, text in recording.provenance.items()
             if key.startswith(("git", "code.")) or key == "command"
         }
-    if as_json:
-        print_json(code_facts | {"files": dict(recorded.files), "new": recorded.new, "patch": recorded.patch})
-        return
+    values = code_facts | {"files": dict(recorded.files), "new": recorded.new, "patch": recorded.patch}
+    return Reply(values, _code_text(recorded, code_facts))
+
+
+def _code_text(recorded: Code, code_facts: dict[str, str]) -> Iterator[Part]:
+    """Yield facts as comments, which `git apply` ignores, and a patch."""
     if not any(key.startswith(("git", "code.")) for key in code_facts):
         code_facts["code.not_recorded"] = "the code of this run"
     committed = [path for path in recorded.files if path not in recorded.new]
@@ -120,72 +103,64 @@ def _print_code(run: Run, as_json: bool) -> None:
         [f"# also printed in full by --json: {', '.join(map(on_one_line, committed))}"] if committed else []
     )
     if console().is_terminal:
-        draw(*head, patch_text(recorded.to_patch().splitlines()))
+        yield "\n".join(head)
+        yield patch_text(recorded.to_patch().splitlines())
     else:
-        echo("\n".join(head) + "\n")
+        yield "\n".join(head) + "\n"
         sys.stdout.write(recorded.to_patch())  # exact, for `git apply`
 
 
-def _parts(details: RunDetails, branches: Mapping[str, Origin]) -> list[RenderableType]:
-    from runner.analysis.summary import brief_provenance
+def _text(details: RunDetails, branches: Mapping[str, Origin]) -> Iterator[Part]:
+    from runner.analysis.summary import brief_provenance, random_policy_sentence
     from runner.cli.evaluations import evaluation_table
     from runner.recording.reader import open_recording
     from runner.recording.run_file import has_environment
 
-    run = details.run
-    parts: list[RenderableType] = [facts(_head(details))]
-    if details.evaluations:
-        table = evaluation_table(details.evaluations, details.success_events, console())
-        parts += [title("Evaluations"), table]
-    if details.loop is not None:
-        parts += [title("Last results"), facts(_loop_results(details.loop, has_environment(details.config)))]
-    if details.extras:
-        parts += [title("Values recorded with steps"), facts(_extras(details.extras))]
-    if details.checkpoints:
-        last = details.checkpoints[-1]
-        summary = (
-            f"{len(details.checkpoints):,}, the last {last.reference}; `{command_for(run, 'checkpoints')}`"
-        )
-        parts += [title("Checkpoints"), summary]
-    if details.run.marks:
-        rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in details.run.marks]
-        parts += [title("Marks"), grid_table(Grid(("step", "text", "tags"), rows))]
-    if branches:
-        parts += [title("Branches"), facts({name: str(each) for name, each in branches.items()})]
-    if details.optimality:
-        with open_recording(run.recording) as recording:
-            measures = _optimality(recording, details.optimality[-1])
-        parts += [title("Greedy policy, exactly"), facts(measures)]
-    if details.tables:
-        fill = {
-            each.agent: UNKNOWN
-            if each.step is None
-            else f"{each.percent_filled:.1f} % filled, {each.zero_cells:,} cells are still zero, "
-            f"after {each.step:,} steps"
-            for each in details.tables
-        }
-        parts += [title("Tables"), facts(fill)]
+    yield _head(details)
     given = dict(details.config)
     if (frames := given.get("frames")) and isinstance(frames, Mapping) and not frames.get("every"):
         del given["frames"]
     if not has_environment(given):
         del given["env"]
-    config = {key: _yaml(value) for key, value in given.items() if value not in ([], {})}
-    parts += [title("Configuration"), facts(config)]
-    if details.provenance:
-        parts += [title("Provenance"), facts(brief_provenance(details.provenance))]
-    return parts
-
-
-def _draw_random_policy(run: Run) -> None:
-    """Print the baseline of the evaluations, after all else: it may take seconds to compute."""
-    from runner.analysis.summary import random_policy_sentence
-    from runner.recording.reader import open_recording
-
-    with stage_line("evaluating a random policy"), open_recording(run.recording) as recording:
-        sentence = random_policy_sentence(recording)
-    if sentence:
-        draw(title("Baseline"), sentence)
+    parts: dict[str, Part] = {
+        "Evaluations": evaluation_table(details.evaluations, details.success_events, console())
+        if details.evaluations
+        else "",
+        "Last results": {}
+        if details.loop is None
+        else _loop_results(details.loop, has_environment(details.config)),
+        "Values recorded with steps": _extras(details.extras),
+        "Checkpoints": f"{len(details.checkpoints):,}, the last {details.checkpoints[-1].reference}; "
+        f"`{command_for(details.run, 'checkpoints')}`"
+        if details.checkpoints
+        else "",
+        "Marks": Grid(
+            ("step", "text", "tags"),
+            [(mark.at, mark.text, " ".join(mark.tags)) for mark in details.run.marks],
+        )
+        if details.run.marks
+        else "",
+        "Branches": {name: str(origin) for name, origin in branches.items()},
+        "Greedy policy, exactly": _optimality(details),
+        "Tables": {
+            each.agent: UNKNOWN
+            if each.step is None
+            else f"{each.percent_filled:.1f} % filled, {each.zero_cells:,} cells are still zero, "
+            f"after {each.step:,} steps"
+            for each in details.tables
+        },
+        "Configuration": {key: _yaml(value) for key, value in given.items() if value not in ([], {})},
+        "Provenance": brief_provenance(details.provenance),
+    }
+    for heading, part in parts.items():
+        if part:
+            yield title(heading)
+            yield part
+    if details.evaluations:  # after all else: it may take seconds to compute
+        with stage_line("evaluating a random policy"), open_recording(details.run.recording) as recording:
+            sentence = random_policy_sentence(recording)
+        if sentence:
+            yield Section("Baseline", [sentence])
 
 
 def _head(details: RunDetails) -> dict[str, str]:
@@ -259,12 +234,17 @@ def _extras(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
     return rows
 
 
-def _optimality(recording: Recording, measures: JsonView) -> dict[str, str]:
-    """Return the last exact measures, next to the optimum."""
+def _optimality(details: RunDetails) -> dict[str, str]:
+    """Return the last exact measures, next to the optimum; empty without any."""
     from runner.environments.naming import states_in_words
+    from runner.recording.reader import open_recording
 
-    states = states_in_words(recording.mdp)
-    gains = zip(recording.agents, measures["values"], measures["best_responses"], strict=True)
+    if not details.optimality:
+        return {}
+    measures = details.optimality[-1]
+    with open_recording(details.run.recording) as recording:
+        states = states_in_words(recording.mdp)
+        gains = zip(recording.agents, measures["values"], measures["best_responses"], strict=True)
     gain = " and ".join(f"{best - own:.3f} ({agent})" for agent, own, best in gains)
     rows = {
         "succeeds": f"{measures['success_percent']:.1f} % of {measures['starts']:,} start states "

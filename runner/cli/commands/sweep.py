@@ -18,14 +18,11 @@ from runner.cli.options import (
     accept_changes_option,
     all_option,
     force_option,
-    json_option,
-    markdown_option,
     ray_option,
     recordings_option,
-    require_one,
     workers_option,
 )
-from runner.cli.output import console, draw, echo, facts, print_json, print_sections, say
+from runner.cli.output import Remark, Reply, console, facts, say
 from runner.cli.parameter_types import ConfigName
 from runner.cli.progress import seldom, stage_line
 from runner.errors import ExitCode, RunnerError
@@ -36,6 +33,7 @@ from runner.util.humanize import UNKNOWN, amount, duration, size
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:
+    from runner.cli.output import Part
     from runner.sweep.model import Range, Sweep
     from runner.sweep.plan import Plan
     from runner.sweep.running import SweepStatus
@@ -68,9 +66,8 @@ def run(
     name: str | None = option(
         "--name", help="Name of the sweep.  [default: the name in the file, or of the file]"
     ),
-    as_json: bool = json_option,
     recordings: Path | None = recordings_option,
-) -> None:
+) -> Reply:
     """Run the sweep FILE: many runs of one experiment with other values.
 
     FILE may also be the name of a shipped sweep, which `dualtaxi config ls` lists.
@@ -96,8 +93,7 @@ def run(
     require_optuna()
     sweep = load_sweep(file, checked_name(name))
     if dry_run:
-        _print_plan(sweep, plan_of(sweep), as_json)
-        return
+        return _plan(sweep, plan_of(sweep))
 
     def planned(plan: Plan, before: int) -> None:
         started = f"; {before:,} started before" if before else ""
@@ -120,12 +116,11 @@ def run(
             report=report,
             planned=planned,
         )
-    _print_results(sweep, trials, status, as_json)
-    if status.stopped or status.failed:
-        raise click.exceptions.Exit(ExitCode.INTERRUPTED if interrupt.came else ExitCode.DIFFERENT)
+    code = ExitCode.DIFFERENT if status.stopped or status.failed else ExitCode.OK
+    return _results(sweep, trials, status, ExitCode.INTERRUPTED if code and interrupt.came else code)
 
 
-@sweep_command.command("show")
+@sweep_command.command("show", forms=("json", "markdown"))
 def show(
     name: str = argument(),
     everything: bool = all_option,
@@ -136,10 +131,8 @@ def show(
         help="Write the best configuration, with fresh seeds.",
     ),
     force: bool = force_option,
-    as_markdown: bool = markdown_option,
-    as_json: bool = json_option,
     recordings: Path | None = recordings_option,
-) -> None:
+) -> Iterator[Reply]:
     """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.
 
     The value of a trial is the median over its seeds, shown with the interquartile mean (IQM) and its 95 %
@@ -153,29 +146,26 @@ def show(
     from runner.sweep.results import DEFAULT_SHOWN, results_of, sections
     from runner.sweep.state import read_sweep
 
-    require_one("as_json", "as_markdown")
     folder = recordings_folder(recordings)
     if best is not None:
         require_new(best, force)
     sweep = read_sweep(name, folder)
     with stage_line("ranking trials"):
         results = results_of(sweep, folder)
-    if as_json:
-        print_json(
-            {
-                "name": name,
-                "objective": results.sweep.objective.model_dump(mode="json"),
-                "trials": results.trials,
-                "ranking": [dataclasses.asdict(entry) for entry in results.ranking],
-                "effects": [dataclasses.asdict(effect) for effect in results.effects],
-                "best": results.best and results.best.number,
-            }
-        )
-    else:
-        print_sections(sections(results, None if everything else DEFAULT_SHOWN), as_markdown)
-        if best is None and results.best is not None:
-            number = results.best.number
-            say(f"--write-best FILE writes the configuration of trial {number}, with seeds not searched.")
+    values = {
+        "name": name,
+        "objective": results.sweep.objective.model_dump(mode="json"),
+        "trials": results.trials,
+        "ranking": [dataclasses.asdict(entry) for entry in results.ranking],
+        "effects": [dataclasses.asdict(effect) for effect in results.effects],
+        "best": results.best and results.best.number,
+    }
+    text: list[Part] = [*sections(results, None if everything else DEFAULT_SHOWN)]
+    if best is None and results.best is not None:
+        number = results.best.number
+        what = f"the configuration of trial {number}, with seeds not searched"
+        text.append(Remark(f"--write-best FILE writes {what}."))
+    yield Reply(values, text)
     if best is not None:
         if results.best_yaml is None:
             raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")
@@ -184,19 +174,14 @@ def show(
 
 
 @sweep_command.command("ls")
-def ls(recordings: Path | None = recordings_option, as_json: bool = json_option) -> None:
+def ls(recordings: Path | None = recordings_option) -> Reply:
     """List the sweeps of a recordings folder.
 
     Example:
       dualtaxi sweep ls
     """
     names = sweeps_in(recordings_folder(recordings))
-    if as_json:
-        print_json({"sweeps": names})
-    elif names:
-        echo("\n".join(names))
-    else:
-        say("No sweeps yet. `dualtaxi sweep run FILE` starts one.")
+    return Reply({"sweeps": names}, names or [Remark("No sweeps yet. `dualtaxi sweep run FILE` starts one.")])
 
 
 @contextlib.contextmanager
@@ -235,12 +220,10 @@ def _status_rows(sweep: Sweep, status: SweepStatus) -> dict[str, str]:
     return rows
 
 
-def _print_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
-    """Print what would run."""
+def _plan(sweep: Sweep, plan: Plan) -> Reply:
+    """Return what would run."""
     values = {path: _range_text(parameter) for path, parameter in sweep.file.parameters.items()}
-    if as_json:
-        print_json(dataclasses.asdict(plan) | {"name": sweep.name, "bytes": plan.bytes, "parameters": values})
-        return
+    more = {"name": sweep.name, "bytes": plan.bytes, "parameters": values}
     runs = f"{plan.runs:,}: {plan.trials:,} trials, {len(sweep.seeds)} seeds each, of "
     runs += f"{amount(sweep.base.episodes)} episodes"
     if plan.excluded:
@@ -252,7 +235,7 @@ def _print_plan(sweep: Sweep, plan: Plan, as_json: bool) -> None:
         "objective": sweep.objective.description,
         "disk": f"about {size(plan.bytes)}, {size(plan.bytes_per_run)} per run",
     }
-    draw(facts(rows))
+    return Reply(dataclasses.asdict(plan) | more, [rows])
 
 
 def _range_text(parameter: list[object] | Range) -> str:
@@ -263,31 +246,27 @@ def _range_text(parameter: list[object] | Range) -> str:
     return f"{parameter.low:g} to {parameter.high:g}{kind}"
 
 
-def _print_results(sweep: Sweep, trials: Trials, status: SweepStatus, as_json: bool) -> None:
+def _results(sweep: Sweep, trials: Trials, status: SweepStatus, exit_code: int) -> Reply:
     from runner.analysis.compare.statistics import bounded
     from runner.sweep.results import objective_text, values_text
 
     best = status.best
-    if as_json:
-        value = None if best is None or best.value is None else bounded(best.value)
-        keys = ("runs", "done", "pruned", "failed", "excluded")
-        print_json(
-            {
-                "name": sweep.name,
-                **{key: getattr(status, key) for key in keys},
-                "stopped": status.stopped or None,
-                "seconds": round(status.seconds, 3),
-                "bytes": status.bytes,
-                "best": best and {"trial": best.number, "value": value, "values": best.values},
-            }
-        )
-    else:
-        rows = _status_rows(sweep, status)
-        if best is not None:
-            rows["best"] = f"{objective_text(best.value)} in trial {best.number}: {values_text(best.values)}"
-        draw(facts(rows | {"next": f"dualtaxi sweep show {sweep.name}"}))
-    for trial in trials.done:
-        for error in trial.errors if trial.state == "failed" else ():
-            say(f"Failed: trial {trial.number}, {error}")
+    value = None if best is None or best.value is None else bounded(best.value)
+    keys = ("runs", "done", "pruned", "failed", "excluded")
+    values = {
+        "name": sweep.name,
+        **{key: getattr(status, key) for key in keys},
+        "stopped": status.stopped or None,
+        "seconds": round(status.seconds, 3),
+        "bytes": status.bytes,
+        "best": best and {"trial": best.number, "value": value, "values": best.values},
+    }
+    rows = _status_rows(sweep, status)
+    if best is not None:
+        rows["best"] = f"{objective_text(best.value)} in trial {best.number}: {values_text(best.values)}"
+    failed = [trial for trial in trials.done if trial.state == "failed"]
+    notes = [f"Failed: trial {trial.number}, {error}" for trial in failed for error in trial.errors]
     if status.stopped:
-        say(f"Stopped: {status.stopped}. --resume continues from there.")
+        notes.append(f"Stopped: {status.stopped}. --resume continues from there.")
+    text = [rows | {"next": f"dualtaxi sweep show {sweep.name}"}]
+    return Reply(values, text, notes=notes, exit_code=exit_code)

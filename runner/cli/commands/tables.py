@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import (
-    json_option,
-    set_option,
-)
-from runner.cli.output import echo_csv, print_json
-
-if TYPE_CHECKING:
-    pass
+from runner.cli.options import set_option
+from runner.cli.output import Reply, csv_lines, json_lines
 
 ROWS_AT_ONCE = 50_000
 
@@ -30,8 +23,7 @@ def table_command(
         help="Gymnasium's id of the environment; before a colon, the module to import for it.",
     ),
     overrides: tuple[str, ...] = set_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Print an environment's transition table as CSV, with names.
 
     A row for each state, action and outcome that can happen: state, action, probability, next_state, reward,
@@ -55,8 +47,6 @@ def table_command(
             part = [column[start : start + ROWS_AT_ONCE].tolist() for column in columns.values()]
             yield from zip(*part, strict=True)
 
-    if as_json:
-        for row in rows():
-            print_json(dict(zip(columns, row, strict=True)), indent=None)
-    else:
-        echo_csv(columns, rows())
+    return Reply(
+        json_lines(dict(zip(columns, row, strict=True)) for row in rows()), csv=csv_lines(columns, rows())
+    )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import click
 
 from runner.cli.command import CommandGroup, argument, option
-from runner.cli.options import json_option
-from runner.cli.output import draw, echo, print_json, say, table
+from runner.cli.output import Remark, Reply, table
 from runner.service.settings import tokens_file
 
 
@@ -33,8 +32,7 @@ def create(
         show_default=True,
         help="What the token allows; writing includes reading.",
     ),
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Create a token called NAME and print it, once: only its hash is stored.
 
     Examples:
@@ -45,15 +43,12 @@ def create(
 
     scopes = (READ, WRITE) if scope == WRITE else (READ,)
     token, secret = Tokens(tokens_file()).create(name, scopes)
-    if as_json:
-        print_json(token.as_json() | {"token": secret})
-    else:
-        echo(secret)
-        say(f"Keep it; it is not shown again. `dualtaxi token revoke {token.id}` revokes it.")
+    remark = Remark(f"Keep it; it is not shown again. `dualtaxi token revoke {token.id}` revokes it.")
+    return Reply(token.as_json() | {"token": secret}, [secret, remark])
 
 
 @token_command.command("ls")
-def ls(as_json: bool = json_option) -> None:
+def ls() -> Reply:
     """List the tokens; only their hashes are stored.
 
     Example:
@@ -62,18 +57,15 @@ def ls(as_json: bool = json_option) -> None:
     from runner.service.tokens import Tokens
 
     tokens = Tokens(tokens_file()).all()
-    if as_json:
-        print_json({"tokens": [token.as_json() for token in tokens]})
-    elif tokens:
-        headings = ("id", "name", "scopes", "created")
-        rows = [(token.id, token.name, " ".join(token.scopes), token.created) for token in tokens]
-        draw(table(*headings, rows=rows, left=headings, shrinking=("name",)))
-    else:
-        say("No tokens yet. `dualtaxi token create NAME` makes one.")
+    headings = ("id", "name", "scopes", "created")
+    rows = [(token.id, token.name, " ".join(token.scopes), token.created) for token in tokens]
+    listed = table(*headings, rows=rows, left=headings, shrinking=("name",))
+    nothing = Remark("No tokens yet. `dualtaxi token create NAME` makes one.")
+    return Reply({"tokens": [token.as_json() for token in tokens]}, [listed if tokens else nothing])
 
 
 @token_command.command("revoke")
-def revoke(which: str = argument(metavar="TOKEN"), as_json: bool = json_option) -> None:
+def revoke(which: str = argument(metavar="TOKEN")) -> Reply:
     """Revoke a token by its id or name; a running server refuses it from now on.
 
     Example:
@@ -82,7 +74,4 @@ def revoke(which: str = argument(metavar="TOKEN"), as_json: bool = json_option) 
     from runner.service.tokens import Tokens
 
     token = Tokens(tokens_file()).revoke(which)
-    if as_json:
-        print_json(token.as_json())
-    else:
-        say(f"Revoked {token.id} ({token.name}).")
+    return Reply(token.as_json(), [Remark(f"Revoked {token.id} ({token.name}).")])

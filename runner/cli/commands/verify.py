@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import json_option, recordings_option, run_argument, trust_option
-from runner.cli.output import facts, print_result
+from runner.cli.options import recordings_option, run_argument, trust_option
+from runner.cli.output import Reply
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import command_for, find_recording, folded, job_progress, require_over
@@ -45,8 +45,7 @@ def verify_command(
     ),
     trust: bool = trust_option,
     recordings: Path | None = recordings_option,
-    as_json: bool = json_option,
-) -> None:
+) -> Reply:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
     A run that was trained here is retrained in memory, with the environment in the recording, and compared.
@@ -88,9 +87,8 @@ def verify_command(
 
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)
-    print_result(as_json, _as_json(found), facts(_rows(found, run)))
-    if not found.sound or (rerun and found.reason):
-        raise click.exceptions.Exit(ExitCode.DIFFERENT)
+    code = ExitCode.DIFFERENT if not found.sound or (rerun and found.reason) else ExitCode.OK
+    return Reply(_as_json(found), [_rows(found, run)], exit_code=code)
 
 
 def _rows(found: Verification, run: Run | None) -> dict[str, str]:
@@ -218,9 +216,7 @@ _MESSAGES: Final = {
 
 
 @click.command("repair", cls=Command)
-def repair_command(
-    run_name: str = run_argument, recordings: Path | None = recordings_option, as_json: bool = json_option
-) -> None:
+def repair_command(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Reply:
     """Repair the recording of RUN, or one given by its path, so that every reader opens it.
 
     Every good chunk is copied to a new file, also those after a damaged place; the file is read back and
@@ -253,10 +249,10 @@ def repair_command(
         done.append((repaired, own))
     first, *others = [_repair_as_json(repaired) for repaired, _ in done]
     value = first | ({"shards": others} if others else {})
-    print_result(as_json, value, *(facts(_repair(repaired, own)) for repaired, own in done))
+    text = [_repair(repaired, own) for repaired, own in done]
     whole = run if run is None else folded(run)
-    if not all(repaired.lossless for repaired, _ in done) or (whole and whole.summary.unfolded):
-        raise click.exceptions.Exit(ExitCode.DIFFERENT)
+    has_losses = not all(repaired.lossless for repaired, _ in done) or (whole and whole.summary.unfolded)
+    return Reply(value, text, exit_code=ExitCode.DIFFERENT if has_losses else ExitCode.OK)
 
 
 def _repair_as_json(repaired: Repair) -> dict[str, object]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from runner.export.rerun.selection import Request
 
 
-@click.command("view", cls=Command)
+@click.command("view", cls=Command, forms=())
 def view_command(
     run_names: tuple[str, ...] = argument(metavar="RUN [RUN]", nargs=-1, required=True, type=RunName()),
     step: EpisodeRef | None = option(

@@ -1,5 +1,7 @@
 """Printed results: numbers, tables that fit the terminal, drawings."""
 
+import json
+
 import pytest
 from click.testing import CliRunner
 from rich.console import Console
@@ -66,8 +68,11 @@ def test_unknown_numbers_are_a_dash():
 
 
 def test_json_has_no_nan(capsys):
-    output.print_json({"a": float("nan"), "b": [1.5, float("inf")], 3: (True, None, "x")}, indent=None)
-    assert capsys.readouterr().out == '{"a": null, "b": [1.5, null], "3": [true, null, "x"]}\n'
+    value = {"a": float("nan"), "b": [1.5, float("inf")], 3: (True, None, "x")}
+    (line,) = output.json_lines([value])
+    assert line == '{"a": null, "b": [1.5, null], "3": [true, null, "x"]}\n'
+    output.print_replies(output.Reply(value), "json")
+    assert json.loads(capsys.readouterr().out) == json.loads(line)
 
 
 NAMES = [
