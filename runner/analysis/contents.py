@@ -60,7 +60,7 @@ def require_steps(recording: Recording, purpose: str, may_redo: bool = False) ->
 
 def why_no_steps(recording: Recording) -> str:
     """Return why a recording has no steps, and the command that records them, if there is one."""
-    if recording.leaves_out_steps and not (recording.can_train_again or recording.has_actions):
+    if recording.leaves_out_steps and recording.maker is not None and not recording.has_actions:
         return (
             "they were left out (steps: none), and without its actions a loop's environment cannot be rerun"
         )

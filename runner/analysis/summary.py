@@ -218,11 +218,9 @@ def _loop_as_json(loop: Summary) -> dict[str, object]:
 
 def _tables(recording: Recording) -> tuple[TableFill, ...]:
     """Return the fill of each table; a loop has none that the runner knows."""
-    if not recording.has_tables:
-        return ()
     reports = [*recording.train.all_metrics(), *recording.eval.all_metrics()]
     last = max(reports, key=lambda report: report["step"], default=None)
     if last is None:
-        return tuple(map(TableFill, recording.agents))
+        return tuple(map(TableFill, recording.agents if recording.table(schema.Q_TABLE_TOPIC) else ()))
     fill = zip(recording.agents, last["zero_cells"], last["percent_filled"], strict=True)
     return tuple(TableFill(agent, last["step"], zero, filled) for agent, zero, filled in fill)

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -90,8 +91,11 @@ def rerecord(
         KeyboardInterrupt: `stop` returned True; the recording stays as it is.
     """
     with locked(run) as current:
-        is_loop = is_rerun(current)
-        if not is_loop and current.status != "finished":
+        if is_rerun(current):
+            record = partial(_rerun_loop, trust=trust, count=count)
+        elif current.status == "finished":
+            record = partial(_rerecord_job, report=report, stop=stop, trust=trust)
+        else:
             from_mapping(current.file.config)  # refuses a loop's run, which nobody can resume
             raise RunnerError(
                 f"run {run.run_id} is {current.status}; `dualtaxi resume {run.run_id}` finishes it first."
@@ -102,13 +106,7 @@ def rerecord(
         try:
             with storage_errors(fresh):
                 fresh.unlink(missing_ok=True)
-                if is_loop:
-                    _require_actions(current, trust)
-                    for done in stream_from_child(_rerecord_loop, current.recording, fresh, trust):
-                        count(done)
-                else:
-                    require_may_train(current.recording, current.file.config, trust)
-                    _rerecord_job(current, fresh, report, stop)
+                record(current, fresh)
                 fresh.replace(current.recording)
         finally:
             fresh.unlink(missing_ok=True)
@@ -186,8 +184,9 @@ def _with(config: ExperimentConfig, **changes: object) -> ExperimentConfig:
     return from_mapping(config.to_mapping() | changes)
 
 
-def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
+def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop, trust: bool) -> None:
     """Retrain a job, and write its recording with whole steps into a new file."""
+    require_may_train(run.recording, run.file.config, trust)
     with open_recording(run.recording) as recording:
         config = from_mapping(recording.config)
         job = Job(_with(config, recording=config.to_mapping()["recording"] | {"steps": "all"}), run.seed)
@@ -211,8 +210,8 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop) -> None:
     rewrite(run.recording, fresh, _with_all_steps, {"rerecord": provenance()}, trained, retrain)
 
 
-def _require_actions(run: Run, trust: bool) -> None:
-    """Refuse a loop whose environment cannot be rerun, or whose result cannot be compared.
+def _rerun_loop(run: Run, fresh: Path, trust: bool, count: Callable[[int], None]) -> None:
+    """Rerun a loop's environment in a child process, and write its recording with whole steps.
 
     Raises:
         CannotRedo: the environment cannot be had.
@@ -230,6 +229,8 @@ def _require_actions(run: Run, trust: bool) -> None:
             )
         if reason := why_not_rerun(recording, trust):
             raise CannotRedo(reason)
+    for done in stream_from_child(_rerecord_loop, run.recording, fresh, trust):
+        count(done)
 
 
 def _rerecord_loop(path: Path, fresh: Path, trust: bool) -> None:
