@@ -87,7 +87,7 @@ class GridLabels:
                 self.stops.append(numbers)
         self._add_levels(*value_range)
 
-    def track(self, root: str) -> Track:
+    def track(self) -> Track:
         """Return the texts and colours of everything below an entity path."""
         classes = [
             {
@@ -103,9 +103,7 @@ class GridLabels:
         # As Arrow, because Rerun is slow to convert thousands of labels.
         empty: Any = rr.AnnotationContext([]).context
         context = pa.array([classes], empty.as_arrow_array().type)
-        return Track(
-            f"{root}/", static=[[ComponentColumn(rr.AnnotationContext.descriptor_context(), context)]]
-        )
+        return Track("", static=[[ComponentColumn(rr.AnnotationContext.descriptor_context(), context)]])
 
     @cached_property
     def points(self) -> Points:

@@ -20,7 +20,7 @@ OVERVIEW: Final = "Overview"
 MAX_SHOWN: Final = {
     "train": MAX_MEMBERS,
     "eval": MAX_MEMBERS,
-    "pictures": MAX_MEMBERS,
+    "picture": MAX_MEMBERS,
     "array": 2,
     "bars": 2,
     "logged": 6,
@@ -87,7 +87,7 @@ def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
 def _loop(loop: Writer) -> rrb.Container:
     """Return the arrangement of a loop: its pictures at the left, its lines at the right."""
     left: list[tuple[Shown, int]] = [(view, 4) for view in _group(loop, "grid")]
-    for place in ("train", "eval", "pictures"):
+    for place in ("train", "eval", "picture"):
         if frames := _group(loop, place):
             left += [(rrb.Grid(*frames, grid_columns=math.ceil(math.sqrt(len(frames)))), 3)]
     left += [(view, 2) for view in _group(loop, "array")]
@@ -117,7 +117,7 @@ def _group(run: Writer, *groups: str) -> list[rrb.View]:
         if group in schema.PHASES:  # frames: environments by number
             of_group.sort(key=lambda shown: (len(shown[0].name), shown[0].name))
         for view, entities in of_group[: MAX_SHOWN.get(group)]:
-            views.append(_drawn(view, f"{run.source.root}/", entities, run.last, run.focus))
+            views.append(_drawn(view, f"{run.source.root}/", entities, run.last, run.selection.focus))
     return views
 
 

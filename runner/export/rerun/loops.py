@@ -6,7 +6,7 @@ Entities of a vector environment are below `train/env_3`, those of a game's agen
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import reduce
 from operator import getitem
 from typing import Any, Final, NamedTuple
@@ -22,37 +22,22 @@ from runner.export.encoded import encoded_picture
 from runner.export.painting import decoded, redrawn
 from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
-from runner.export.rerun.selection import MAX_MEMBERS, Selection
-from runner.export.rerun.tracks import (
-    MAX_ROWS,
-    Row,
-    Times,
-    Track,
-    TrackView,
-    Writer,
-    grouped,
-    rows_of,
-    scalars,
-    times_of,
-)
+from runner.export.rerun.selection import MAX_MEMBERS
+from runner.export.rerun.tracks import Row, Times, Track, TrackView, Writer, in_tracks, scalars, times_of
 from runner.export.values import FEW, acted, number_names, observed
 from runner.recording import schema
-from runner.recording.messages import frame_place, media_type
+from runner.recording.messages import decode_array, frame_place, media_type
 from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
 from runner.replay.steps import frames_every, log_times_of
-from runner.util.arrays import Array, MaskedArray, Records
+from runner.util.arrays import Array, Flags, MaskedArray, Records
 
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
 MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
-FRAMES_SENT: Final = 64
-"""Pictures sent at once."""
 LOG: Final = TrackView("log", "Log", rrb.TextLogView)
-_NAMED: Final = {"picture": ("pictures", rrb.Spatial2DView), "array": ("array", rrb.TensorView)}
-"""Entities of what is logged by name: the group and the kind of their views."""
 OBSERVED: Final = {"observation": observed, "action": acted}
 Part = tuple[list[tuple[str, ...]], list[str]]
 """Paths into the values of a space, and the names of all numbers there."""
@@ -71,69 +56,69 @@ class Member(NamedTuple):
     agent: str = ""
     """The agent's name in the recording of a game."""
 
+    def is_own(self, rows: Records) -> Flags:
+        """Return which steps or episodes are of the member."""
+        if self.agent and "acted" in (rows.dtype.names or ()):
+            return (rows["acted"] >> self.number & 1).astype(np.bool_)
+        is_alone = self.agent or not self.name
+        return np.full(len(rows), True) if is_alone else np.asarray(rows["environment"] == self.number)
+
 
 class LoopTracks:
     """Makes the tracks of a loop: an overview, lines of its steps, and pictures that are drawn of them."""
 
-    def __init__(
-        self, writer: Writer, selection: Selection, trust: bool, stage: Callable[[str], None]
-    ) -> None:
+    def __init__(self, writer: Writer) -> None:
         recording = self._recording = writer.source.recording
-        self._writer, self._root, self._selection = writer, writer.source.root, selection
-        self._trust, self._stage = trust, stage
-        self._is_game, n = len(recording.agents) > 1, recording.environments
-        self._environments = [f"env_{i}" if n > 1 else "" for i in range(n)]
-        self._alone = n == 1
-        """Whether environments take no turns, or follow one another."""
-        if self._is_game:
+        self._writer = writer
+        if len(recording.agents) > 1:
             agents = enumerate(recording.agents)
             self._members = [Member(i, entity_name(a), i, _parts(recording, a), a) for i, a in agents]
         else:
-            parts = _parts(recording)
-            self._members = [Member(i, name, 0, parts) for i, name in enumerate(self._environments)]
+            parts, environments = _parts(recording), range(recording.environments)
+            self._members = [Member(i, self._environment(i), parts=parts) for i in environments]
         self._pictured: dict[tuple[str, int], int] = {}
         """The step of the last picture, by phase and environment."""
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but the steps."""
-        recording = self._recording
         for phase in schema.PHASES:
             yield from self._episodes(phase)
-            for environment, frames in grouped(self._recorded_frames(phase), FRAMES_SENT):
-                yield self._frames(phase, environment, frames)
-        for image in recording.table(schema.IMAGE_TOPIC).decoded():
-            if data := _still(image["data"]):
-                yield self._named("picture", image["frame_id"], image["log_time"], _picture(data))
-        for series, rows in recording.scalars():
+        yield from in_tracks(self._rows())
+        for series, rows in self._recording.scalars():
             names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
             for name in dict.fromkeys(names.tolist()):
                 own = rows[names == name]
                 times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
                 values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
-                yield Track(f"{self._root}/logged/{name}", times, values, style, TrackView("logged", view))
-        texts = (
-            ("log", (_step(text["log_time"]), rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")))
-            for text in recording.table(schema.LOG_TOPIC).decoded()
-        )
-        for name, lines in grouped(texts, MAX_ROWS):
-            yield rows_of(f"{self._root}/{name}", lines, LOG)
-        arrays = recording.table(schema.ARRAY_TOPIC).messages()
-        for (time, _), array in zip(arrays, recording.arrays(), strict=True):
-            yield self._named("array", array.name, time, rr.Tensor(np.atleast_1d(array.values)))
+                yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
 
-    def _named(self, folder: str, name: str, log_time: int, shown: rr.AsComponents) -> Track:
-        """Return a track of what was logged once under a name, in a view of its own."""
-        group, kind = _NAMED[folder]
-        name = entity_name(name)
-        return rows_of(
-            f"{self._root}/{folder}/{name}", [(_step(log_time), shown)], TrackView(group, name, kind)
-        )
+    def _rows(self) -> Iterator[Row]:
+        """Yield recorded frames, and logged pictures, texts and arrays."""
+        recording, is_each_step = self._recording, frames_every(self._recording) == 1
+        for phase in schema.PHASES:
+            for frame in recording.phase(phase).frames.decoded():
+                environment, _ = frame_place(frame)
+                later = recording.environments - 1 - environment
+                step = max(0, _step(frame["log_time"]) - later)
+                if later >= 0 and (self._is_later(phase, environment, step) or not is_each_step):
+                    yield self._frame(phase, environment, step, _picture(frame["data"]))
+        for image in recording.table(schema.IMAGE_TOPIC).decoded():
+            if data := _still(image["data"]):
+                name, step = entity_name(image["frame_id"]), _step(image["log_time"])
+                view = TrackView("picture", name, rrb.Spatial2DView)
+                yield Row(f"picture/{name}", step, _picture(data), view)
+        for text in recording.table(schema.LOG_TOPIC).decoded():
+            line = rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")
+            yield Row("log", _step(text["log_time"]), line, LOG)
+        for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
+            name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
+            yield Row(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
 
     def _episodes(self, phase: str) -> Iterator[Track]:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
         for block in self._recording.phase(phase).episodes.blocks():
             for member in self._members:
-                own = block if self._alone else block[block["environment"] == member.number]
+                own = block[member.is_own(block)]
                 if len(own):
                     times = times_of(own["log_time"], episode=own["episode"])
                     yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
@@ -146,11 +131,7 @@ class LoopTracks:
         recording = self._recording
         extras = recording.phase(phase).extras.at(steps["step"])
         for member in self._members:
-            is_own = np.full(len(steps), True)
-            if self._is_game:
-                is_own = (steps["acted"] >> member.number & 1).astype(np.bool_)
-            elif not self._alone:
-                is_own = steps["environment"] == member.number
+            is_own = member.is_own(steps)
             if not is_own.any():
                 continue
             own = steps[is_own]
@@ -161,7 +142,7 @@ class LoopTracks:
                 numbers = [reduce(getitem, path, values).reshape(len(own), -1) for path in paths]
                 yield self._line(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
             for name, values in extras.items():
-                agent, _, own_name = name.partition("/") if self._is_game else (member.name, "", name)
+                agent, _, own_name = name.partition("/") if member.agent else (member.name, "", name)
                 if entity_name(agent) == (member.name or "_"):
                     yield from self._extra(phase, member, own_name, values[is_own], times)
 
@@ -178,18 +159,17 @@ class LoopTracks:
             names = [f"{name}[{i}]" for i in range(numbers.shape[1])]
             yield self._line(phase, member, quantity, times, numbers, names)
             return
-        texts: list[Row] = []
-        bars: list[Row] = []
+        entity, title = _entity(phase, member.name, quantity), f"{member.name} {name}".strip()
+        texts = TrackView("texts", title, rrb.TextDocumentView)
+        bars = TrackView("bars", title, rrb.BarChartView)
+        rows = []
         for step, value in zip(times["step"][is_given].tolist(), values.data[is_given], strict=True):
             if isinstance(value, str):
-                texts.append((step, rr.TextDocument(value.encode(errors="replace").decode())))
+                text = rr.TextDocument(value.encode(errors="replace").decode())
+                rows.append(Row(entity, step, text, texts))
             elif value.size:
-                bars.append((step, rr.BarChart(value.ravel().astype(np.float64))))
-        entity, title = self._entity(phase, member.name, quantity), f"{member.name} {name}".strip()
-        if texts:
-            yield rows_of(entity, texts, TrackView("texts", title, rrb.TextDocumentView))
-        if bars:
-            yield rows_of(entity, bars, TrackView("bars", title, rrb.BarChartView))
+                rows.append(Row(entity, step, rr.BarChart(value.ravel().astype(np.float64)), bars))
+        yield from in_tracks(rows)
 
     def _line(
         self,
@@ -204,7 +184,7 @@ class LoopTracks:
 
         A view shows a quantity of all environments; one of several numbers those of one environment.
         """
-        entity = self._entity(phase, member.name, quantity)
+        entity = _entity(phase, member.name, quantity)
         if entity in self._writer.entities:
             return Track(entity, times, scalars(values))
         colours, lines = phase_colours(phase, len(names)), names
@@ -227,49 +207,33 @@ class LoopTracks:
         view = TrackView(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
         return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
-    def _recorded_frames(self, phase: str) -> Iterator[tuple[int, Row]]:
-        """Yield environment and row of each recorded frame, at the step of its own environment."""
-        recording, n = self._recording, len(self._environments)
-        is_each_step = frames_every(recording) == 1
-        for frame in recording.phase(phase).frames.decoded():
-            environment, _ = frame_place(frame)
-            if environment < n:
-                step = max(0, _step(frame["log_time"]) - (n - 1 - environment))
-                if self._is_later(phase, environment, step) or not is_each_step:
-                    yield environment, (step, _picture(frame["data"]))
-
-    def drawn_frames(self, phase: str, episodes: Sequence[int]) -> Iterator[Track]:
+    def drawn(self) -> Iterator[Row]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
-        recording = self._recording
-        sources = {number: pictures.source_of(recording, phase, self._trust, number) for number in episodes}
-        notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
-        chosen = [
-            number for number, (source, _) in sources.items() if source is pictures.PictureSource.REDRAWN
-        ]
-        number, times, environment, rows = 0, [0], 0, []
-        try:
-            for number, t, pixels in redrawn(recording, phase, chosen, self._trust) if chosen else ():
-                if t == 0:
-                    times = [_step(time) for time in log_times_of(recording, phase, number)]
-                    environment = recording.phase(phase).episode(number).place
-                    self._stage(f"drawing {phase} episode {chosen.index(number) + 1:,} of {len(chosen):,}")
-                step = times[t - 1] if t else times[0] - 1
-                if self._is_later(phase, environment, step):
-                    rows.append((step, _picture(encoded_picture(pixels))))
-                if t == len(times) or len(rows) == FRAMES_SENT:
-                    frames = self._frames(phase, environment, rows)
-                    yield frames
-                    rows = []
-                    if t == len(times):  # nothing is shown until the next picture
-                        end = {"step": np.array([step + len(self._environments)])}
-                        yield Track(frames.entity, end, rr.Clear.columns(is_recursive=[False]))
-        except CannotRedo as error:
-            notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
-        if rows:
-            yield self._frames(phase, environment, rows)
-        for note in notes:
-            self._selection.warnings.append(note)
-            yield rows_of(f"{self._root}/log", [(self._writer.last, rr.TextLog(note, level="WARN"))], LOG)
+        recording, selection = self._recording, self._writer.selection
+        trust = selection.trust
+        for phase, episodes in selection.drawn.items():
+            sources = {number: pictures.source_of(recording, phase, trust, number) for number in episodes}
+            notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
+            redrawable = pictures.PictureSource.REDRAWN
+            chosen = [number for number, (source, _) in sources.items() if source is redrawable]
+            number = 0
+            try:
+                for number, t, pixels in redrawn(recording, phase, chosen, trust) if chosen else ():
+                    if t == 0:
+                        after = [_step(time) for time in log_times_of(recording, phase, number)]
+                        times, place = [after[0] - 1, *after], recording.phase(phase).episode(number).place
+                        count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
+                        self._writer.stage(f"drawing {phase} episode {count}")
+                    if self._is_later(phase, place, times[t]):
+                        yield self._frame(phase, place, times[t], _picture(encoded_picture(pixels)))
+                    if t == len(after):  # nothing is shown until the next picture
+                        end = times[t] + recording.environments
+                        yield self._frame(phase, place, end, rr.Clear(recursive=False))
+            except CannotRedo as error:
+                notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
+            for note in notes:
+                selection.warnings.append(note)
+                yield Row("log", self._writer.last, rr.TextLog(note, level="WARN"), LOG)
 
     def _is_later(self, phase: str, environment: int, step: int) -> bool:
         """Return whether a picture is later than the one before.
@@ -280,12 +244,16 @@ class LoopTracks:
         self._pictured[phase, environment] = step
         return before < step
 
-    def _frames(self, phase: str, environment: int, rows: Sequence[Row]) -> Track:
-        parts = [phase, *filter(None, [self._environments[environment]]), "frame"]
-        return rows_of(self._entity(*parts), rows, TrackView(phase, " ".join(parts), rrb.Spatial2DView))
+    def _frame(self, phase: str, environment: int, step: int, shown: rr.AsComponents) -> Row:
+        entity = _entity(phase, self._environment(environment), "frame")
+        return Row(entity, step, shown, TrackView(phase, entity.replace("/", " "), rrb.Spatial2DView))
 
-    def _entity(self, *parts: str) -> str:
-        return "/".join([self._root, *filter(None, parts)])
+    def _environment(self, number: int) -> str:
+        return f"env_{number}" if self._recording.environments > 1 else ""
+
+
+def _entity(*parts: str) -> str:
+    return "/".join(filter(None, parts))
 
 
 def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:

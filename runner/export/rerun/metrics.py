@@ -60,7 +60,7 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
         static = [series_lines([label + name for name in names], colours, width)]
         options = {"plot_legend": rrb.PlotLegend(visible=True)}
         views = [TrackView("plots", title, options=options) for title, paths in PLOTS if path in paths]
-        yield Track(f"{source.root}/{path}", times, scalars(values), static, *views)
+        yield Track(path, times, scalars(values), static, *views)
     if evaluations:
         lines = [
             f"evaluation after {row['episode']:,} episodes: "
@@ -69,7 +69,7 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
             for row in evaluations
         ]
         log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
-        yield Track(f"{source.root}/eval/events", _times(evaluations), log, view=EVENTS)
+        yield Track("eval/events", _times(evaluations), log, view=EVENTS)
 
 
 def mark_tracks(source: TrackSource) -> Iterator[Track]:
@@ -82,7 +82,7 @@ def mark_tracks(source: TrackSource) -> Iterator[Track]:
             lines.append(" ".join(["mark", mark.at, mark.text, *map("[{}]".format, mark.tags)]))
     if lines:
         log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
-        yield Track(f"{source.root}/marks", times_of(times), log, view=EVENTS)
+        yield Track("marks", times_of(times), log, view=EVENTS)
 
 
 def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iterator[Lines]:

@@ -132,8 +132,8 @@ class ValueReader:
 class ValueTracks:
     """Makes the table of values of one phase: its numbers as text are rounded, its scalars exact."""
 
-    def __init__(self, root: str, phase: str, labels: GridLabels) -> None:
-        self._entity, self._labels, mdp = f"{root}/{phase}/q", labels, labels.mdp
+    def __init__(self, phase: str, labels: GridLabels) -> None:
+        self._entity, self._labels, mdp = f"{phase}/q", labels, labels.mdp
         agents, self._own_actions = len(mdp.agents), mdp.own_actions
         self._agent = np.repeat(np.arange(agents), mdp.action_counts)
         """[values]: the agent of each value."""
@@ -164,7 +164,7 @@ class ValueTracks:
             series_lines(lines),
         ]
         self.still = [
-            Track(f"{root}/table/words", static=[words_style], view=view),
+            Track("table/words", static=[words_style], view=view),
             Track(self._entity, static=style, view=view),
         ]
         """What never changes; the words around the table for both phases."""
@@ -198,12 +198,12 @@ class ValueTracks:
 class MapTracks:
     """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
-    def __init__(self, root: str, phase: str, labels: GridLabels, learner: int) -> None:
+    def __init__(self, phase: str, labels: GridLabels, learner: int) -> None:
         scene, mdp, name = labels.scene, labels.mdp, labels.learners[learner]
         assert scene is not None
         assert scene.placements is not None
         placements = self._placements = scene.placements
-        self._learner, self._path = learner, f"{root}/{phase}/map/{name}"
+        self._learner, self._path = learner, f"{phase}/map/{name}"
         is_joint = len(labels.learners) != len(mdp.agents)
         agents = list(range(len(mdp.agents))) if is_joint else [learner]
         movers, agent_name = scene.mover_agents, mdp.agents[agents[0]]
@@ -232,7 +232,7 @@ class MapTracks:
         colours = agent_colours(np.repeat(agents, len(self._order)).tolist())
         origins, red = self._origins.reshape(-1, 2), [palette.rgb(palette.BAD)]
         parts = {
-            f"{root}/frame": rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
+            "frame": rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
             self._path: rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
             f"{self._path}/moves": rr.Arrows2D.from_fields(
                 origins=origins, colors=colours, radii=0.06, draw_order=40.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, TypeVar
 
@@ -15,9 +15,18 @@ from runner.export.rerun.loops import LoopTracks
 from runner.export.rerun.metrics import EVENTS, mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
-from runner.export.rerun.selection import Selection, episodes_of
+from runner.export.rerun.selection import episodes_of
 from runner.export.rerun.steps import Batch, StepTracks, grid_view
-from runner.export.rerun.tracks import GREY, MAX_ROWS, Track, Writer, cleared, scalars, text_track
+from runner.export.rerun.tracks import (
+    GREY,
+    MAX_ROWS,
+    Track,
+    Writer,
+    cleared,
+    in_tracks,
+    scalars,
+    text_track,
+)
 from runner.recording import schema
 from runner.recording.turns import taken
 from runner.util.arrays import Records
@@ -29,14 +38,10 @@ _BATCH_BYTES: Final = 64 << 20
 class RunReader:
     """Reads a run as tracks: an overview, of which all views of a job follow, then its steps."""
 
-    def __init__(
-        self, writer: Writer, selection: Selection, trust: bool, stage: Callable[[str], None]
-    ) -> None:
-        source, root = writer.source, writer.source.root
-        self._writer, self._source, self._root, self._selection = writer, source, root, selection
-        recording = self._recording = source.recording
-        self._is_job = recording.has_tables
-        self._loop = None if self._is_job else LoopTracks(writer, selection, trust, stage)
+    def __init__(self, writer: Writer) -> None:
+        recording, selection = writer.source.recording, writer.selection
+        self._writer, self._recording, self._is_job = writer, recording, recording.has_tables
+        self._loop = None if self._is_job else LoopTracks(writer)
         scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._steps: dict[str, StepTracks] = {}
         self._values: dict[str, list[ValueTracks | MapTracks]] = {}
@@ -49,69 +54,67 @@ class RunReader:
             return
         bounds = [0.0, *(b for q in recording.snapshots() for b in (q.values.min(), q.values.max()))]
         labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
+        maps = range(len(recording.agents) if scene and scene.placements else 0)
         for phase, spans in selection.by_phase.items():
             if spans:
-                self._steps[phase] = StepTracks(root, phase, source.title, labels)
+                self._steps[phase] = StepTracks(phase, writer.source.title, labels)
             if spans and self._is_job:
-                maps = range(len(recording.agents) if scene and scene.placements else 0)
-                self._values[phase] = [
-                    ValueTracks(root, phase, labels),
-                    *(MapTracks(root, phase, labels, learner) for learner in maps),
-                ]
+                own = (MapTracks(phase, labels, learner) for learner in maps)
+                self._values[phase] = [ValueTracks(phase, labels), *own]
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but steps, and what never changes of them."""
-        root = self._root
-        yield from self._loop.overview() if self._loop else metric_tracks(self._source)
-        yield from mark_tracks(self._source)
+        source = self._writer.source
+        yield from self._loop.overview() if self._loop else metric_tracks(source)
+        yield from mark_tracks(source)
         if not self._steps:
             return
-        yield self._labels.track(root)
+        yield self._labels.track()
         if self._scene:
-            view = grid_view(self._source.title, self._scene)
-            yield from background(root, self._scene, view)
+            view = grid_view(source.title, self._scene)
+            yield from background(self._scene, view)
             if self._is_job:
                 text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
-                yield Track(f"{root}/notice/text", static=[text], view=view)
+                yield Track("notice/text", static=[text], view=view)
         for phase, steps in self._steps.items():
             if self._is_job:
-                yield Track(f"{root}/{phase}/events", view=EVENTS)
+                yield Track(f"{phase}/events", view=EVENTS)
             for maker in (steps, *self._values.get(phase, ())):
                 yield from maker.still
 
     def steps(self) -> Iterator[Track]:
         """Yield the selected steps, then pictures that are drawn of them."""
-        covered, names = [], [f"reward {spoken(name)}" for name in self._recording.agents]
+        names = [f"reward {spoken(name)}" for name in self._recording.agents]
         values = ValueReader(self._recording, self._scene) if self._values else None
-        for phase, spans in self._selection.by_phase.items():
-            path = f"{self._root}/{phase}"
+        for phase, spans in self._writer.selection.by_phase.items():
             style, are_values_shown = [series_lines(names, phase_colours(phase, len(names)))], False
             batches = self._batches(phase, spans, values)
             for batch in _prefetched(batches) if self._is_job else batches:
                 if self._loop:
                     yield from self._loop.lines(phase, batch.records)
                 else:
-                    yield Track(f"{path}/reward", batch.times(), scalars(batch.records["rewards"]), style)
+                    yield Track(f"{phase}/reward", batch.times(), scalars(batch.records["rewards"]), style)
                 if phase in self._steps:
                     yield from self._steps[phase].of(batch)
                 if len(batch.values):
                     for maker in self._values[phase]:
                         yield from maker.of(batch)
                 elif are_values_shown:
-                    yield from cleared([f"{path}/q", f"{path}/map"], [int(batch.times()["step"][0])])
+                    yield from cleared([f"{phase}/q", f"{phase}/map"], batch.times()["step"][:1])
                 are_values_shown = len(batch.values) > 0
             if phase in self._steps:
                 parts = ("q", "map", "grid") if self._is_job else ("grid",)
-                stretches = self._steps[phase].covered
                 # A job's last step stays in view.
-                stops = [stop for _, stop in stretches if not self._is_job or stop <= self._writer.last]
-                yield from cleared([f"{path}/{part}" for part in parts], stops)
-                covered += stretches
+                stops = [
+                    stop
+                    for stop in sorted(self._steps[phase].edges)[1::2]
+                    if not self._is_job or stop <= self._writer.last
+                ]
+                yield from cleared([f"{phase}/{part}" for part in parts], stops)
         if self._loop:
-            for phase, episodes in self._selection.drawn.items():
-                yield from self._loop.drawn_frames(phase, episodes)
-        else:
-            yield from self._notice(sorted(covered))
+            yield from in_tracks(self._loop.drawn())
+        elif self._scene and self._steps:
+            yield from self._notice(self._scene.columns / 2, self._scene.rows / 2)
 
     def _batches(self, phase: str, spans: Sequence[range], values: ValueReader | None) -> Iterator[Batch]:
         """Yield the steps of a phase after checking them, at most a batch of each environment at a time."""
@@ -148,17 +151,18 @@ class RunReader:
         if waiting:
             yield np.concatenate(waiting)
 
-    def _notice(self, covered: Sequence[tuple[int, int]]) -> Iterator[Track]:
+    def _notice(self, x: float, y: float) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""
-        last = self._writer.last
-        starts, stops = [0, *(stop for _, stop in covered)], [*(start for start, _ in covered), last + 1]
-        gaps = [(start, stop) for start, stop in zip(starts, stops, strict=True) if max(start, 1) < stop]
-        if self._scene is None or not self._steps or not gaps:
-            return
-        entity, begins = f"{self._root}/notice/text", {"step": np.array([start for start, _ in gaps])}
-        words = ["no steps of this time were exported"] * len(gaps)
-        yield text_track(entity, begins, (self._scene.columns / 2, self._scene.rows / 2), words)
-        yield from cleared([entity], [stop for _, stop in gaps if stop <= last])
+        last, entity = self._writer.last, "notice/text"
+        edges: set[int] = set()
+        for steps in self._steps.values():
+            edges ^= steps.edges
+        gaps = np.array([0, *sorted(edges), last + 1]).reshape(-1, 2)
+        gaps = gaps[gaps[:, 0].clip(min=1) < gaps[:, 1]]
+        if len(gaps):
+            words = ["no steps of this time were exported"] * len(gaps)
+            yield text_track(entity, {"step": gaps[:, 0]}, (x, y), words)
+            yield from cleared([entity], gaps[gaps[:, 1] <= last, 1])
 
 
 def _prefetched(items: Iterable[T]) -> Iterator[T]:

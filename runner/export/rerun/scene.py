@@ -158,7 +158,7 @@ class Placements:
         return pixels.reshape(rows, rows, columns, columns).transpose(1, 0, 3, 2).reshape(-1)
 
 
-def background(root: str, scene: Scene, view: TrackView) -> Iterator[Track]:
+def background(scene: Scene, view: TrackView) -> Iterator[Track]:
     """Yield cells, walls and landmarks."""
     rows, columns = scene.rows, scene.columns
     lines = crossing_lines(range(rows + 1), range(columns + 1))
@@ -185,7 +185,7 @@ def background(root: str, scene: Scene, view: TrackView) -> Iterator[Track]:
             draw_order=26,
         )
     for part, static in parts.items():
-        yield Track(f"{root}/scene/{part}", static=[static], view=view)
+        yield Track(f"scene/{part}", static=[static], view=view)
 
 
 def crossing_lines(rows: range, columns: range) -> list[Any]:

@@ -95,6 +95,8 @@ class Selection:
     """The numbers of the steps, of successive whole episodes as far as they are one range."""
     drawn: dict[str, list[int]] = field(default_factory=dict)
     """Episodes of a loop of which pictures are drawn, by phase."""
+    trust: bool = False
+    """Whether what the recording names may be imported for that."""
     focus: tuple[int, int] | None = None
     """First and last step, on the timeline, of the episodes that were asked for by number."""
     exported: list[str] = field(default_factory=list)
@@ -113,7 +115,7 @@ def select(recording: Recording, request: Request) -> Selection:
     Raises:
         NotInRecording: an episode or an evaluation does not exist.
     """
-    selection, is_job = Selection(warnings=shortcomings(recording)), recording.has_tables
+    selection, is_job = Selection(trust=request.trust, warnings=shortcomings(recording)), recording.has_tables
     if is_job and request.frames:
         selection.warnings.append("--frames draws loops only: the run was trained here.")
     if is_job and (recording.mdp.scene is None or recording.mdp.scene_cells is None):

@@ -74,15 +74,14 @@ class Batch(NamedTuple):
 class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
 
-    def __init__(self, root: str, phase: str, title: str, labels: GridLabels) -> None:
-        path = self.path = f"{root}/{phase}"
+    def __init__(self, phase: str, title: str, labels: GridLabels) -> None:
         self._phase, self._labels = phase, labels
         self._states = states_in_words(labels.mdp)
         self._entry = cache(partial(_entry, labels.mdp))
         self._before: Ints | None = None
         """The last states of the batch before, as many as a trail may show."""
-        self.covered: list[tuple[int, int]] = []
-        """The stretches of time whose steps were sent: the first, and the one after the last."""
+        self.edges: set[int] = set()
+        """First steps of the stretches of time that were sent, and the steps after their last ones."""
         parts: dict[str, list[Any]] = {}
         if scene := labels.scene:
             view = grid_view(title, scene)
@@ -102,7 +101,7 @@ class StepTracks:
             view = TrackView("grid", f"{title}: state and action", has_focus=True)
             for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
                 parts[name] = [series_lines([f"{name} ({phase})"], [colour])]
-        self.still = [Track(f"{path}/{part}", static=static, view=view) for part, static in parts.items()]
+        self.still = [Track(f"{phase}/{part}", static=static, view=view) for part, static in parts.items()]
         """What never changes."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
@@ -114,13 +113,11 @@ class StepTracks:
             yield from self._grid(scene, batch, events, times)
         else:
             for name in ("state", "action"):
-                yield Track(f"{self.path}/{name}", times, scalars(records[name][:, None]))
+                yield Track(f"{self._phase}/{name}", times, scalars(records[name][:, None]))
         steps = times["step"]
-        for stretch in np.split(steps, np.flatnonzero(np.diff(steps) != 1) + 1):
-            start, stop = int(stretch[0]), int(stretch[-1]) + 1
-            if self.covered and self.covered[-1][1] == start:
-                start = self.covered.pop()[0]
-            self.covered.append((start, stop))
+        starts = steps[np.diff(steps, prepend=-2) != 1]
+        stops = steps[np.diff(steps, append=-2) != 1] + 1
+        self.edges ^= {*starts.tolist(), *stops.tolist()}  # no edge where a stretch continues the one before
 
     def _grid(self, scene: Scene, batch: Batch, events: NDArray[np.uint32], times: Times) -> Iterator[Track]:
         """Yield the grid of each step: movers, passengers, goals, trails and moves.
@@ -128,7 +125,7 @@ class StepTracks:
         The movers, passengers and texts of a step are points of one entity, with their arrows and trails,
         because a row costs more than its content.
         """
-        records, labels, path = batch.records, self._labels, f"{self.path}/grid"
+        records, labels, path = batch.records, self._labels, f"{self._phase}/grid"
         state, next_state = (records[name].astype(np.int64) for name in ("state", "next_state"))
         points, origins = labels.points.take(state, axis=0), scene.mover_points.take(state, axis=0)
         moved = scene.mover_points.take(next_state, axis=0) - origins
@@ -197,7 +194,7 @@ class StepTracks:
         if entries:
             rows, lines, levels = zip(*entries, strict=True)
             log = columns(rr.TextLog, text=texts(lines), level=texts(levels))
-            yield Track(f"{self.path}/events", batch.times(np.array(rows)), log)
+            yield Track(f"{self._phase}/events", batch.times(np.array(rows)), log)
 
 
 def _entry(mdp: Mdp, mask: int, ending: int) -> tuple[str, str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, TypeVar
+from itertools import islice
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +14,7 @@ import rerun.blueprint as rrb
 from numpy.typing import ArrayLike, NDArray
 
 from runner.drawing import palette
+from runner.export.rerun.selection import Selection
 from runner.recording.marks import Mark
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
@@ -21,20 +23,18 @@ from runner.util.arrays import Array, Ints, Scalar
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
 """Maximum number of rows sent at once: the web viewer drops larger columns."""
+ROWS_SENT: Final = 64
+"""Rows with an archetype each, such as pictures, that are sent at once."""
 MAX_QUEUED: Final = 40 * MAX_ROWS
 """Rows that may wait to be compressed, which takes longer than making them."""
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
-K = TypeVar("K")
-T = TypeVar("T")
 Colour = tuple[int, int, int]
 GREY: Final[Colour] = palette.rgb(palette.MIDTONE)
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 """[..., 2]: x and y."""
-Row = tuple[int, rr.AsComponents]
-"""A step, and what is shown from it on."""
 Times = dict[str, Array]
 """[n] numbers by timeline."""
 
@@ -56,10 +56,20 @@ class Track:
     """Rows of an entity; its first track also has what never changes."""
 
     entity: str
+    """Its path below that of the run."""
     times: Times = field(default_factory=dict)
     columns: Iterable[Any] = ()
     """Components of as many rows as there are times."""
     static: Sequence[Any] = ()
+    view: TrackView | None = None
+
+
+class Row(NamedTuple):
+    """What an entity shows from a step on."""
+
+    entity: str
+    step: int
+    shown: rr.AsComponents
     view: TrackView | None = None
 
 
@@ -83,8 +93,9 @@ class Writer:
 
     stream: rr.RecordingStream
     source: TrackSource
-    focus: tuple[int, int] | None = None
-    """First and last step shown in views that have a focus; None for the whole run."""
+    selection: Selection
+    stage: Callable[[str], None]
+    """Called with what takes long."""
     last: int = 0
     """The last step of the run, or else of its lines that were sent."""
     entities: set[str] = field(default_factory=set)
@@ -95,18 +106,19 @@ class Writer:
     def send(self, tracks: Iterable[Track]) -> None:
         """Send tracks by columns."""
         for track in tracks:
+            entity = f"{self.source.root}/{track.entity}"
             if track.entity not in self.entities:
                 self.entities.add(track.entity)
                 for archetype in track.static:
-                    self.stream.log(track.entity, archetype, static=True)
+                    self.stream.log(entity, archetype, static=True)
             if view := track.view:
-                self.views.setdefault((view.group, view.name), (view, {}))[1][track.entity] = None
+                self.views.setdefault((view.group, view.name), (view, {}))[1][entity] = None
             if track.times:
                 steps = track.times["step"]
                 if "episode" in track.times:
                     self.last = max(self.last, int(steps.max()))
                 times = [rr.TimeColumn(name, sequence=numbers) for name, numbers in track.times.items()]
-                self.stream.send_columns(track.entity, times, track.columns)
+                self.stream.send_columns(entity, times, track.columns)
                 self._queued += len(steps)
                 if self._queued > MAX_QUEUED:
                     self.stream.flush()
@@ -170,34 +182,26 @@ def scalars(values: Array) -> list[ComponentColumn]:
     return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
 
 
-def rows_of(entity: str, rows: Sequence[Row], view: TrackView | None = None) -> Track:
-    """Return a track of one archetype a row, given with its step; all have the same components."""
-    parts = zip(*(archetype.as_component_batches() for _, archetype in rows), strict=True)
-    made = []
-    for batches in parts:
-        items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
-        array = _listed(np.ones(len(rows), np.int64), items)
-        made.append(ComponentColumn(batches[0].component_descriptor(), array))
-    return Track(entity, {"step": np.array([step for step, _ in rows])}, made, view=view)
+def in_tracks(rows: Iterable[Row]) -> Iterator[Track]:
+    """Yield rows as tracks, some at a time: an archetype has the same components in all rows of an entity."""
+    rows = iter(rows)
+    while batch := list(islice(rows, ROWS_SENT)):
+        groups: dict[tuple[str, type], list[Row]] = {}
+        for row in batch:
+            groups.setdefault((row.entity, type(row.shown)), []).append(row)
+        for (entity, _), group in groups.items():
+            shown = []
+            for batches in zip(*(row.shown.as_component_batches() for row in group), strict=True):
+                items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
+                listed = _listed(np.ones(len(group), np.int64), items)
+                shown.append(ComponentColumn(batches[0].component_descriptor(), listed))
+            yield Track(entity, {"step": np.array([row.step for row in group])}, shown, view=group[0].view)
 
 
-def grouped(rows: Iterable[tuple[K, T]], size: int) -> Iterator[tuple[K, list[T]]]:
-    """Yield the rows of each key together, at most `size` at a time."""
-    waiting: dict[K, list[T]] = {}
-    for key, row in rows:
-        of_key = waiting.setdefault(key, [])
-        of_key.append(row)
-        if len(of_key) == size:
-            yield key, waiting.pop(key)
-    yield from waiting.items()
-
-
-def cleared(entities: Iterable[str], steps: Sequence[int]) -> Iterator[Track]:
+def cleared(entities: Iterable[str], steps: Array | Sequence[int]) -> Iterator[Track]:
     """Yield the tracks that clear entities, and all below them, from each of these steps on."""
-    if steps:
-        for entity in entities:
-            columns = rr.Clear.columns(is_recursive=[True] * len(steps))
-            yield Track(entity, {"step": np.array(steps)}, columns)
+    for entity in entities if len(steps) else ():
+        yield Track(entity, {"step": np.array(steps)}, rr.Clear.columns(is_recursive=[True] * len(steps)))
 
 
 def repeated(row: NDArray[Scalar], n: int) -> NDArray[Scalar]:

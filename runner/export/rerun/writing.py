@@ -33,8 +33,8 @@ def export(
         stream.send_recording_name(" and ".join(source.title for source in sources))
         readers = []
         for source, selection in zip(sources, selections, strict=True):
-            writer = Writer(stream, source, selection.focus)
-            readers.append((writer, RunReader(writer, selection, request.trust, stage)))
+            writer = Writer(stream, source, selection, stage)
+            readers.append((writer, RunReader(writer)))
         for writer, reader in readers:
             writer.send(reader.overview())
         writers = [writer for writer, _ in readers]
