@@ -7,7 +7,7 @@ with runner.open_recording(path) as recording:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
@@ -21,7 +21,7 @@ from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 from runner.replay.checkpoints import CHECKPOINT_STEPS, Checkpoints
 from runner.replay.step_replay import NO_ROWS, StepReplay, Trace
-from runner.util.arrays import Floats, Records
+from runner.util.arrays import Flags, Floats, Ints, Records
 
 NEAR_STEPS: Final = 200_000
 """`TableReplay.seek` replays this many steps rather than load a snapshot on the way."""
@@ -186,6 +186,13 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
         else:
             spans.append((first, last))
     return spans
+
+
+def are_within(spans: Sequence[tuple[int, int]], steps: Ints) -> Flags:
+    """Return which steps are within ranges such as those of `known_steps`."""
+    edges = [edge for first, last in spans for edge in (first, last + 1)]
+    is_inside: Flags = np.searchsorted(edges, steps, side="right") % 2 == 1
+    return is_inside
 
 
 def tables_before_training(recording: Recording) -> list[NamedTables] | None:

@@ -20,8 +20,8 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.scene import Scene
-from runner.export.rerun.tracks import ComponentColumn, Floats, Points, Track
-from runner.util.arrays import Ints, Records
+from runner.export.rerun.tracks import ComponentColumn, Floats, Points, Track, pairs, repeated
+from runner.util.arrays import Records
 
 MAX_REWARDS: Final = 2_000
 MAX_T: Final = 10_000
@@ -39,7 +39,7 @@ PASSENGER_LABEL_Y: Final = 0.12
 class GridLabels:
     """Texts and colours, numbered, and the numbers and points of what is written at each step.
 
-    `value_range` is the lowest and the highest value of the tables.
+    `value_range` is the lowest and the highest value of the tables, and includes 0.
     """
 
     def __init__(
@@ -77,14 +77,11 @@ class GridLabels:
         self.exploited = self._add(["greedy"], palette.GOOD)
         """The mark of the chosen action if it was not explored."""
         self.explored = self._add(["explored"], palette.BAD)
-        self.stops: list[Ints] = []
-        """For each agent, [own actions]: the letter of an action such as a pickup; -1 for a move."""
-        if scene:
-            for agent, names in enumerate(numbered_actions(mdp)):
-                numbers = np.full(len(names), -1)
-                for own in scene.stops:
-                    numbers[own] = self._add([names[own][0].upper()], palette.agent(agent))
-                self.stops.append(numbers)
+        self.stops = np.full((len(mdp.agents), max(mdp.action_counts) + 1), -1)
+        """[agents, own actions + 1]: the letter of an action such as a pickup; -1 for a move or none."""
+        for agent, names in enumerate(numbered_actions(mdp)):
+            for own in scene.stops if scene else ():
+                self.stops[agent, own] = self._add([names[own][0].upper()], palette.agent(agent))
         self._add_levels(*value_range)
 
     def track(self) -> Track:
@@ -108,14 +105,13 @@ class GridLabels:
     @cached_property
     def points(self) -> Points:
         """[S, texts, 2]: where the texts of each state are; `t` and the rewards below the grid."""
-        scene, rewards = self.scene, len(self._rewards)
+        scene = self.scene
         assert scene is not None
-        rise = np.repeat([MOVER_LABEL_Y, PASSENGER_LABEL_Y], [len(scene.movers), len(scene.passengers)])
-        points = scene.points + np.stack((0 * rise, rise), axis=1).astype(np.float32)
-        x = np.array([0.25] + [0.65] * rewards) * scene.columns
-        y = scene.rows + STATUS_Y + STATUS_LINE * np.array([0, *range(rewards)])
-        status = np.stack((x, y), axis=1).astype(np.float32)
-        return np.concatenate((points, np.broadcast_to(status, (len(points), *status.shape))), axis=1)
+        rises = [MOVER_LABEL_Y] * len(scene.movers) + [PASSENGER_LABEL_Y] * len(scene.passengers)
+        y, left, right = scene.rows + STATUS_Y, 0.25 * scene.columns, 0.65 * scene.columns
+        rewards = ((right, y + STATUS_LINE * k) for k in range(len(self._rewards)))
+        status = repeated(pairs([(left, y), *rewards]), len(scene.points))
+        return np.concatenate((scene.points + pairs((0, rise) for rise in rises), status), axis=1)
 
     def of_steps(self, records: Records, events: NDArray[np.uint32]) -> NDArray[np.uint16]:
         """Return the label of each text in each step, [n, texts].
@@ -160,7 +156,6 @@ class GridLabels:
 
     def _add_levels(self, low: float, high: float) -> None:
         """Number values to three digits of the greatest one, with a margin on both sides."""
-        low, high = min(low, 0.0), max(high, 0.0)
         self._unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
         while (high - low) / self._unit > MAX_LEVELS:
             self._unit *= 10

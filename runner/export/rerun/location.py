@@ -51,7 +51,7 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
             raise NotInRecording(
                 f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
             )
-        time = int(steps.one(step.t)["log_time"]) // schema.STEP_NANOSECONDS
+        time = time_of(steps.one(step.t))
     if not request.everything:
         request = dataclasses.replace(request, with_default=request.is_default, **added)
     return Location(time, request)
@@ -86,5 +86,5 @@ def _default_time(recording: Recording, request: Request) -> int:
     selected = select(recording, request).by_phase
     for phase in ("eval", "train"):
         if selected[phase]:
-            return time_of(recording, phase, selected[phase][-1].start)
+            return time_of(recording.phase(phase).steps.one(selected[phase][-1].start))
     return 0

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import reduce
-from operator import getitem
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -31,7 +29,7 @@ from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
 from runner.replay.steps import frames_every, log_times_of
-from runner.util.arrays import Array, Flags, MaskedArray, Records
+from runner.util.arrays import Array, Flags, MaskedArray, Records, leaves
 
 MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
@@ -39,8 +37,6 @@ MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
 LOG: Final = TrackView("log", "Log", rrb.TextLogView)
 OBSERVED: Final = {"observation": observed, "action": acted}
-Part = tuple[list[tuple[str, ...]], list[str]]
-"""Paths into the values of a space, and the names of all numbers there."""
 
 
 class Member(NamedTuple):
@@ -51,8 +47,8 @@ class Member(NamedTuple):
     """`env_3`, or the agent; empty if there is only one."""
     column: int = 0
     """Its column among the rewards."""
-    parts: Mapping[str, Part] = {}
-    """`observation` and `action`, if they are drawn as lines."""
+    numbers: Mapping[str, Sequence[str]] = {}
+    """The names of all numbers of `observation` and `action`, if they are drawn as lines."""
     agent: str = ""
     """The agent's name in the recording of a game."""
 
@@ -72,10 +68,10 @@ class LoopTracks:
         self._writer = writer
         if len(recording.agents) > 1:
             agents = enumerate(recording.agents)
-            self._members = [Member(i, entity_name(a), i, _parts(recording, a), a) for i, a in agents]
+            self._members = [Member(i, entity_name(a), i, _numbers(recording, a), a) for i, a in agents]
         else:
-            parts, environments = _parts(recording), range(recording.environments)
-            self._members = [Member(i, self._environment(i), parts=parts) for i in environments]
+            numbers, environments = _numbers(recording), range(recording.environments)
+            self._members = [Member(i, self._environment(i), numbers=numbers) for i in environments]
         self._pictured: dict[tuple[str, int], int] = {}
         """The step of the last picture, by phase and environment."""
 
@@ -137,10 +133,11 @@ class LoopTracks:
             own = steps[is_own]
             times = times_of(own["log_time"], episode=own["episode"], t=own["t"])
             yield self._line(phase, member, "reward", times, own["rewards"][:, [member.column]])
-            for quantity, (paths, names) in member.parts.items():
+            for quantity, names in member.numbers.items():
                 values = OBSERVED[quantity](recording, own)
-                numbers = [reduce(getitem, path, values).reshape(len(own), -1) for path in paths]
-                yield self._line(phase, member, quantity, times, np.concatenate(numbers, axis=1), names)
+                parts = leaves("", values[member.agent] if member.agent else values)
+                numbers = np.concatenate([part.reshape(len(own), -1) for _, part in parts], axis=1)
+                yield self._line(phase, member, quantity, times, numbers, names)
             for name, values in extras.items():
                 agent, _, own_name = name.partition("/") if member.agent else (member.name, "", name)
                 if entity_name(agent) == (member.name or "_"):
@@ -256,21 +253,21 @@ def _entity(*parts: str) -> str:
     return "/".join(filter(None, parts))
 
 
-def _parts(recording: Recording, agent: str = "") -> dict[str, Part]:
-    """Return the numbers of a step, of one agent or of all, that are drawn as lines."""
-    parts = {}
+def _numbers(recording: Recording, agent: str = "") -> dict[str, list[str]]:
+    """Return the names of the numbers of a step, of one agent or of all, that are drawn as lines."""
+    numbers = {}
     has_grid = recording.tabular and recording.mdp.scene is not None
     for quantity in () if has_grid or recording.train.steps.dtype is None else OBSERVED:
-        leaves = [
-            leaf
-            for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
-            if leaf.dtype is not None and (not agent or leaf.path[0] == agent)
-        ]
         known = observation_names(recording) if quantity == "observation" else ()
-        names = [name for leaf in leaves for name in number_names(leaf, quantity, bool(agent), known)]
+        names = [
+            name
+            for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
+            if not agent or leaf.path[0] == agent
+            for name in number_names(leaf, quantity, bool(agent), known)
+        ]
         if 0 < len(names) <= MAX_LINES:
-            parts[quantity] = [leaf.path for leaf in leaves], names
-    return parts
+            numbers[quantity] = names
+    return numbers
 
 
 def entity_name(name: str) -> str:

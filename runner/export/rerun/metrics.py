@@ -16,7 +16,18 @@ from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.tracks import Colour, Floats, Times, Track, TrackSource, TrackView, scalars, times_of
+from runner.export.rerun.tracks import (
+    Colour,
+    Floats,
+    Times,
+    Track,
+    TrackSource,
+    TrackView,
+    columns,
+    scalars,
+    texts,
+    times_of,
+)
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
@@ -58,18 +69,17 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
             colours = line_colours(len(names), source.tint)
         label = f"{recording.run_id} " if source.tint else ""
         static = [series_lines([label + name for name in names], colours, width)]
-        options = {"plot_legend": rrb.PlotLegend(visible=True)}
-        views = [TrackView("plots", title, options=options) for title, paths in PLOTS if path in paths]
-        yield Track(path, times, scalars(values), static, *views)
-    if evaluations:
-        lines = [
-            f"evaluation after {row['episode']:,} episodes: "
-            + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
-            + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
-            for row in evaluations
-        ]
-        log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
-        yield Track("eval/events", _times(evaluations), log, view=EVENTS)
+        title = next((title for title, paths in PLOTS if path in paths), "")
+        view = TrackView("plots", title, options={"plot_legend": rrb.PlotLegend(visible=True)})
+        yield Track(path, times, scalars(values), static, view if title else None)
+    lines = [
+        f"evaluation after {row['episode']:,} episodes: "
+        + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
+        + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
+        for row in evaluations
+    ]
+    if lines:
+        yield log_track("eval/events", _times(evaluations), lines)
 
 
 def mark_tracks(source: TrackSource) -> Iterator[Track]:
@@ -81,8 +91,13 @@ def mark_tracks(source: TrackSource) -> Iterator[Track]:
             times.append(steps.one(min(mark.t, len(steps) - 1))["log_time"])
             lines.append(" ".join(["mark", mark.at, mark.text, *map("[{}]".format, mark.tags)]))
     if lines:
-        log = rr.TextLog.columns(text=lines, level=["INFO"] * len(lines))
-        yield Track("marks", times_of(times), log, view=EVENTS)
+        yield log_track("marks", times_of(times), lines)
+
+
+def log_track(entity: str, times: Times, lines: Sequence[str], levels: Sequence[str] = ()) -> Track:
+    """Return a track of lines of the log, by default of the level INFO."""
+    levels = levels or ["INFO"] * len(lines)
+    return Track(entity, times, columns(rr.TextLog, text=texts(lines), level=texts(levels)), view=EVENTS)
 
 
 def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iterator[Lines]:
@@ -95,13 +110,10 @@ def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iter
     yield "train/metrics/filled_percent", times, _numbers(reports, "percent_filled"), filled
     for name in SCHEDULES:
         yield f"train/metrics/{name}", times, _numbers(reports, name), [spoken(name)]
-    if rewards := sorted({reward for row in reports for reward in row["rewards"]}):
-        shares = np.zeros((len(reports), len(rewards)))
-        for k, row in enumerate(reports):
-            total = max(sum(row["reward_counts"]), 1)
-            for reward, count in zip(row["rewards"], row["reward_counts"], strict=True):
-                shares[k, rewards.index(reward)] = 100.0 * count / total
-        yield "train/metrics/reward_percent", times, shares, [f"{reward:g}" for reward in rewards]
+    counts = [dict(zip(row["rewards"], row["reward_counts"], strict=True)) for row in reports]
+    if rewards := sorted({reward for row in counts for reward in row}):
+        shares = [[100.0 * row.get(r, 0) / max(sum(row.values()), 1) for r in rewards] for row in counts]
+        yield "train/metrics/reward_percent", times, np.array(shares), [f"{reward:g}" for reward in rewards]
 
 
 def _evaluation_lines(

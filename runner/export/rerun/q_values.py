@@ -19,7 +19,7 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.metrics import series_lines
-from runner.export.rerun.scene import Scene, crossing_lines
+from runner.export.rerun.scene import Placements, Scene, crossing_lines
 from runner.export.rerun.steps import Batch
 from runner.export.rerun.tracks import (
     GREY,
@@ -27,6 +27,8 @@ from runner.export.rerun.tracks import (
     Track,
     TrackView,
     agent_colours,
+    centred,
+    cleared,
     columns,
     grey_text,
     pairs,
@@ -37,7 +39,7 @@ from runner.export.rerun.tracks import (
 )
 from runner.recording.reader import Recording
 from runner.replay.step_replay import StateProbe
-from runner.replay.tables import TableReplay, known_steps
+from runner.replay.tables import TableReplay, are_within, known_steps
 from runner.util.arrays import Ints, Records
 
 NAME_X: Final = 1.0
@@ -71,7 +73,7 @@ class ValueReader:
         placements = scene.placements if scene else None
         self._context = placements.context if placements else np.zeros(self._mdp.states, np.int64)
         self._states = placements.states if placements else np.empty((1, 0), np.int32)
-        self._known_ranges = known_steps(recording)
+        self._known = known_steps(recording)
         self._replay: TableReplay | None = None
         self._last = (-1, -1)
         """Time and context of the step before."""
@@ -82,9 +84,7 @@ class ValueReader:
         The numbers are those of a `Batch`, and the training steps before each step.
         """
         trained = numbers[-1]
-        is_known = np.zeros(len(steps), np.bool_)
-        for first, last in self._known_ranges:
-            is_known |= (first <= trained) & (trained <= last)
+        is_known = are_within(self._known, trained)
         edges = np.flatnonzero(np.diff(is_known)) + 1
         for part, *own, before, known in zip(
             *(np.split(rows, edges) for rows in (steps, *numbers, is_known)), strict=True
@@ -133,7 +133,8 @@ class ValueTracks:
     """Makes the table of values of one phase: its numbers as text are rounded, its scalars exact."""
 
     def __init__(self, phase: str, labels: GridLabels) -> None:
-        self._entity, self._labels, mdp = f"{phase}/q", labels, labels.mdp
+        self._phase, self._labels, mdp = phase, labels, labels.mdp
+        self._is_shown = False
         agents, self._own_actions = len(mdp.agents), mdp.own_actions
         self._agent = np.repeat(np.arange(agents), mdp.action_counts)
         """[values]: the agent of each value."""
@@ -165,12 +166,18 @@ class ValueTracks:
         ]
         self.still = [
             Track("table/words", static=[words_style], view=view),
-            Track(self._entity, static=style, view=view),
+            Track(f"{phase}/q", static=style, view=view),
         ]
         """What never changes; the words around the table for both phases."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
-        """Yield the values of each step of a batch: as they were before its update."""
+        """Yield the values of each step of a batch as they were before its update; none where unknown."""
+        if not len(batch.values):
+            if self._is_shown:
+                yield from cleared([f"{self._phase}/q", f"{self._phase}/map"], batch.times()["step"][:1])
+            self._is_shown = False
+            return
+        self._is_shown = True
         q, labels, first, agent = batch.values, self._labels, self._first, self._agent
         n, count = q.shape
         own = self._own_actions[batch.records["action"]]
@@ -188,39 +195,34 @@ class ValueTracks:
         bars[:, :, 1, 0] = BAR_LEFT + np.ceil((q - low[:, agent]) * scale[:, agent]) / _BAR_FRACTION
         bars[..., 1] = self._y[:, None]
         shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
-        yield Track(self._entity, batch.times(), [*scalars(q), *shown])
+        yield Track(f"{self._phase}/q", batch.times(), [*scalars(q), *shown])
         rows = np.flatnonzero(batch.has_map)  # the points never change, but are cleared with the rest
         if len(rows):
             points = repeated(self._points, len(rows))
-            yield Track(self._entity, batch.times(rows), columns(rr.Points2D, positions=points))
+            yield Track(f"{self._phase}/q", batch.times(rows), columns(rr.Points2D, positions=points))
 
 
 class MapTracks:
     """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
-    def __init__(self, phase: str, labels: GridLabels, learner: int) -> None:
-        scene, mdp, name = labels.scene, labels.mdp, labels.learners[learner]
-        assert scene is not None
-        assert scene.placements is not None
-        placements = self._placements = scene.placements
-        self._learner, self._path = learner, f"{phase}/map/{name}"
+    def __init__(self, phase: str, labels: GridLabels, placements: Placements, learner: int) -> None:
+        scene, mdp, name = placements.scene, labels.mdp, labels.learners[learner]
+        self._learner, self._path, self._placements = learner, f"{phase}/map/{name}", placements
         is_joint = len(labels.learners) != len(mdp.agents)
-        agents = list(range(len(mdp.agents))) if is_joint else [learner]
+        agents = [*range(len(mdp.agents))] if is_joint else [learner]
         movers, agent_name = scene.mover_agents, mdp.agents[agents[0]]
         self._order = placements.order(movers.index(agent_name) if agent_name in movers else 0)
-        self._pixel = np.argsort(self._order)[placements.pixel]
-        """[S]: the pixel of each state."""
         row, column = np.divmod(np.arange(len(self._order)), placements.width)
-        self._centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
-        x = (np.arange(len(agents)) - (len(agents) - 1) / 2) * 2 * _AGENT_OFFSET
-        self._origins = self._centres + np.stack((x, 0 * x), axis=1).astype(np.float32)[:, None]
+        centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
+        self._here = centres[self._order[placements.pixel]]  # the order is its own inverse
+        """[S, 2]: the centre of each state's pixel."""
+        offsets = pairs((x, 0.0) for x in centred(len(agents), 2 * _AGENT_OFFSET))
+        self._origins = centres + offsets[:, None]
         """[agents, pixels, 2]."""
-        actions = [mdp.own_actions[:, i] if is_joint else np.arange(mdp.action_counts[i]) for i in agents]
-        arrows = [scene.own_moves[own] * np.float32(_ARROW_SCALE) for own in actions]
-        letters = [labels.stops[agent][own] for agent, own in zip(agents, actions, strict=True)]
-        # The last action is that of pixels without a state, -1.
-        self._arrows = np.pad(np.stack(arrows), ((0, 0), (0, 1), (0, 0)))
-        self._letters = np.pad(np.stack(letters), ((0, 0), (0, 1)), constant_values=-1)
+        actions = mdp.own_actions.T if is_joint else [np.arange(mdp.action_counts[learner])]
+        own = np.pad(actions, ((0, 0), (0, 1)), constant_values=-1)  # the last for pixels without a state
+        self._arrows = scene.own_moves[own] * np.float32(_ARROW_SCALE)
+        self._letters = labels.stops[np.array(agents)[:, None], own]
         height, width = placements.height, placements.width
         lines = crossing_lines(range(0, height + 1, scene.rows), range(0, width + 1, scene.columns))
         pixels = rr.components.ImageFormat(
@@ -230,16 +232,17 @@ class MapTracks:
             color_model=rr.ColorModel.L,
         )
         colours = agent_colours(np.repeat(agents, len(self._order)).tolist())
-        origins, red = self._origins.reshape(-1, 2), [palette.rgb(palette.BAD)]
         parts = {
             "frame": rr.LineStrips2D(lines, colors=[(255, 255, 255)], radii=0.06, draw_order=30),
             self._path: rr.DepthImage.from_fields(format=pixels, colormap=rr.components.Colormap.Viridis),
-            f"{self._path}/moves": rr.Arrows2D.from_fields(
-                origins=origins, colors=colours, radii=0.06, draw_order=40.0
+            self._path + "/moves": rr.Arrows2D.from_fields(
+                origins=self._origins.reshape(-1, 2), colors=colours, radii=0.06, draw_order=40.0
             ),
-            f"{self._path}/here": rr.Boxes2D.from_fields(colors=red, radii=0.1, draw_order=50.0),
-            f"{self._path}/stops": rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
-            f"{self._path}/label": grey_text(),
+            self._path + "/here": rr.Boxes2D.from_fields(
+                colors=[palette.rgb(palette.BAD)], radii=0.1, draw_order=50.0
+            ),
+            self._path + "/stops": rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
+            self._path + "/label": grey_text(),
         }
         bounds = rrb.VisualBounds2D(x_range=(-0.5, width + 0.5), y_range=(-3.2, height + 0.5))
         title = f"{spoken(name)}: max Q, greedy moves"
@@ -248,9 +251,11 @@ class MapTracks:
         """What never changes; the frame for both phases and all learners."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
-        """Yield where each step of a batch is in the map, and the maps that there are."""
+        """Yield where each step of a batch is in the map, and the maps that there are; none if unknown."""
+        if not len(batch.values):
+            return
         state, path, placements = batch.records["state"], self._path, self._placements
-        here = self._centres.take(self._pixel.take(state), axis=0)[:, None]
+        here = self._here.take(state, axis=0)[:, None]
         yield Track(f"{path}/here", batch.times(), columns(rr.Boxes2D, centers=here))
         rows = np.flatnonzero(batch.has_map)
         if not (n := len(rows)):
@@ -274,9 +279,9 @@ class MapTracks:
             positions=points[is_letter],
             class_ids=letters[is_letter].astype(np.uint16),
         )
-        contexts = placements.context[state[rows]].tolist()
+        contexts = placements.names[placements.context[state[rows]]]
         labels = [
-            f"as of step {time:,}\n{placements.names[context]}"
+            f"as of step {time:,}\n{context}"
             for time, context in zip(times["step"].tolist(), contexts, strict=True)
         ]
         sizes = columns(rr.Boxes2D, half_sizes=repeated(pairs([(0.5, 0.5)]), n))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import chain
 from typing import Final, TypeVar
 
 import numpy as np
@@ -43,9 +44,10 @@ class RunReader:
         self._writer, self._recording, self._is_job = writer, recording, recording.has_tables
         self._loop = None if self._is_job else LoopTracks(writer)
         scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
-        self._steps: dict[str, StepTracks] = {}
-        self._values: dict[str, list[ValueTracks | MapTracks]] = {}
+        self._makers: dict[str, list[StepTracks | ValueTracks | MapTracks]] = {}
         """Makers of the tracks of each phase: of the steps, and of the Q-values at them."""
+        self._edges: set[int] = set()
+        """First steps of the stretches of time that were sent, and the steps after their last ones."""
         if self._is_job:
             reports = [*recording.train.all_metrics()[-1:], *recording.eval.all_metrics()[-1:]]
             steps = sum(phase.steps.count() for phase in recording.phases)
@@ -54,20 +56,20 @@ class RunReader:
             return
         bounds = [0.0, *(b for q in recording.snapshots() for b in (q.values.min(), q.values.max()))]
         labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
-        maps = range(len(recording.agents) if scene and scene.placements else 0)
-        for phase, spans in selection.by_phase.items():
-            if spans:
-                self._steps[phase] = StepTracks(phase, writer.source.title, labels)
-            if spans and self._is_job:
-                own = (MapTracks(phase, labels, learner) for learner in maps)
-                self._values[phase] = [ValueTracks(phase, labels), *own]
+        for phase in (phase for phase, spans in selection.by_phase.items() if spans):
+            makers = self._makers[phase] = [StepTracks(phase, writer.source.title, labels)]
+            if self._is_job:
+                makers.append(ValueTracks(phase, labels))
+                if scene and scene.placements:
+                    learners = range(len(recording.agents))
+                    makers += [MapTracks(phase, labels, scene.placements, learner) for learner in learners]
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but steps, and what never changes of them."""
         source = self._writer.source
         yield from self._loop.overview() if self._loop else metric_tracks(source)
         yield from mark_tracks(source)
-        if not self._steps:
+        if not self._makers:
             return
         yield self._labels.track()
         if self._scene:
@@ -76,44 +78,38 @@ class RunReader:
             if self._is_job:
                 text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
                 yield Track("notice/text", static=[text], view=view)
-        for phase, steps in self._steps.items():
+        for phase, makers in self._makers.items():
             if self._is_job:
                 yield Track(f"{phase}/events", view=EVENTS)
-            for maker in (steps, *self._values.get(phase, ())):
+            for maker in makers:
                 yield from maker.still
 
     def steps(self) -> Iterator[Track]:
         """Yield the selected steps, then pictures that are drawn of them."""
         names = [f"reward {spoken(name)}" for name in self._recording.agents]
-        values = ValueReader(self._recording, self._scene) if self._values else None
+        values = ValueReader(self._recording, self._scene) if self._is_job and self._makers else None
         for phase, spans in self._writer.selection.by_phase.items():
-            style, are_values_shown = [series_lines(names, phase_colours(phase, len(names)))], False
-            batches = self._batches(phase, spans, values)
+            style = [series_lines(names, phase_colours(phase, len(names)))]
+            makers, batches = self._makers.get(phase, ()), self._batches(phase, spans, values)
+            edges: set[int] = set()
             for batch in _prefetched(batches) if self._is_job else batches:
                 if self._loop:
                     yield from self._loop.lines(phase, batch.records)
                 else:
                     yield Track(f"{phase}/reward", batch.times(), scalars(batch.records["rewards"]), style)
-                if phase in self._steps:
-                    yield from self._steps[phase].of(batch)
-                if len(batch.values):
-                    for maker in self._values[phase]:
-                        yield from maker.of(batch)
-                elif are_values_shown:
-                    yield from cleared([f"{phase}/q", f"{phase}/map"], batch.times()["step"][:1])
-                are_values_shown = len(batch.values) > 0
-            if phase in self._steps:
+                for maker in makers:
+                    yield from maker.of(batch)
+                edges ^= batch.edges()  # no edge where a stretch continues the one before
+            if makers:
+                self._edges ^= edges
                 parts = ("q", "map", "grid") if self._is_job else ("grid",)
                 # A job's last step stays in view.
-                stops = [
-                    stop
-                    for stop in sorted(self._steps[phase].edges)[1::2]
-                    if not self._is_job or stop <= self._writer.last
-                ]
+                last = self._writer.last if self._is_job else np.inf
+                stops = [stop for stop in sorted(edges)[1::2] if stop <= last]
                 yield from cleared([f"{phase}/{part}" for part in parts], stops)
         if self._loop:
             yield from in_tracks(self._loop.drawn())
-        elif self._scene and self._steps:
+        elif self._scene and self._makers:
             yield from self._notice(self._scene.columns / 2, self._scene.rows / 2)
 
     def _batches(self, phase: str, spans: Sequence[range], values: ValueReader | None) -> Iterator[Batch]:
@@ -122,14 +118,14 @@ class RunReader:
         plan = recording.config["evaluation"] if self._is_job else None
         trials = int(plan["trials"]) if plan else 2**63 - 1
         for steps in self._blocks(phase, spans):
-            if self._steps:
+            if self._makers:
                 recording.mdp.check_steps(steps, str(recording.path), schema.PHASE_NAMES[phase])
             trained, episode = (steps[name].astype(np.int64) for name in ("step", "episode"))
             number = episode
             if phase == "eval":  # shown by the training episodes before it
                 number = episode % trials
                 trained = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS - 1 - trained
-                episode = np.searchsorted(train.stop[: train.ended], trained, side="right")
+                episode = train.before(trained)
             if values is None:
                 yield Batch(steps, episode, number)
             else:
@@ -140,10 +136,8 @@ class RunReader:
         table, n = self._recording.phase(phase).steps, self._recording.environments
         limit = max(1, min(MAX_ROWS * n, _BATCH_BYTES // table.row_dtype.itemsize))
         waiting: list[Records] = []
-        for block in (block for span in spans for block in table.numbered(span)):
-            steps = taken(block)
-            for start in range(0, len(steps), limit):
-                part = steps[start : start + limit]
+        for block in filter(len, map(taken, chain.from_iterable(map(table.numbered, spans)))):
+            for part in np.split(block, range(limit, len(block), limit)):
                 if waiting and (table.dtype is None or sum(map(len, waiting)) + len(part) > limit):
                     yield np.concatenate(waiting)
                     waiting = []
@@ -154,10 +148,7 @@ class RunReader:
     def _notice(self, x: float, y: float) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""
         last, entity = self._writer.last, "notice/text"
-        edges: set[int] = set()
-        for steps in self._steps.values():
-            edges ^= steps.edges
-        gaps = np.array([0, *sorted(edges), last + 1]).reshape(-1, 2)
+        gaps = np.array([0, *sorted(self._edges), last + 1]).reshape(-1, 2)
         gaps = gaps[gaps[:, 0].clip(min=1) < gaps[:, 1]]
         if len(gaps):
             words = ["no steps of this time were exported"] * len(gaps)

@@ -5,7 +5,7 @@ Coordinates are cells: x to the right, y down, the first cell from (0, 0) to (1,
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +17,7 @@ from runner.drawing.svg import VEHICLES, wall_ends
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names
 from runner.environments.scene import SceneDescription
-from runner.export.rerun.tracks import GREY, Track, TrackView, pairs
+from runner.export.rerun.tracks import GREY, Track, TrackView, centred, pairs
 from runner.util.arrays import Ints
 
 _SPACING: Final = 0.34
@@ -56,18 +56,18 @@ class Scene:
         self.mdp, self.description, self.cells, self.carriers = mdp, description, cells, carriers
         """`cells` and `carriers`: where each thing is in each state, and what carries it, -1 for nothing."""
         things, self.rows, self.columns = description["things"], description["rows"], description["columns"]
-        kinds, self.labels = [thing["kind"] for thing in things], [str(thing["label"]) for thing in things]
-        self.movers = [i for i, kind in enumerate(kinds) if kind == "mover"]
-        """Indices of the things that agents move."""
-        self.goals = [i for i, kind in enumerate(kinds) if kind == "goal"]
-        self.passengers = [i for i in range(len(kinds)) if i not in self.movers + self.goals]
+        self.labels = [str(thing["label"]) for thing in things]
+        self.movers, self.goals = (
+            [i for i, thing in enumerate(things) if thing["kind"] == kind] for kind in ("mover", "goal")
+        )
+        """Indices of the things that agents move, and of goals."""
+        self.passengers = [i for i in range(len(things)) if i not in self.movers + self.goals]
         self.mover_agents = [str(things[mover].get("agent", "")) for mover in self.movers]
         """The name of the agent that moves each mover; empty for none."""
         centres = np.stack((cells % self.columns + 0.5, cells // self.columns + 0.5), 2).astype(np.float32)
         self.goal_points = centres[:, self.goals]
         """[S, goals, 2]: the centre of each goal's cell."""
-        spread = (np.arange(len(self.movers)) - (len(self.movers) - 1) / 2) * _SPACING
-        offsets = np.stack((spread, spread * 0.6 - 0.05), axis=1).astype(np.float32)
+        offsets = pairs((x, x * 0.6 - 0.05) for x in centred(len(self.movers), _SPACING))
         self.mover_points = np.ascontiguousarray(centres[:, self.movers] + offsets)
         """[S, movers, 2]: where each mover is drawn."""
         passengers = centres[:, self.passengers] + np.array([0.2, 0.26], np.float32)
@@ -87,19 +87,16 @@ class Scene:
         """[S, movers + passengers, 2]: where each is drawn."""
         self.shape_centres = self.points[:, self.owners] + pairs(shape.offset for shape in self.shapes)
         """[S, shapes, 2]: the centre of each shape."""
-        is_carrier = carriers[..., None] == np.array(self.movers, np.int64)
-        self.is_carrying = is_carrier.any(axis=1).astype(np.int64)
-        """[S, movers]: 1 where a mover carries something."""
+        self.is_carrying = (carriers[..., None] == np.array(self.movers, np.int64)).any(axis=1)
+        """[S, movers]: whether a mover carries something."""
         self.is_carried = carriers[:, self.passengers] >= 0
         """[S, passengers]: whether something carries the passenger."""
-        moves: list[Sequence[int]] = [(0, 0)] * max(mdp.action_counts)
-        self.stops: list[int] = []
+        actions = description["actions"] if action_names(mdp) else ()
+        moves = [action.get("move") or (0, 0) for action in actions] or [(0, 0)] * max(mdp.action_counts)
+        self.stops = [own for own, move in enumerate(moves) if actions and not any(move)]
         """Actions of an agent that are no moves, such as a pickup, as far as actions have names."""
-        if action_names(mdp) is not None:
-            moves = [action.get("move") or (0, 0) for action in description["actions"]]
-            self.stops = [own for own, move in enumerate(moves) if not any(move)]
-        self.own_moves = pairs(move[::-1] for move in moves) * np.float32(_BLOCKED_ARROW)
-        """[own actions, 2]: a short arrow for an agent's action; zero for an action that is no move."""
+        self.own_moves = pairs([*(move[::-1] for move in moves), (0, 0)]) * np.float32(_BLOCKED_ARROW)
+        """[own actions + 1, 2]: a short arrow for an agent's action; zero if it is no move, or none."""
         self.moves = np.zeros((mdp.joint_actions, len(self.movers), 2), np.float32)
         """[J, movers, 2]: the arrow of each mover's own action."""
         for i, agent in enumerate(self.mover_agents):
@@ -120,30 +117,32 @@ class Placements:
     """
 
     def __init__(self, scene: Scene) -> None:
-        rows, columns = self.block = scene.rows, scene.columns
-        """Rows and columns of a block."""
+        self.scene = scene
+        rows, columns = (scene.rows, scene.columns) if len(scene.movers) == 2 else (1, 1)
+        self._shape = rows, scene.rows, columns, scene.columns
+        """Rows of blocks, of cells in a block; columns of them."""
+        self.height, self.width = rows * scene.rows, columns * scene.columns
         cells = scene.cells[:, scene.movers]
-        has_blocks = cells.shape[1] == 2
-        self.height, self.width = (rows * rows, columns * columns) if has_blocks else self.block
-        inner_row, inner_column = np.divmod(cells[:, 0], columns)
-        outer_row, outer_column = np.divmod(cells[:, 1] if has_blocks else 0, columns)
-        self.pixel = (outer_row * rows + inner_row) * self.width + outer_column * columns + inner_column
+        row, column = np.divmod(cells[:, 0], scene.columns)
+        block_row, block_column = np.divmod(cells[:, 1:].sum(axis=1), scene.columns)
+        self.pixel = np.ravel_multi_index((block_row, row, block_column, column), self._shape)
         """[S]: the pixel of each state."""
         things = scene.passengers + scene.goals
         carriers = scene.carriers[:, things]
-        keys = np.where(carriers >= 0, -1 - carriers, scene.cells[:, things])
-        keys, context = np.unique(keys, axis=0, return_inverse=True)
+        where = np.where(carriers >= 0, -1 - carriers, scene.cells[:, things])
+        keys, context = np.unique(where, axis=0, return_inverse=True)
         self.context = context.reshape(-1)
         """[S]: the number of each state's context."""
         places = {-1 - i: f"in {label}" for i, label in enumerate(scene.labels)}
-        places |= {cell: str(divmod(cell, columns)) for cell in range(rows * columns)}
+        places |= {cell: str(divmod(cell, scene.columns)) for cell in range(scene.rows * scene.columns)}
         for mark in scene.description["landmarks"]:
-            row, column = mark["cell"]
-            places[row * columns + column] = mark["name"]
-        self.names = [
+            mark_row, mark_column = mark["cell"]
+            places[mark_row * scene.columns + mark_column] = mark["name"]
+        names = [
             ", ".join(f"{scene.labels[i]} {places[k]}" for i, k in zip(things, key, strict=True))
             for key in keys.tolist()
         ]
+        self.names = np.array(names, object)
         """A description of each context: `passenger R, destination B`."""
         self.states = np.full((len(keys), self.height * self.width), -1, np.int32)
         """[contexts, pixels]: the state at each pixel, row by row; -1 for none."""
@@ -151,11 +150,8 @@ class Placements:
 
     def order(self, mover: int) -> Ints:
         """Return the pixels in the order of the picture whose blocks hold the cells of that mover."""
-        rows, columns = self.block
         pixels = np.arange(self.height * self.width)
-        if mover == 0 or (self.height, self.width) == self.block:
-            return pixels
-        return pixels.reshape(rows, rows, columns, columns).transpose(1, 0, 3, 2).reshape(-1)
+        return pixels.reshape(self._shape).transpose(1, 0, 3, 2).reshape(-1) if mover else pixels
 
 
 def background(scene: Scene, view: TrackView) -> Iterator[Track]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -68,23 +68,18 @@ class SelectedEpisodes:
         """The number of episodes with steps."""
         return len(self.start)
 
+    def before(self, steps: Ints | int) -> Ints:
+        """Return how many of the episodes had ended after these numbers of steps."""
+        return np.searchsorted(self.stop[: self.ended], steps, side="right")
+
     @property
     def lengths(self) -> Ints:
         """[E]: the number of steps."""
         return self.stop - self.start
 
     def steps_of(self, numbers: Ints) -> list[range]:
-        """Return the steps of these episodes; those that follow each other, or overlap, are one range."""
-        joined: list[range] = []
-        for start, stop in sorted(
-            zip(self.start[numbers].tolist(), self.stop[numbers].tolist(), strict=True)
-        ):
-            if joined and start <= joined[-1].stop:
-                before = joined.pop()
-                joined.append(range(before.start, max(stop, before.stop)))
-            else:
-                joined.append(range(start, stop))
-        return joined
+        """Return the steps of these episodes as `joined` returns them."""
+        return joined(map(range, self.start[numbers].tolist(), self.stop[numbers].tolist()))
 
 
 @dataclass
@@ -107,6 +102,18 @@ class Selection:
     def steps(self) -> int:
         """The number of selected steps."""
         return sum(len(steps) for of_phase in self.by_phase.values() for steps in of_phase)
+
+
+def joined(spans: Iterable[range]) -> list[range]:
+    """Return ranges in order; those that follow each other, or overlap, are one range."""
+    whole: list[range] = []
+    for span in sorted(filter(None, spans), key=lambda span: span.start):
+        if whole and span.start <= whole[-1].stop:
+            before = whole.pop()
+            whole.append(range(before.start, max(before.stop, span.stop)))
+        else:
+            whole.append(span)
+    return whole
 
 
 def select(recording: Recording, request: Request) -> Selection:
@@ -166,11 +173,9 @@ def episodes_of(recording: Recording, phase: str) -> SelectedEpisodes:
     if n > 1:  # from the beginning of a round to the end of one
         place = records["environment"].astype(np.int64)
         return SelectedEpisodes(begin - place, last - place + n, len(records))
-    first = np.full(own.episodes.count() + 1, -1, np.int64)
-    first[0], number = 0, records["episode"].astype(np.int64)
-    is_counted = number < len(first) - 1
-    first[number[is_counted]] = begin[is_counted]
-    first[number[is_counted] + 1] = (last + 1)[is_counted]
+    first = np.zeros(own.episodes.count() + 1, np.int64)
+    number = records["episode"].astype(np.int64).clip(max=len(first) - 2)
+    first[number], first[number + 1] = begin, last + 1
     # Steps of episodes that were lost in a repair count as those of the first episode after them.
     first = np.maximum.accumulate(first)
     first = first[first <= total]
@@ -192,15 +197,14 @@ def evaluations_with_steps(
         bounds = int(evals.start[start]), int(evals.stop[stop - 1])
         block = next(recording.eval.steps.blocks(*bounds), None)
         if block is not None:  # otherwise all of its steps were lost in a repair
-            trained = int(block["log_time"][0]) // schema.STEP_NANOSECONDS - (int(block["step"][0]) + 1)
-            after = int(np.searchsorted(train.stop[: train.ended], trained, side="right"))
-            evaluations.append(Evaluation(after, trained, start, stop))
+            trained = time_of(block[0]) - (int(block["step"][0]) + 1)
+            evaluations.append(Evaluation(int(train.before(trained)), trained, start, stop))
     return evaluations
 
 
-def time_of(recording: Recording, phase: str, step: int) -> int:
-    """Return where a step of a phase is on the timeline."""
-    return int(recording.phase(phase).steps.one(step)["log_time"]) // schema.STEP_NANOSECONDS
+def time_of(step: np.void) -> int:
+    """Return where a step is on the timeline."""
+    return int(step["log_time"]) // schema.STEP_NANOSECONDS
 
 
 def _trials(evaluations: Sequence[Evaluation]) -> Ints:
@@ -211,7 +215,7 @@ def _trials(evaluations: Sequence[Evaluation]) -> Ints:
 def _focus(recording: Recording, shown: Mapping[str, Sequence[range]]) -> tuple[int, int] | None:
     """Return the times of the first and the last of some steps; None without any."""
     times = [
-        time_of(recording, phase, step)
+        time_of(recording.phase(phase).steps.one(step))
         for phase, spans in shown.items()
         if spans
         for step in (spans[0].start, spans[-1].stop - 1)
@@ -230,25 +234,23 @@ def _asked_episodes(recording: Recording, request: Request, count: int) -> Ints:
 
 def _default_episodes(lengths: Ints, limit: int = DEFAULT_STEPS) -> Ints:
     """Return episodes evenly spread from the first to the last, as many as the limits allow."""
+    numbers = np.arange(min(len(lengths), 1))
     for count in range(min(DEFAULT_EPISODES, len(lengths)), 1, -1):
-        numbers = np.unique(np.linspace(0, len(lengths) - 1, count).round().astype(np.int64))
-        if int(lengths[numbers].sum()) <= limit:
-            return numbers
-    return np.unique([0, len(lengths) - 1]).astype(np.int64) if len(lengths) else _NONE
+        numbers = np.linspace(0, len(lengths) - 1, count).round().astype(np.int64)
+        if lengths[numbers].sum() <= limit:
+            break
+    return numbers
 
 
 def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
     """Return how many of the training steps in these ranges have unknown Q-values."""
     if not recording.lost and next((one.step for one in recording.snapshots()), -1) == 0:
         return 0
-    from runner.replay.tables import known_steps  # loads Numba
+    from runner.replay.tables import are_within, known_steps  # loads Numba
 
-    spans, unknown = known_steps(recording), 0
-    for steps in ranges:
-        for block in recording.train.steps.blocks(steps.start, steps.stop):
-            inside = [(block["step"] >= first) & (block["step"] <= last) for first, last in spans]
-            unknown += len(block) - int(np.any(inside, axis=0).sum())
-    return unknown
+    known = known_steps(recording)
+    blocks = (block for steps in ranges for block in recording.train.steps.numbered(steps))
+    return sum(int((~are_within(known, block["step"].astype(np.int64))).sum()) for block in blocks)
 
 
 def _describe_job(
@@ -290,8 +292,7 @@ def _complete_loop(
     if request.frames:
         _select_drawn(recording, request, selection, asked)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
-    earlier = [range(steps.start, min(steps.stop, first)) for steps in selection.by_phase["eval"]]
-    selection.by_phase["eval"] = [steps for steps in (*earlier, range(first, tested)) if steps]
+    selection.by_phase["eval"] = joined([*selection.by_phase["eval"], range(first, tested)])
     trained, evaluated = (sum(map(len, spans)) for spans in selection.by_phase.values())
     environments = f" in {recording.environments} environments" if recording.environments > 1 else ""
     of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""

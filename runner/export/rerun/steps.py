@@ -70,6 +70,12 @@ class Batch(NamedTuple):
         records = self.records[rows]
         return times_of(records["log_time"], episode=self.episode[rows], t=records["t"])
 
+    def edges(self) -> set[int]:
+        """Return the first steps of stretches of time without gaps, and the steps after their last ones."""
+        steps = self.times()["step"]
+        starts, stops = np.diff(steps, prepend=-2) != 1, np.diff(steps, append=-2) != 1
+        return {*steps[starts].tolist(), *(steps[stops] + 1).tolist()}
+
 
 class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
@@ -80,8 +86,6 @@ class StepTracks:
         self._entry = cache(partial(_entry, labels.mdp))
         self._before: Ints | None = None
         """The last states of the batch before, as many as a trail may show."""
-        self.edges: set[int] = set()
-        """First steps of the stretches of time that were sent, and the steps after their last ones."""
         parts: dict[str, list[Any]] = {}
         if scene := labels.scene:
             view = grid_view(title, scene)
@@ -114,10 +118,6 @@ class StepTracks:
         else:
             for name in ("state", "action"):
                 yield Track(f"{self._phase}/{name}", times, scalars(records[name][:, None]))
-        steps = times["step"]
-        starts = steps[np.diff(steps, prepend=-2) != 1]
-        stops = steps[np.diff(steps, append=-2) != 1] + 1
-        self.edges ^= {*starts.tolist(), *stops.tolist()}  # no edge where a stretch continues the one before
 
     def _grid(self, scene: Scene, batch: Batch, events: NDArray[np.uint32], times: Times) -> Iterator[Track]:
         """Yield the grid of each step: movers, passengers, goals, trails and moves.

@@ -214,6 +214,11 @@ def pairs(points: Iterable[Sequence[float]]) -> Points:
     return np.array(list(points), np.float32).reshape(-1, 2)
 
 
+def centred(count: int, spacing: float) -> list[float]:
+    """Return positions at equal distances around 0."""
+    return [(i - (count - 1) / 2) * spacing for i in range(count)]
+
+
 def texts(rows: Sequence[str]) -> NDArray[np.object_]:
     """Return one text per row, [n, 1]."""
     return np.array(rows, dtype=object)[:, None]

@@ -94,16 +94,8 @@ class RerunViewer:
         environment = os.environ | {"RERUN_ANALYTICS": "0"}
         with log.open("wb") as output:
             self.process = subprocess.Popen(
-                arguments,
-                env=environment,
-                stdout=output,
-                stderr=subprocess.STDOUT,
+                arguments, env=environment, stdout=output, stderr=subprocess.STDOUT
             )
-        try:
-            self.wait_for(port)
-        except BaseException:
-            self.end()
-            raise
 
     def wait_for(self, port: int) -> None:
         """Wait until it listens on a port."""
@@ -138,25 +130,23 @@ class RerunViewer:
             reason = next((f": {line}" for line in reversed(text.splitlines()) if line.strip()), ".")
         return ViewerError(f"the Rerun viewer {what}{reason}")
 
-    def end(self) -> None:
-        """End the viewer."""
-        self.process.terminate()
-        try:
-            self.process.wait(5)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
 
 @contextlib.contextmanager
 def viewer(port: int, *options: str) -> Iterator[RerunViewer]:
     """Start a viewer that ends with the block."""
     with tempfile.TemporaryDirectory() as folder:
         started = RerunViewer(Path(folder) / "viewer.log", port, *options)
+        process = started.process
         try:
+            started.wait_for(port)
             yield started
         finally:
-            started.end()
+            process.terminate()
+            try:
+                process.wait(5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 @contextlib.contextmanager
