@@ -98,10 +98,6 @@ class Positions:
 
     def of_moment(self, episodes: int, steps: int) -> float:
         """Return the position of one moment, an integer where the axis has whole numbers."""
-        if self.axis is EPISODES:
-            return episodes
-        if self.axis.name == STEPS.name:
-            return steps
         value = float(self.at(episodes, steps))
         return int(value) if self.axis.whole else value
 
@@ -115,7 +111,7 @@ def positions(recording: Recording, axis: Axis) -> Positions:
     """
     steps, values = np.empty(0), np.empty(0)
     if axis is UPDATES and recording.eval.has_metrics:  # each training step of a job updates its tables
-        return Positions(STEPS, steps, values)
+        axis = STEPS
     if axis in (EPISODES, STEPS):
         if not has_environment(recording.config):
             axis = LOGGED_STEPS
@@ -144,11 +140,14 @@ def edges_of(axis: Axis, last: float, parts: int) -> Floats:
     Runs of about the same length have the same edges. Only an axis without whole numbers has stretches
     shorter than 1. `last` is finite and not negative.
     """
-    width = max(last / parts, 1.0 if axis.whole else 0.0) or 1.0
-    power = math.floor(math.log10(width))
-    scale = next(factor for factor in (1, 2, 5, 10, 20) if factor * 10.0**power >= width * (1 - 1e-12))
-    width = scale * 10.0**power
+    width = round_width(max(last / parts, 1.0 if axis.whole else 0.0) or 1.0)
     return np.arange(max(math.ceil(last / width * (1 - 1e-12)), 1) + 1, dtype=np.float64) * width
+
+
+def round_width(width: float) -> float:
+    """Return the smallest of 1, 2, 5, 10, 20, ... that is at least a width above 0."""
+    power = 10.0 ** math.floor(math.log10(width))
+    return next(edge for edge in (power, 2 * power, 5 * power, 10 * power) if edge >= width * (1 - 1e-12))
 
 
 def stretches_at(edges: Floats, at: Floats) -> NDArray[np.intp]:

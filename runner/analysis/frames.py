@@ -172,7 +172,7 @@ def episode_columns(
     records = recording.phase(phase).episodes.array(start, stop)
     names = records.dtype.names or ()
     plain = [name for name in schema.EPISODE_COLUMNS if name in names and name not in ("returns", "events")]
-    columns = _plain_columns(records, plain)
+    columns: dict[str, Array] = {name: records[name].copy() for name in plain}
     columns |= _by_name(records["returns"], [f"return.{agent}" for agent in recording.agents])
     return columns | _by_name(records["events"], recording.environment["event_names"])
 
@@ -217,7 +217,7 @@ def step_columns(
         if name == "rewards":
             columns |= _by_name(records["rewards"], [f"reward.{agent}" for agent in recording.agents])
         elif name in names and name != "taken":
-            columns |= dict(leaves(name, _plain_columns(records, [name])[name]))
+            columns |= dict(leaves(name, records[name].copy()))
     extras = recording.phase(phase).extras.at(records["step"])
     return columns | {f"extra.{name}": filled(values) for name, values in extras.items()}
 
@@ -253,11 +253,6 @@ def evaluation_column(key: str) -> str:
     first, dot, rest = key.partition(".")
     names = {metric.key: metric.name for metric in METRICS}
     return rest if first == "events" else f"{names.get(first, first)}{dot}{rest}"
-
-
-def _plain_columns(records: Records, names: Sequence[str]) -> dict[str, Array]:
-    """Return fields of records as arrays of their own."""
-    return {name: records[name].copy() for name in names}
 
 
 def _by_name(values: Array, names: Sequence[str]) -> dict[str, Array]:

@@ -14,11 +14,12 @@ import numpy as np
 
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Grid, Section
+from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
 from runner.errors import ConfigError, NotInRecording
 from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
-from runner.replay.history import history_of
+from runner.replay.history import StateHistory, history_of
 from runner.replay.steps import last_step, step_of_episode
 from runner.replay.tables import TableReplay
 from runner.util.arrays import Floats
@@ -151,13 +152,19 @@ def tables_of(
         step = step_of_episode(recording, episode)
     if not recording.has_tables:
         return _recorded(recording, step, state)
-    step = last_step(recording) if step is None else step
-    number = None if state is None else state_of(recording.mdp, state)  # before the tables are replayed
+    mdp, step = recording.mdp, last_step(recording) if step is None else step
+    number = None if state is None else state_of(mdp, state)  # before the tables are replayed
     replay = TableReplay(recording, step)
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
     description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
     if number is not None:
-        _add_state(description, recording, replay, number)
+        history = history_of(recording, number, replay.step)
+        description |= {
+            "state": number,
+            "state_in_words": str(states_in_words(mdp)[number]),
+            "visits": int(history.visits[0].sum()),
+            "values": list(_replayed_values(mdp, replay, history, number)),
+        }
     return QTables(description, one_array(replay.tables))
 
 
@@ -210,13 +217,16 @@ def _recorded(recording: Recording, step: int | None, state: str | None) -> QTab
             for block in recording.train.steps.blocks(0, stop):
                 counts += np.bincount(block["action"][block["state"] == number], minlength=action_count)
             visits = counts.tolist()
-        description["state"], description["state_in_words"] = number, states[number]
-        description["visits"] = None if visits is None else sum(visits)
-        description["values"] = [
-            value
-            for table, q in tables.items()
-            for value in _action_values(table, names, q[number], int(q[number].argmax()), visits)
-        ]
+        description |= {
+            "state": number,
+            "state_in_words": states[number],
+            "visits": None if visits is None else sum(visits),
+            "values": [
+                value
+                for table, q in tables.items()
+                for value in _action_values(table, names, q[number], int(q[number].argmax()), visits)
+            ],
+        }
     return QTables(description, one_array(list(tables.values())))
 
 
@@ -268,11 +278,11 @@ def summarize(agent: str, q: Floats) -> TableSummary:
     }
 
 
-def _add_state(description: TablesDescription, recording: Recording, replay: TableReplay, state: int) -> None:
-    mdp = recording.mdp
-    history = history_of(recording, state, replay.step)
+def _replayed_values(
+    mdp: Mdp, replay: TableReplay, history: StateHistory, state: int
+) -> Iterator[ActionValue]:
+    """Yield the values of all learners' actions in a state, with their history."""
     joint, of_agents = actions_in_words(mdp), action_names(mdp)
-    values: list[ActionValue] = []
     for i, (agent, named) in enumerate(zip(replay.agents, replay.named_tables, strict=True)):
         q = named["q"]
         names = joint if q.shape[1] == mdp.joint_actions else of_agents[i] if of_agents else range(q.shape[1])
@@ -284,8 +294,4 @@ def _add_state(description: TablesDescription, recording: Recording, replay: Tab
                 value["changed_episode"] = int(history.changed_episode[i, action])
             if "policy" in named:
                 value["policy"] = float(named["policy"][state, action])
-            values.append(value)
-    description["state"] = state
-    description["state_in_words"] = str(states_in_words(mdp)[state])
-    description["visits"] = int(history.visits[0].sum())
-    description["values"] = values
+            yield value

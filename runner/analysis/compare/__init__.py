@@ -164,16 +164,11 @@ def compare(
 
 def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: Moment) -> Iterator[str]:
     """Yield what limits the comparison of these groups: environments, metrics, equal contents, few seeds."""
-    environments = {
-        (
-            group.label,
-            run.environment,
-        ): None
-        for group in groups
-        for run in group.runs
-    }
-    if len({env_id for _, env_id in environments} - {""}) > 1:
-        where = ", ".join(f"{env_id} in {label}" for label, env_id in environments if env_id)
+    environments = dict.fromkeys(
+        (group.label, run.environment) for group in groups for run in group.runs if run.environment
+    )
+    if len({env_id for _, env_id in environments}) > 1:
+        where = ", ".join(f"{env_id} in {label}" for label, env_id in environments)
         yield (
             f"the environments differ ({where}): their figures do not measure the same; normalised, by "
             "`minmax` or a table of scores, algorithms are compared that all ran in the same environments"

@@ -17,6 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.analysis.axes import round_width
 from runner.drawing import palette
 
 Values = NDArray[np.float64]
@@ -41,6 +42,7 @@ MARKERS: Final = (
     ("m-{r},-{r}l{d},{d}m0,-{d}l-{d},{d}", "x"),
 )
 """Relative SVG path and Matplotlib's name of each marker."""
+_GRID: Final = {"stroke": palette.INK, "width": 0.5, "opacity": 0.15}
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Scale:
         """About five round values inside."""
         if self.log:
             return _log_ticks(self.low, self.high)
-        step = _round_step((self.high - self.low) / 5)
+        step = round_width((self.high - self.low) / 5 or 1.0)
         first, last = math.ceil(self.low / step - 1e-9), math.floor(self.high / step + 1e-9)
         return [round(i * step, 12) if step < 1 else i * step for i in range(first, last + 1)]
 
@@ -200,24 +202,24 @@ class Chart(Canvas):
         for number, label in enumerate(y_labels):
             self.text(9 + 10 * number, (y.start + y.end) / 2, label, "middle", angle=-90)
 
-    def x_ticks(self, labels: Iterable[tuple[float, str]], slanted: bool = False) -> None:
-        """Draw grid lines and labels along x."""
+    def x_ticks(self, labels: Iterable[tuple[float, str]] | None = None, slanted: bool = False) -> None:
+        """Draw grid lines and labels along x, by default of about five round values."""
         top, bottom = self.y.end, self.y.start
-        for value, label in labels:
+        for value, label in labelled(self.x.ticks) if labels is None else labels:
             at = self.x.at(value)
-            self._grid_line((at, top), (at, bottom))
+            self.shape([(at, top), (at, bottom)], **_GRID)
             self.shape([(at, bottom), (at, bottom + 3)], stroke=palette.INK)
             if slanted:
                 self.text(at + 6, bottom + 10, label, "end", size=8, angle=-20)
             else:
                 self.text(at, bottom + 11.5, label, "middle", size=8)
 
-    def y_ticks(self, labels: Iterable[tuple[float, str]]) -> None:
-        """Draw grid lines and labels along y."""
+    def y_ticks(self, labels: Iterable[tuple[float, str]] | None = None) -> None:
+        """Draw grid lines and labels along y, by default of about five round values."""
         left, right = self.x.start, self.x.end
-        for value, label in labels:
+        for value, label in labelled(self.y.ticks) if labels is None else labels:
             at = self.y.at(value)
-            self._grid_line((left, at), (right, at))
+            self.shape([(left, at), (right, at)], **_GRID)
             self.shape([(left, at), (left - 3, at)], stroke=palette.INK)
             self.text(left - 5, at + 3, label, "end", size=8)
 
@@ -258,9 +260,6 @@ class Chart(Canvas):
         marked_x, marked_y = at or (x, y)
         every = slice(None, None, max(len(marked_x) // 8, 1))
         self.markers(marked_x[every], marked_y[every], series_colour(number), series_marker(number), 1.7)
-
-    def _grid_line(self, start: tuple[float, float], end: tuple[float, float]) -> None:
-        self.shape([start, end], stroke=palette.INK, width=0.5, opacity=0.15)
 
 
 def series_colour(number: int) -> str:
@@ -335,12 +334,6 @@ def _thinned(x: Values, y: Values) -> tuple[Values, Values]:
         inside = y[start:stop]
         chosen += sorted({start, start + int(inside.argmin()), start + int(inside.argmax()), stop - 1})
     return x[chosen], y[chosen]
-
-
-def _round_step(width: float) -> float:
-    """Return the smallest of 1, 2, 5, 10, 20, ... that is at least a width."""
-    magnitude = 10.0 ** math.floor(math.log10(width)) if width > 0 else 1.0
-    return next(step * magnitude for step in (1, 2, 5, 10) if step * magnitude >= width * (1 - 1e-9))
 
 
 def _log_ticks(low: float, high: float) -> list[float]:

@@ -44,7 +44,7 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
     x = Scale.around(np.array(drawn), 40.0, WIDTH - 10)
     y = Scale(len(metric.groups) - 0.4, -0.6, bottom, 12.0)
     chart = Chart(x, y, WIDTH, bottom + 34, f"{metric.title}: values of the groups")
-    chart.x_ticks(labelled(x.ticks))
+    chart.x_ticks()
     chart.shape([(x.start, bottom), (x.end, bottom)], stroke=palette.INK)
     chart.text((x.start + x.end) / 2, chart.height - 5, metric.unit, "middle")
     for row, group in enumerate(metric.groups):
@@ -78,7 +78,7 @@ def profile_chart(
     levels = np.array(thresholds)
     x, y = Scale.around(levels, 50.0, WIDTH - 10), Scale(0, 103, 146.0, 16.0 if not heading else 32.0)
     chart = Chart(x, y, WIDTH, HEIGHT, title)
-    chart.x_ticks(labelled(x.ticks))
+    chart.x_ticks()
     chart.y_ticks(labelled(range(0, 101, 20)))
     sign = "at most" if is_lower_better else "at least"
     chart.frame(heading, 25.0 if heading else 14.0, f"{unit}, {sign}", ["percent of runs"])
@@ -116,9 +116,7 @@ def tables_svg(tables: Sequence[TableDiff]) -> str:
             chart.markers(episodes, values, colours[i], i, 1.6)
         canvas.place(chart, 0, 76.0 * row)
     if len(agents) > 1:
-        legend = Chart(Scale(0, 1, 150.0, WIDTH), Scale(0, 1, 100.0, 32.0), WIDTH, 0, "")
-        draw_legend(legend, [spoken(agent) for agent in agents], colours)
-        canvas.place(legend, 0, 0)
+        draw_legend(canvas, 150.0, 24.0, [spoken(agent) for agent in agents], colours)
     return canvas.svg()
 
 

@@ -21,7 +21,16 @@ from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
-from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour, series_marker
+from runner.export.plots.chart import (
+    SMALL,
+    Canvas,
+    Chart,
+    Markers,
+    Scale,
+    labelled,
+    series_colour,
+    series_marker,
+)
 from runner.export.plots.style import PLAIN, CurveStyle, not_drawn, style_of, visible
 from runner.recording.metrics import SHARES
 
@@ -63,27 +72,23 @@ def panel_plots(panels: Sequence[Panel], groups: int, style: CurveStyle = PLAIN)
 def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], style: CurveStyle = PLAIN) -> Canvas:
     """Return all panels on one sheet, with a legend of the groups above and notes below."""
     columns = min(3, len(panels))
-    narrow = [panel for panel in panels if panel.metric != SHARES]
-    wide = [panel for panel in panels if panel.metric == SHARES]
+    ordered = sorted(panels, key=lambda panel: panel.metric == SHARES)
+    has_wide = ordered[-1].metric == SHARES  # which takes the last row
     width = WIDTH * max(columns, 2)
     notes = textwrap.wrap(footnote(groups, panels, style), round(_LETTERS * width / (3 * WIDTH)))
     head = 32.0 + 14 * len(groups)
-    rows = math.ceil(len(narrow) / columns) + len(wide)
+    rows = math.ceil((len(panels) - has_wide) / columns) + has_wide
     sheet = Canvas(width, head + HEIGHT * rows + 8 + 10 * len(notes), f"Metrics over {groups[0].axis.title}")
     sheet.text(10, 20, sheet.title, size=13, bold=True)
     for number, group in enumerate(groups):
         colour, y = series_colour(number), 36.0 + 14 * number
-        key = Chart(Scale(0, 1, 12, 36), Scale(0, 1, y, y - 6), 0, 0, "")
-        key.line(np.array([0.0, 1.0]), np.array([0.5, 0.5]), colour)
-        key.markers(np.array([0.5]), np.array([0.5]), colour, series_marker(number), 2)
-        sheet.place(key, 0, 0)
+        sheet.shape([(12, y - 3), (36, y - 3)], stroke=colour, width=1.5, is_curve=True)
+        key = np.array([[24, y - 3]])
+        sheet.marks.append(Markers(key, series_marker(number), 2, colour, colour, 1.0))
         sheet.text(42, y, group.described)
-    for number, panel in enumerate(narrow):
-        row, column = divmod(number, columns)
+    for number, panel in enumerate(ordered):
+        row, column = (rows - 1, 0) if panel.metric == SHARES else divmod(number, columns)
         sheet.place(panel_chart(panel, len(groups), style), WIDTH * column, head + HEIGHT * row)
-    for number, panel in enumerate(wide):
-        chart = panel_chart(panel, len(groups), style)
-        sheet.place(chart, 0, head + HEIGHT * (rows - len(wide) + number))
     sheet.notes(notes)
     return sheet
 
@@ -134,16 +139,15 @@ def panel_chart(panel: Panel, groups: int, style: CurveStyle = PLAIN) -> Chart:
         _draw_curve(chart, panel, curve, groups, style)
     if has_legend:
         colours = [series_colour(i) if groups == 1 else palette.INK for i in range(len(panel.lines))]
-        draw_legend(chart, [spoken(line) or "all" for line in panel.lines], colours)
+        draw_legend(chart, x.start, y.end - 8, [spoken(line) or "all" for line in panel.lines], colours)
     return chart
 
 
-def draw_legend(chart: Chart, names: Sequence[str], colours: Sequence[str]) -> None:
-    """Name lines above the axes of a chart, each with its colour and its dashes."""
-    at, y = chart.x.start, chart.y.end - 8
+def draw_legend(canvas: Canvas, at: float, y: float, names: Sequence[str], colours: Sequence[str]) -> None:
+    """Name lines from left to right, each with its colour and its dashes."""
     for number, (name, colour) in enumerate(zip(names, colours, strict=True)):
-        chart.shape([(at, y), (at + 18, y)], stroke=colour, width=1.5, dash=number)
-        chart.text(at + 22, y + 2.8, name, size=SMALL)
+        canvas.shape([(at, y), (at + 18, y)], stroke=colour, width=1.5, dash=number)
+        canvas.text(at + 22, y + 2.8, name, size=SMALL)
         at += 32 + len(name) * SMALL * _LETTER
 
 

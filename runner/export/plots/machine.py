@@ -97,7 +97,7 @@ def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
     highest = max(float(np.nanmax(values, initial=0.0)) for values in usable.values())
     y = Scale(0.0, max(panel.top, 1.06 * highest) or 1.0, HEIGHT - 34, 32.0)
     chart = Chart(Scale(0.0, duration / divisor or 1.0, 50.0, WIDTH - 8), y, WIDTH, HEIGHT, panel.title)
-    chart.x_ticks(labelled(chart.x.ticks))
+    chart.x_ticks()
     chart.y_ticks(labelled(y.ticks, short=highest >= 10_000))
     chart.frame(panel.title, 25.0 if len(usable) == 1 else 14.0, unit, [panel.unit])
     for number, values in enumerate(usable.values()):
@@ -107,5 +107,5 @@ def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
         if len(places) < 3:  # a line through one point is invisible
             chart.markers(places, shown, series_colour(number), series_marker(number), 1.7)
     if len(usable) > 1:
-        draw_legend(chart, list(usable), [series_colour(i) for i in range(len(usable))])
+        draw_legend(chart, chart.x.start, y.end - 8, list(usable), [*map(series_colour, range(len(usable)))])
     return Plot(panel.title, chart.svg(), wide=False)

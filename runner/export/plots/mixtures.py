@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.analysis.compare.statistics import Estimate
 from runner.drawing import palette
-from runner.export.plots.chart import Chart, Markers, Scale, labelled, series_colour
+from runner.export.plots.chart import Chart, Markers, Scale, series_colour
 
 _NAMES: Final = 205.0
 """Where charts begin, right of the names of settings."""
@@ -35,7 +35,7 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
     x = Scale.around(np.array([0.0, *ends]), _NAMES, _WIDTH - 10)
     chart = Chart(x, Scale(len(rows) - 0.5, -0.5, bottom, 24.0), _WIDTH, bottom + 18, title)
     chart.text(5, 14, title, size=9.5, bold=True)
-    chart.x_ticks(labelled(x.ticks))
+    chart.x_ticks()
     for row, (name, each) in enumerate(rows):
         middle, zero, end = chart.y.at(row), x.at(0), x.at(each.value)
         corners = [(zero, middle - 6), (end, middle - 6), (end, middle + 6), (zero, middle + 6)]
@@ -55,7 +55,7 @@ def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn
     bottom, last = 170.0, 184.0 + 16 * len(names)
     x = Scale(-0.6, len(columns) - 0.4, _NAMES, _WIDTH - 10)
     chart = Chart(x, Scale.around(values, bottom, 24.0), _WIDTH, last + 4, title)
-    chart.y_ticks(labelled(chart.y.ticks))
+    chart.y_ticks()
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.shape([(x.start, 24), (x.start, bottom), (x.end, bottom)], stroke=palette.INK)
     for column, one in enumerate(columns):

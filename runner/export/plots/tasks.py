@@ -72,7 +72,7 @@ def _aggregates(comparison: TaskComparison) -> Canvas:
             0,
             "",
         )
-        chart.x_ticks(labelled(chart.x.ticks))
+        chart.x_ticks()
         for i, result in enumerate(comparison.algorithms):
             draw_estimate(chart, estimate_of(result), i, i, 2.6)
         chart.text(70.0, top + (row - 16) / 2 + 3, name, "end")
@@ -89,7 +89,7 @@ def _curves(comparison: TaskComparison) -> Chart:
     y = Scale.around(values[np.isfinite(values)], 146.0, 32.0)
     chart = Chart(Scale(places[0], places[-1], 50.0, WIDTH - 10), y, WIDTH, HEIGHT, "Sample efficiency")
     chart.x_ticks(labelled(chart.x.ticks, short=places[-1] >= 10_000))
-    chart.y_ticks(labelled(y.ticks))
+    chart.y_ticks()
     chart.frame("Sample efficiency", 25.0, comparison.axis, [f"{_SCORE}, IQM"])
     for i, result in enumerate(comparison.algorithms):
         low, high = np.array(result.curve_low), np.array(result.curve_high)

@@ -6,6 +6,7 @@ Only what the page shows is kept in memory: not the other steps, and nothing of 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -79,7 +80,8 @@ class _ShownPart:
 def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     phase, number = recording.phase(at.phase), at.number_in(recording)
-    length, environment = len(phase.episode(number)), phase.episode(number).environment
+    episode = phase.episode(number)
+    length = len(episode)
     if not 0 <= first < length:
         raise at.no_step(recording, length, max(first, at.t))
     parts, notes = _shown_parts(recording)
@@ -89,18 +91,24 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
     numbers = [np.empty(0, np.int64)]
     actions: list[dict[str, str]] = []
-    observations = [_observations_before(recording, at.phase, number, first, parts)]
-    for steps in _steps(recording, at.phase, number, 0, first + limit):
+    observations: list[list[Column]] = []
+    reset = reset_of(recording, at.phase, number)
+    if reset is not None and not first:
+        value = reset.value(recording)
+        values: Values = [value] if phase.steps.dtype is None else np.array([value])
+        observations.append([part.column(values) for part in parts])
+    for steps in _steps(recording, at.phase, number, first + limit):
         paid = steps["rewards"].astype(np.float64)
-        earlier = int(np.searchsorted(steps["t"], first))
+        earlier, seen = np.searchsorted(steps["t"], [first, first - 1]).tolist()
         before += paid[:earlier].sum(axis=0)
-        if earlier < len(steps):
-            shown = steps[earlier:]
-            rewards.append(paid[earlier:])
-            log_times.append(shown["log_time"].astype(np.int64))
-            numbers.append(shown["step"])
-            actions += map(in_words, shown)
-            observations.append(_observations(recording, shown, parts))
+        shown = steps[earlier:]
+        rewards.append(paid[earlier:])
+        log_times.append(shown["log_time"].astype(np.int64))
+        numbers.append(shown["step"])
+        actions += map(in_words, shown)
+        if seen < len(steps):
+            after = observed(recording, steps[seen:])
+            observations.append([part.column(after) for part in parts])
     reward, time = np.concatenate(rewards), np.concatenate(log_times)
     if len(reward) != min(limit, length - first):
         raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
@@ -111,12 +119,11 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
         total = float(phase.episodes.array(number, number + 1)["returns"].sum())
     elif first + limit >= length:
         total = float(before.sum() + reward.sum())
-    reset = reset_of(recording, at.phase, number)
     begun = f" Reset with {reset.in_words}." if reset is not None and reset.in_words else ""
-    texts, series = _frames(parts, observations)
+    texts, series = _frames(parts, observations, len(frames))
     extra_texts, extra_series = _extras(recording, at.phase, np.concatenate(numbers), notes)
     return Playback(
-        title=at.heading + (f", in environment {environment}" if recording.environments > 1 else ""),
+        title=at.heading + (f", in environment {episode.environment}" if recording.environments > 1 else ""),
         description=outcome_in_words(length, ended, total) + begun,
         length=length,
         first=first,
@@ -136,34 +143,12 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     )
 
 
-def _steps(recording: Recording, phase: str, episode: int, first: int, stop: int) -> Iterator[Records]:
-    """Yield the steps of an episode from t = `first` to before `stop`, some at a time."""
+def _steps(recording: Recording, phase: str, episode: int, stop: int) -> Iterator[Records]:
+    """Yield the steps of an episode to before t = `stop`, some at a time."""
     if not recording.phase(phase).steps.are_actions:
-        yield from recording.phase(phase).episode(episode).rows(first, stop)
+        yield from recording.phase(phase).episode(episode).rows(0, stop)
         return
-    yield whole_steps(recording, phase, episode)[first:stop]
-
-
-def _observations_before(
-    recording: Recording, phase: str, episode: int, first: int, parts: Sequence[_ShownPart]
-) -> list[Column]:
-    """Return the observation before a step of an episode, as columns of one value; empty if unknown."""
-    if first:
-        steps = next(_steps(recording, phase, episode, first - 1, first), None)
-        return [] if steps is None else _observations(recording, steps, parts)
-    reset = reset_of(recording, phase, episode)
-    if reset is None:
-        return []
-    value = reset.value(recording)
-    return [
-        part.column([value] if recording.train.steps.dtype is None else np.array([value])) for part in parts
-    ]
-
-
-def _observations(recording: Recording, steps: Records, parts: Sequence[_ShownPart]) -> list[Column]:
-    """Return what is shown of the observations after steps, as columns."""
-    after = observed(recording, steps)
-    return [part.column(after) for part in parts]
+    yield whole_steps(recording, phase, episode)[:stop]
 
 
 def _extras(
@@ -207,7 +192,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
     leaves = leaves_of(recording.spaces["observation"], f"{recording.path}: the observation space")
     shown, notes, unseen, known = [], [], 0, observation_names(recording)
     left = max(MAX_SERIES // len(agents), _LEAST_SERIES) if agents else MAX_SERIES
-    budget = dict.fromkeys(agents or ("",), left)
+    budget: defaultdict[str, int] = defaultdict(lambda: left)
     for leaf in leaves:
         agent = leaf.path[0] if leaf.path and leaf.path[0] in agents else ""
         skip = 1 if agent else 0
@@ -220,8 +205,8 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
             what = "an image" if is_image(leaf) else "an array"
             notes.append(f"{' '.join(filter(None, (agent, name))) or 'observation'}: {what}, {_sizes(shape)}")
             continue
-        taken = min(count, budget.get(agent, left))
-        budget[agent] = budget.get(agent, left) - taken
+        taken = min(count, budget[agent])
+        budget[agent] -= taken
         unseen += count - taken
         names = tuple(islice(number_names(leaf, "", skip, known), taken))
         if names:
@@ -236,22 +221,22 @@ def _sizes(shape: tuple[int, ...]) -> str:
 
 
 def _frames(
-    parts: Sequence[_ShownPart], observations: Sequence[Sequence[Column]]
+    parts: Sequence[_ShownPart], observations: Sequence[Sequence[Column]], frames: int
 ) -> tuple[list[Words], list[PlayerSeries]]:
-    """Return the texts and the numbers of T + 1 frames.
+    """Return the texts and the numbers of frames.
 
-    The observations are columns of each part: at first those before the steps, none if unknown.
+    The observations are columns of each part, without the first frame's if it is unknown.
     """
     texts, series = [], []
     for i, part in enumerate(parts):
-        columns = [each[i] for each in observations if each]
-        name = part.names[0] or "observation"
+        columns = [each[i] for each in observations]
         if part.is_text:
-            unknown = [] if observations[0] else [""]
-            texts.append(words(part.agent, name, [*unknown, *(text for each in columns for text in each)]))
+            shown = [text for column in columns for text in column]
+            unknown = [""] * (frames - len(shown))
+            texts.append(words(part.agent, part.names[0] or "observation", unknown + shown))
             continue
         numbers = np.concatenate(columns).astype(np.float64)
         for name, own in zip(part.names, numbers.T.tolist(), strict=True):
-            values = [*([] if observations[0] else [None]), *map(short, own)]
+            values: list[Value] = [None] * (frames - len(own)) + [*map(short, own)]
             series.append(PlayerSeries(part.agent, "observation", name or "observation", values))
     return texts, series

@@ -98,13 +98,26 @@ def stages_of(recording: Recording) -> list[MapStage]:
 def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int) -> list[MapRow]:
     """Return the maps for the situation of a state; none without a scene or a mover."""
     drawing = drawing_of(mdp)
-    if drawing is None or not stages:
+    if drawing is None or mdp.scene is None or not stages:
         return []
-    pairs = range(len(learners)) if len(drawing.movers) == 2 else ()
-    return [
-        *(_pair_row(mdp, learners, stages, state, drawing.movers, learner) for learner in pairs),
-        *(_policy_row(mdp, learners, stages, state, mover) for mover in drawing.movers),
-    ]
+    rows, things = [], [mdp.scene["things"][mover] for mover in drawing.movers]
+    for learner, name in enumerate(learners) if len(things) == 2 else ():
+        whose = "" if len(learners) == 1 else f" of {spoken(name)}"
+        one, other = (thing["label"] for thing in things)
+        explanation = (
+            f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all "
+            "actions have the same value."
+        )
+        title = f"Highest Q-value{whose} for every pair of places"
+        rows.append(_row(title, explanation, mdp, stages, state, drawing.movers, learner))
+    explanation = "Arrow: the greedy action in that cell. Grey: all actions have the same value there."
+    for mover, thing in zip(drawing.movers, things, strict=True):
+        agent = mdp.agents.index(thing["agent"]) if thing.get("agent") in mdp.agents else 0
+        # Of a joint table the mover's part of each action is shown.
+        learner, own_actions = (0, mdp.own_actions[:, agent]) if len(learners) == 1 else (agent, None)
+        title = f"Greedy actions of {thing['label']}, and the highest Q-value"
+        rows.append(_row(title, explanation, mdp, stages, state, [mover], learner, own_actions))
+    return rows
 
 
 def situation(mdp: Mdp, state: int, free: Sequence[int]) -> NDArray[np.bool_]:
@@ -139,35 +152,6 @@ def _replayed(recording: Recording, episode: int) -> MapStage | None:
         return MapStage("", episode, step, tables_at(recording, step))
     except RecordingError:
         return None
-
-
-def _pair_row(
-    mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int, movers: list[int], learner: int
-) -> MapRow:
-    """Return the highest value for each pair of cells of two movers."""
-    assert mdp.scene is not None
-    one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
-    whose = "" if len(learners) == 1 else f" of {spoken(learners[learner])}"
-    title = f"Highest Q-value{whose} for every pair of places"
-    explanation = (
-        f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all actions "
-        "have the same value."
-    )
-    return _row(title, explanation, mdp, stages, state, movers, learner)
-
-
-def _policy_row(
-    mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int, mover: int
-) -> MapRow:
-    """Return the greedy action and the highest value of one mover in each cell."""
-    assert mdp.scene is not None
-    thing = mdp.scene["things"][mover]
-    agent = mdp.agents.index(thing["agent"]) if thing.get("agent") in mdp.agents else 0
-    title = f"Greedy actions of {thing['label']}, and the highest Q-value"
-    explanation = "Arrow: the greedy action in that cell. Grey: all actions have the same value there."
-    if len(learners) > 1:
-        return _row(title, explanation, mdp, stages, state, [mover], agent)
-    return _row(title, explanation, mdp, stages, state, [mover], 0, mdp.own_actions[:, agent])
 
 
 def _row(
