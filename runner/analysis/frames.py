@@ -34,7 +34,7 @@ from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.listing import run_at
 from runner.runs.run import Run
-from runner.util.arrays import Array, Records, leaves
+from runner.util.arrays import Array, leaves
 from runner.util.extras import require
 from runner.util.values import flatten
 
