@@ -42,7 +42,7 @@ def echo(text: object, err: bool = False, nl: bool = True) -> None:
 
 
 class Remark(str):
-    """A part of a reply's text that is said on stderr."""
+    """A part of a reply's text that goes to stderr."""
 
     __slots__ = ()
 
@@ -62,7 +62,7 @@ class Reply:
     csv: Iterable[str] = ()
     """Lines of CSV, which stand for the text where there is none."""
     page: str = ""
-    """A line about a page that was written: it stands for the text, and is said on stderr in other forms."""
+    """A line about a page that was written: it stands for the text, and goes to stderr in other forms."""
     notes: Iterable[str] = ()
     """Notices on stderr, after the reply in any form."""
     exit_code: int = ExitCode.OK
