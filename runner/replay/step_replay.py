@@ -79,6 +79,11 @@ class StepReplay:
         return [self.learner.table(i) for i in range(len(self.agents))]
 
     @property
+    def greedy(self) -> Array:
+        """The greedy actions at `step`, int32 [learners, states]: the lowest of the best ones."""
+        return self.learner.tables.greedy
+
+    @property
     def named_tables(self) -> list[NamedTables]:
         """All tables of each learner at `step`, by name: views that `apply` changes; `q` is its Q-table."""
         return [self.learner.named_tables(i) for i in range(len(self.agents))]
