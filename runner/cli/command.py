@@ -80,7 +80,8 @@ class Command(click.Command):
 
     The defaults of the function's parameters declare them, unless they are `declared`; `params` are further
     ones, which the function does not get. The function returns a `Reply` or yields several; it is printed
-    as text, or in the form that --json or another of the `forms` demands.
+    as text, or in the form that --json or another of the `forms` demands. What several records declare by one
+    name is one option.
     """
 
     def __init__(
@@ -93,8 +94,9 @@ class Command(click.Command):
         **attributes: Any,
     ) -> None:
         call = _Record(callback, declared)
+        declared_once = {parameter.name: parameter for parameter in call.parameters()}
         flags = [click.Option([f"as_{form}", f"--{form}"], is_flag=True, help=_FORMS[form]) for form in forms]
-        super().__init__(name, callback=call, params=[*call.parameters(), *params, *flags], **attributes)
+        super().__init__(name, callback=call, params=[*declared_once.values(), *params, *flags], **attributes)
         self.help = _with_examples(self.help)
         self.forms = forms
 

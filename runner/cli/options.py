@@ -18,6 +18,7 @@ from runner.cli.parameter_types import (
     FILTER_WORD,
     INDEX,
     NUMBERS,
+    PATH,
     RANGES,
     SETTING,
     STEP,
@@ -28,7 +29,7 @@ from runner.cli.parameter_types import (
     RunName,
     RunOrFilter,
 )
-from runner.runs.run import recordings_folder
+from runner.runs.run import Run, recordings_folder
 from runner.util.values import Ranges
 
 if TYPE_CHECKING:
@@ -74,9 +75,8 @@ set_option: Final = option(
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as evaluation.trials=50; may be repeated.",
 )
-html_option: Final = option(
-    "--html", type=click.Path(path_type=Path), metavar="FILE", help="Write an HTML page instead."
-)
+html_option: Final = option("--html", type=PATH, metavar="FILE", help="Write an HTML page instead.")
+tags_option: Final = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated.")
 force_option: Final = option("--force", is_flag=True, help="Replace existing output.")
 accept_changes_option: Final = option(
     "--accept-changes",
@@ -207,7 +207,7 @@ def output_option(default: str, metavar: str = "FILE") -> Declared:
     return option(
         "-o",
         "--output",
-        type=click.Path(path_type=Path),
+        type=PATH,
         metavar=metavar,
         help=f"The {kind} to write.  [default: {default}]",
     )
@@ -221,22 +221,17 @@ class Writing:
     default: str
     """The path without --output, in which NAME-RUN stands for the run."""
     force: bool
-    recordings: Path | None
 
-    def path(self, file_stem: str = "") -> Path:
-        """Return the path to write; `file_stem` is that of the run."""
-        return self.output or Path(self.default.replace("NAME-RUN", file_stem))
+    def path(self, run: Run | None = None) -> Path:
+        """Return the path to write, for a run or for none."""
+        return self.output or Path(self.default.replace("NAME-RUN", run.file_stem if run else ""))
 
 
 def writing_options(default: str, metavar: str = "FILE") -> Declared:
     """Return the options of a command that writes files made from runs, by default at the path `default`."""
 
-    def writing(
-        output: Path | None = output_option(default, metavar),
-        force: bool = force_option,
-        recordings: Path | None = recordings_option,
-    ) -> Writing:
-        return Writing(output, default, force, recordings)
+    def writing(output: Path | None = output_option(default, metavar), force: bool = force_option) -> Writing:
+        return Writing(output, default, force)
 
     return record(writing)
 

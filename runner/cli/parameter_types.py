@@ -220,6 +220,7 @@ GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: 
 TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
 AXIS: Final = Parsed("axis", "episodes, steps, updates, time or a logged name", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _step)
+PATH: Final = click.Path(path_type=Path)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
 COUNT: Final = click.IntRange(1)

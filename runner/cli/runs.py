@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.archive.places import at_hand
+from runner.cli.command import record
+from runner.cli.options import recordings_option, run_argument
 from runner.cli.output import Reply, say
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import ExitCode, RecordingError, RunnerError, RunNotFound
@@ -100,15 +102,18 @@ def restored(run: Run) -> Run:
         return at_hand(run, say, report)
 
 
-def find_recording(name: str, recordings: Path | None) -> tuple[Path, Run | None]:
+@record
+def recording_and_run(
+    run_name: str = run_argument, recordings: Path | None = recordings_option
+) -> tuple[Path, Run | None]:
     """Return a recording, however damaged, by run name or path; and its run, if it is in a run's folder."""
     try:
-        run = find_recorded(name, recordings)
+        run = find_recorded(run_name, recordings)
         in_folder = run.recording.name == RECORDING_FILE and (run.folder / RUN_FILE).is_file()
         return run.recording, run if in_folder else None
     except (RunNotFound, RecordingError):
-        folders = (Path(name), recordings_folder(recordings) / name)
-        for path in (Path(name), *(folder / RECORDING_FILE for folder in folders)):
+        folders = (Path(run_name), recordings_folder(recordings) / run_name)
+        for path in (Path(run_name), *(folder / RECORDING_FILE for folder in folders)):
             if path.is_file():
                 return path, None
         raise
@@ -133,20 +138,29 @@ def command_for(run: Run, verb: str, *options: str) -> str:
 
 
 @contextlib.contextmanager
-def opened_run(
-    run_name: str, recordings: Path | None, needs_steps: bool = False
-) -> Iterator[tuple[Run, Recording]]:
-    """Open a run to export it, and print what its recording lacks when that is done."""
+def open_for_export(run: Run, needs_steps: bool = False) -> Iterator[Recording]:
+    """Open the recording of a run to export it, and print what it lacks when that is done."""
     from runner.analysis.contents import require_steps, shortcomings
     from runner.recording.reader import open_recording
 
-    run = find_recorded(run_name, recordings)
     with open_recording(run.recording) as recording:
         if needs_steps and has_environment(recording.config):
             require_steps(recording, "export")
-        yield run, recording
+        yield recording
         for shortcoming in shortcomings(recording):
             say(shortcoming)
+
+
+@record
+def found_run(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Run:
+    """Return the run that the command names."""
+    return find(run_name, recordings)
+
+
+@record
+def recorded_run(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Run:
+    """Return the newest run of the name that the command gives, with its recording."""
+    return find_recorded(run_name, recordings)
 
 
 # --- working ----------------------------------------------------------------------------------------------

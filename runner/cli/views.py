@@ -7,14 +7,13 @@ from pathlib import Path
 from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     force_option,
-    recordings_option,
-    run_argument,
 )
 from runner.cli.output import Remark, Reply, files_written
 from runner.cli.parameter_types import FILE, INDEX, ExpressionText
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import command_for, compilation_notice, find_recorded
+from runner.cli.runs import command_for, compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
+from runner.runs.run import Run
 from runner.views.view import Input, View
 
 
@@ -22,15 +21,13 @@ def command_of(view: View) -> Command:
     """Return the command of a view."""
 
     def call(
-        run_name: str,
-        recordings: Path | None,
+        run: Run,
         output: Path | None = None,
         force: bool = False,
         **values: object,
     ) -> Reply:
         if output is not None:
             require_new(output, force)
-        run = find_recorded(run_name, recordings)
         from runner.recording.reader import open_recording
 
         line = steps_line if view.counts_steps else stage_line
@@ -48,13 +45,12 @@ def command_of(view: View) -> Command:
         )
 
     declared = {
-        "run_name": run_argument,
+        "run": recorded_run,
         **{name: _declared(each, view) for name, each in view.inputs.items()},
     }
     if view.file_ending:
         output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=view.file_help)
         declared |= {"output": output, "force": force_option}
-    declared["recordings"] = recordings_option
     return Command(view.name, call, declared, forms=("json", "markdown"), help=view.help)
 
 

@@ -12,7 +12,7 @@ from runner.archive.places import default_target
 from runner.cli.command import Command, argument, option
 from runner.cli.options import recordings_option, runs_argument
 from runner.cli.output import Remark, Reply, json_lines, say
-from runner.cli.parameter_types import RunName
+from runner.cli.parameter_types import PATH, RunName
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import compilation_notice, find, received, run_reply
 from runner.errors import RunnerError
@@ -124,7 +124,7 @@ def restore_command(
 
 @click.command("import", cls=Command)
 def import_command(
-    file: Path = argument(metavar="FILE", type=click.Path(path_type=Path)),
+    file: Path = argument(metavar="FILE", type=PATH),
     as_new: bool = option("--as-new", is_flag=True, help="Give the run a new id."),
     recordings: Path | None = recordings_option,
 ) -> Reply:

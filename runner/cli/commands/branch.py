@@ -14,11 +14,11 @@ from click.core import ParameterSource
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.jobs import job_option
-from runner.cli.options import recordings_option, run_argument, set_option, trust_option
+from runner.cli.options import recordings_option, set_option, trust_option
 from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import COUNT, INDEX, STEP
 from runner.cli.progress import steps_line
-from runner.cli.runs import command_for, compilation_notice, find_recorded, run_facts, run_reply
+from runner.cli.runs import command_for, compilation_notice, recorded_run, run_facts, run_reply
 from runner.runs.run import Run
 from runner.util.humanize import counted, number
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @click.command("branch", cls=Command)
 @job_option
 def branch_command(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     at: EpisodeRef | None = option(
         "--at",
         type=STEP,
@@ -101,7 +101,6 @@ def branch_command(
       dualtaxi branch lander --at 4:100 --action 0.5,-0.2 --policy agent:act
       dualtaxi branch spread --at 0:10 --action agent_0=1 --action agent_2=4
     """
-    run = find_recorded(run_name, recordings)
     if at is None:
         raise click.UsageError("expected --at EPISODE:T, the step to branch at")
     if not run.can_train_again and "all" in actions:

@@ -16,14 +16,13 @@ from runner.cli.options import (
     filter_argument,
     folders_option,
     limit_option,
-    recordings_option,
-    run_argument,
+    tags_option,
 )
 from runner.cli.output import Remark, Reply, say, table, title
-from runner.cli.runs import find
+from runner.cli.runs import found_run
 from runner.errors import ExitCode, RunnerError
 from runner.runs.catalogue.columns import with_same_as
-from runner.runs.run import label
+from runner.runs.run import Run, label
 from runner.util.humanize import UNKNOWN, duration, size
 
 if TYPE_CHECKING:
@@ -37,18 +36,17 @@ _LARGEST: Final = 20
 
 @click.command("label", cls=Command)
 def label_command(
-    run_name: str = run_argument,
+    run: Run = found_run,
     name: str | None = option(
         "--name", metavar="NAME", help="Rename the run; an empty NAME restores the original name."
     ),
     note: str | None = option(
         "--note", metavar="TEXT", help="Replace the note; - reads it from stdin, an empty one removes it."
     ),
-    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated."),
+    tags: tuple[str, ...] = tags_option,
     untags: tuple[str, ...] = option(
         "--untag", multiple=True, metavar="TAG", help="Remove a tag; may be repeated."
     ),
-    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Change the name, note and tags of RUN, and show them.
 
@@ -62,7 +60,6 @@ def label_command(
       dualtaxi label k3v9m2xq --note - < observations.txt
       dualtaxi ls --quiet 'name == "quick"' | xargs -I{} dualtaxi label {} --tag first-try
     """
-    run = find(run_name, recordings)
     missing = sorted(set(untags) - set(run.tags))
     labels = run.labels
     if name is not None or note is not None or tags or untags:
@@ -77,14 +74,13 @@ def label_command(
 
 @click.command("mark", cls=Command)
 def mark_command(
-    run_name: str = run_argument,
+    run: Run = found_run,
     at: str | None = argument(metavar="[STEP]", required=False),
     text: str = argument(metavar="[TEXT]", required=False, default=""),
-    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated."),
+    tags: tuple[str, ...] = tags_option,
     removed: tuple[str, ...] = option(
         "--unmark", multiple=True, metavar="MARK", help="Remove a mark by its id; may be repeated."
     ),
-    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Mark a STEP of RUN with a TEXT, and list the marks of the run.
 
@@ -100,7 +96,6 @@ def mark_command(
     """
     from runner.analysis.marking import mark, unmark
 
-    run = find(run_name, recordings)
     if at is not None:
         mark(run, at, text, tags=tags)
     if removed:

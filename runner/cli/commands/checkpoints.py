@@ -17,15 +17,15 @@ from runner.cli.options import (
     force_option,
     output_option,
     policy_option,
-    recordings_option,
-    run_argument,
     trial_option,
     trust_option,
 )
 from runner.cli.output import Remark, Reply, csv_lines, table, written
+from runner.cli.parameter_types import PATH
 from runner.cli.progress import stage_line
-from runner.cli.runs import find_recorded
+from runner.cli.runs import recorded_run
 from runner.export.places import new_file, write_text_new
+from runner.runs.run import Run
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ _LEFT: Final = ("checkpoint", "phase", "format", "digest", "content")
 
 
 @click.command("checkpoints", cls=Command)
-def checkpoints_command(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Reply:
+def checkpoints_command(run: Run = recorded_run) -> Reply:
     """List the checkpoints of RUN, which a loop recorded by `rec.checkpoint(name, ...)`.
 
     Examples:
       dualtaxi checkpoints @latest
       dualtaxi checkpoints cartpole --json
     """
-    checkpoints = find_recorded(run_name, recordings).checkpoints()
+    checkpoints = run.checkpoints()
     rows = (
         (
             each.reference,
@@ -74,11 +74,10 @@ def checkpoint_command() -> None:
 
 @checkpoint_command.command("get", short_help="Write a checkpoint into a file.")
 def get_command(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     reference: str = argument(metavar="[NAME]@STEP", default="@latest"),
     output: Path | None = output_option("NAME-STEP.FORMAT"),
     force: bool = force_option,
-    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Write a checkpoint of RUN into a file, after comparing its digest.
 
@@ -91,7 +90,6 @@ def get_command(
     """
     from runner.runs.checkpoints import find_checkpoint
 
-    run = find_recorded(run_name, recordings)
     checkpoint = find_checkpoint(run.checkpoints(), reference, f"run {run.run_id}")
     name = re.sub(r"[^\w.+=-]", "_", checkpoint.name)
     path = output or Path(f"{name}-{checkpoint.step}.{checkpoint.format}")
@@ -104,17 +102,14 @@ def get_command(
 
 @click.command("values", cls=Command)
 def values_command(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     episode: EpisodeRef | None = episode_option,
     trial: EpisodeRef | None = trial_option,
     checkpoint: str | None = checkpoint_option,
     policy: str | None = policy_option,
-    output: Path | None = option(
-        "-o", "--output", type=click.Path(path_type=Path), metavar="FILE.csv", help="Write a CSV file."
-    ),
+    output: Path | None = option("-o", "--output", type=PATH, metavar="FILE.csv", help="Write a CSV file."),
     force: bool = force_option,
     trust: bool = trust_option,
-    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Compute what the agent of a checkpoint of RUN returns at each step of a recorded episode.
 
@@ -131,7 +126,6 @@ def values_command(
     from runner.recording.reader import open_recording
     from runner.runs.checkpoints import find_checkpoint
 
-    run = find_recorded(run_name, recordings)
     at = episode or trial
     if checkpoint is None or policy is None or at is None or (episode and trial):
         raise click.UsageError("expected --episode N or --eval N:TRIAL, --checkpoint and --policy.")

@@ -9,13 +9,14 @@ import click
 
 from runner.cli.command import Command, CommandGroup, option
 from runner.cli.commands import export_film, export_tables, export_tools
-from runner.cli.options import Writing, run_argument, selection_options, writing_options
+from runner.cli.options import Writing, selection_options, writing_options
 from runner.cli.output import Reply, say, written
 from runner.cli.progress import stage_line
-from runner.cli.runs import compilation_notice, find_recorded
+from runner.cli.runs import compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
 from runner.export.plugin import installed_export
 from runner.export.rerun.viewer import require_rerun
+from runner.runs.run import Run
 from runner.util.humanize import duration, size
 from runner.util.plugins import EXPORTS
 
@@ -32,11 +33,10 @@ class ExportGroup(CommandGroup):
         """Return the command of an export that an installed package adds."""
         added = installed_export(name)
 
-        def call(run_name: str, to: Writing) -> Reply:
+        def call(run: Run, to: Writing) -> Reply:
             from runner.recording.reader import open_recording
 
-            run = find_recorded(run_name, to.recordings)
-            path = to.path(run.file_stem)
+            path = to.path(run)
             with (
                 new_file(path, to.force) as temporary,
                 open_recording(run.recording) as recording,
@@ -46,7 +46,7 @@ class ExportGroup(CommandGroup):
             return written(f"{path}  {size(path.stat().st_size)}", path)
 
         to = writing_options(f"NAME-RUN{added.ending}", f"FILE{added.ending}")
-        return Command(name, call, {"run_name": run_argument, "to": to}, help=added.help)
+        return Command(name, call, {"run": recorded_run, "to": to}, help=added.help)
 
 
 @click.group("export", cls=ExportGroup)
@@ -60,7 +60,7 @@ def export_command() -> None:
 
 @export_command.command("rerun", short_help="For the Rerun viewer: every view of selected episodes.")
 def rerun(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     selected: Request = selection_options,
     to: Writing = writing_options("exports/NAME-RUN.rrd", "FILE.rrd"),
 ) -> Reply:
@@ -81,8 +81,7 @@ def rerun(
     from runner.export.rerun.writing import export_runs
 
     started = time.monotonic()
-    run = find_recorded(run_name, to.recordings)
-    path = to.path(run.file_stem)
+    path = to.path(run)
     require_new(path, to.force)
     with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting") as stage:
         (selection,) = export_runs([run], [recording], selected, path, stage)
@@ -104,7 +103,7 @@ def print_selection(selection: Selection) -> None:
 
 @export_command.command("mcap", short_help="One file with everything, for `dualtaxi import`.")
 def mcap(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     anonymous: bool = option(
         "--anonymous", is_flag=True, help="Leave out host, user, command line and folder."
     ),
@@ -121,8 +120,7 @@ def mcap(
     """
     from runner.export.mcap import export_mcap
 
-    run = find_recorded(run_name, to.recordings)
-    path = to.path(run.file_stem)
+    path = to.path(run)
     with stage_line(f"exporting {run.run_id}"):
         exported = export_mcap(run, path, anonymous, to.force)
     for warning in exported.warnings:

@@ -14,16 +14,16 @@ from runner.cli.options import (
     Writing,
     episode_options,
     require_one,
-    run_argument,
     trust_option,
     writing_options,
 )
 from runner.cli.output import Reply, say, written
 from runner.cli.parameter_types import GRID
 from runner.cli.progress import count_line
-from runner.cli.runs import opened_run
+from runner.cli.runs import open_for_export, recorded_run
 from runner.errors import ExitCode
 from runner.export.places import new_file, require_new
+from runner.runs.run import Run
 from runner.util.humanize import size
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ _MAX_GIF_FPS = 50
 
 @click.command("film", cls=Command, short_help="A film of an episode: MP4, WebM, GIF or WebP.")
 def command(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     chosen: EpisodeRef = episode_options,
     grid: tuple[int, int] | None = option(
         "--grid",
@@ -93,8 +93,8 @@ def command(
     from runner.export.encoder import format_of
     from runner.export.pictures import Pictures, source_of
 
-    with opened_run(run_name, to.recordings) as (run, recording):
-        path = to.path(run.file_stem)
+    with open_for_export(run) as recording:
+        path = to.path(run)
         format_of(path)
         require_new(path, to.force)
         shown = _ranked(recording, grid) if grid else [chosen.resolved(recording)]

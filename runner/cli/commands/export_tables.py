@@ -5,11 +5,12 @@ from __future__ import annotations
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import Writing, episodes_option, run_argument, writing_options
+from runner.cli.options import Writing, episodes_option, writing_options
 from runner.cli.output import Reply, say, written
 from runner.cli.progress import count_line
-from runner.cli.runs import opened_run
+from runner.cli.runs import open_for_export, recorded_run
 from runner.export.places import new_folder
+from runner.runs.run import Run
 from runner.util.extras import require
 from runner.util.humanize import size
 from runner.util.values import Ranges
@@ -24,7 +25,7 @@ _phase_option = option(
 
 @click.command("csv", cls=Command, short_help=_HELP)
 def csv(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     phase: str | None = _phase_option,
     episodes: Ranges | None = episodes_option,
     gz: bool = option("--gz", is_flag=True, help="Compress each file with gzip."),
@@ -41,12 +42,12 @@ def csv(
       dualtaxi export csv k3v9m2xq --gz --phase eval -o trials
       dualtaxi export csv k3v9m2xq --episodes 0..20,2980.. --force
     """
-    return _export("csv", run_name, phase, episodes, gz, to)
+    return _export("csv", run, phase, episodes, gz, to)
 
 
 @click.command("parquet", cls=Command, short_help=_HELP)
 def parquet(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     phase: str | None = _phase_option,
     episodes: Ranges | None = episodes_option,
     to: Writing = writing_options("exports/NAME-RUN-parquet", "FOLDER"),
@@ -61,17 +62,15 @@ def parquet(
       dualtaxi export parquet @latest
       dualtaxi export parquet k3v9m2xq --episodes 0..20 -o first
     """
-    return _export("parquet", run_name, phase, episodes, False, to)
+    return _export("parquet", run, phase, episodes, False, to)
 
 
-def _export(
-    form: str, run_name: str, phase: str | None, episodes: Ranges | None, gz: bool, to: Writing
-) -> Reply:
+def _export(form: str, run: Run, phase: str | None, episodes: Ranges | None, gz: bool, to: Writing) -> Reply:
     require("pyarrow", extra="archive", purpose=f"export {form}")
     from runner.export.tables import PATTERNS, left_out, write_tables
 
-    with opened_run(run_name, to.recordings, needs_steps=True) as (run, recording):
-        path = to.path(run.file_stem)
+    with open_for_export(run, needs_steps=True) as recording:
+        path = to.path(run)
         total = (recording.result.train_steps or 0) + (recording.result.eval_steps or 0)
         with new_folder(path, to.force, PATTERNS) as folder, count_line("steps", total) as report:
             rows = write_tables(recording, folder, form, phase, episodes or (), gz, report)

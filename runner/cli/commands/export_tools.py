@@ -8,19 +8,19 @@ from runner.cli.command import Command, option
 from runner.cli.options import (
     Writing,
     episodes_option,
-    run_argument,
     writing_options,
 )
 from runner.cli.output import Reply, say, written
 from runner.cli.progress import count_line, stage_line
-from runner.cli.runs import opened_run
+from runner.cli.runs import open_for_export, recorded_run
 from runner.export.places import new_folder
+from runner.runs.run import Run
 from runner.util.values import Ranges
 
 
 @click.command("minari", cls=Command, short_help="A Minari dataset, for offline learning.")
 def minari(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     phase: str = option(
         "--phase",
         type=click.Choice(["train", "eval"]),
@@ -44,7 +44,7 @@ def minari(
     from runner.export.minari import PATTERNS, dataset_id, require_packages, write_dataset
 
     require_packages()
-    with opened_run(run_name, to.recordings, needs_steps=True) as (_, recording):
+    with open_for_export(run, needs_steps=True) as recording:
         folder = to.path()
         path = folder / dataset_id(recording)
         total = recording.phase(phase).episodes.count()
@@ -61,7 +61,7 @@ def minari(
 
 @click.command("tensorboard", cls=Command, short_help="An event file for TensorBoard.")
 def tensorboard(
-    run_name: str = run_argument, to: Writing = writing_options("exports/tensorboard/NAME-RUN", "FOLDER")
+    run: Run = recorded_run, to: Writing = writing_options("exports/tensorboard/NAME-RUN", "FOLDER")
 ) -> Reply:
     """Export RUN for TensorBoard: every metric, and length and return of each training episode.
 
@@ -75,8 +75,8 @@ def tensorboard(
     from runner.export.tensorboard import PATTERNS, require_packages, write_events
 
     require_packages()
-    with opened_run(run_name, to.recordings) as (run, recording):
-        path = to.path(run.file_stem)
+    with open_for_export(run) as recording:
+        path = to.path(run)
         with new_folder(path, to.force, PATTERNS) as folder, stage_line("writing events"):
             count = write_events(recording, folder)
     text = (

@@ -8,7 +8,6 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -16,11 +15,10 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import (
     episode_options,
-    recordings_option,
-    run_argument,
 )
 from runner.cli.output import Remark, Reply, console, json_lines
-from runner.cli.runs import find_recorded
+from runner.cli.runs import recorded_run
+from runner.runs.run import Run
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -47,7 +45,7 @@ _POLL_SECONDS: Final = 0.02
 
 @click.command("play", cls=Command)
 def play_command(
-    run_name: str = run_argument,
+    run: Run = recorded_run,
     chosen: EpisodeRef = episode_options,
     speed: float = option(
         "--speed",
@@ -57,7 +55,6 @@ def play_command(
         metavar="STEPS",
         help="Steps per second.",
     ),
-    recordings: Path | None = recordings_option,
 ) -> Iterator[Reply]:
     """Replay a recorded episode of RUN, step by step, with actions and rewards.
 
@@ -81,13 +78,12 @@ def play_command(
     from runner.export.values import Values
     from runner.recording.reader import open_recording
 
-    run = find_recorded(run_name, recordings)
     with open_recording(run.recording) as recording:
         at = chosen.resolved(recording)
         played = ShownEpisode(recording, at, f"{run.title}: {at.title}")
         remarks = []
         if not recording.tabular and Values(recording).image:
-            film = f"`dualtaxi export film {run_name}`"
+            film = f"`dualtaxi export film {run.run_id}`"
             remarks = [Remark(f"Observations that are pictures are not shown: {film} does.")]
         yield Reply(json_lines(played.steps()), itertools.chain(remarks, _shown(played, speed)))
 

@@ -14,7 +14,7 @@ import click
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
-from runner.cli.options import folders_option, force_option, limit_option, require_one
+from runner.cli.options import folders_option, force_option, limit_option, require_one, tags_option
 from runner.cli.output import Remark, Reply, csv_lines, json_list, say
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
@@ -156,7 +156,7 @@ def find_command(
     mark: str | None = option(
         "--mark", metavar="TEXT", help="Mark the first step of the episodes shown, as `dualtaxi mark` does."
     ),
-    tags: tuple[str, ...] = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated."),
+    tags: tuple[str, ...] = tags_option,
     quiet: bool = option(
         "-q",
         "--quiet",

@@ -15,6 +15,7 @@ from runner.cli.options import (
     compared_argument,
     curve_options,
     normalise_option,
+    recordings_option,
     writing_options,
 )
 from runner.cli.output import Reply, require_page, say, written
@@ -40,6 +41,7 @@ def plot_command(
     style: CurveStyle = curve_options,
     normalise: str | None = normalise_option,
     to: Writing = writing_options("exports/plot.png", "FILE.png|svg|pdf"),
+    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Draw every metric of one or several runs over an axis, in one figure; or a sweep.
 
@@ -70,7 +72,7 @@ def plot_command(
     from runner.export.plots.style import CurveStyle
     from runner.recording.reader import open_recording
 
-    output, folder = to.path(), recordings_folder(to.recordings)
+    output, folder = to.path(), recordings_folder(recordings)
     check_suffix(output)
     if normalise is not None and style != CurveStyle():
         raise click.UsageError(
@@ -169,6 +171,7 @@ def report_command(
     axis: Axis = axis_option,
     style: CurveStyle = curve_options,
     to: Writing = writing_options("exports/report.html", "FILE.html"),
+    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Write one self-contained page about one or several runs, or about a sweep.
 
@@ -187,7 +190,7 @@ def report_command(
     """
     from runner.export.reports.report import render_report
 
-    output, folder = to.path(), recordings_folder(to.recordings)
+    output, folder = to.path(), recordings_folder(recordings)
     require_page(output, to.force)
     if is_sweep(run_names, folder):
         if episodes or trials:

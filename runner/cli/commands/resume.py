@@ -15,7 +15,6 @@ from runner.cli.options import (
     checkpoint_option,
     policy_option,
     recordings_option,
-    run_argument,
     trust_option,
 )
 from runner.cli.output import Reply, console, say
@@ -23,9 +22,9 @@ from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line
 from runner.cli.runs import (
     command_for,
-    find,
-    find_recorded,
+    found_run,
     job_progress,
+    recorded_run,
     require_over,
     run_as_json,
     run_facts,
@@ -42,10 +41,9 @@ if TYPE_CHECKING:
 @click.command("resume", cls=Command)
 @job_option
 def resume_command(
-    run_name: str = run_argument,
+    run: Run = found_run,
     accept_changes: bool = accept_changes_option,
     trust: bool = trust_option,
-    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Resume RUN, which was interrupted or failed, as if it had never stopped.
 
@@ -62,7 +60,6 @@ def resume_command(
     """
     from runner.execution.resume import is_finished, resume
 
-    run = find(run_name, recordings)
     was_finished = is_finished(run)
     if not was_finished and run.status != "running":
         _announce(run)
@@ -86,8 +83,7 @@ def _announce(run: Run) -> None:
 
 @click.command("rerecord", cls=Command)
 def rerecord_command(
-    run_name: str = run_argument,
-    recordings: Path | None = recordings_option,
+    run: Run = found_run,
     trust: bool = trust_option,
 ) -> Reply:
     """Record the steps of RUN, which was recorded without them.
@@ -103,7 +99,6 @@ def rerecord_command(
     """
     from runner.execution.rerecord import holds_steps, is_rerun, rerecord
 
-    run = find(run_name, recordings)
     require_over(run)
     is_loop = is_rerun(run)
     had_steps = (is_loop or run.status == "finished") and holds_steps(run)
@@ -128,7 +123,7 @@ LOOP_TRIALS: Final = 20
 
 @click.command("evaluate", cls=Command)
 def evaluate_command(
-    run_name: str = run_argument,
+    source: Run = recorded_run,
     step: int | None = option(
         "--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]"
     ),
@@ -182,7 +177,6 @@ def evaluate_command(
     from runner.execution.rerecord import evaluate
     from runner.recording.reader import open_recording
 
-    source = find_recorded(run_name, recordings)
     if not source.can_train_again or checkpoint is not None or policy is not None:
         if checkpoint is None or policy is None:
             raise click.UsageError(

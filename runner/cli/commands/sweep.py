@@ -23,7 +23,7 @@ from runner.cli.options import (
     workers_option,
 )
 from runner.cli.output import Remark, Reply, console, facts, say
-from runner.cli.parameter_types import ConfigName
+from runner.cli.parameter_types import PATH, ConfigName
 from runner.cli.progress import seldom, stage_line
 from runner.errors import ExitCode, RunnerError
 from runner.export.places import require_new, write_text_new
@@ -126,7 +126,7 @@ def show(
     everything: bool = all_option,
     best: Path | None = option(
         "--write-best",
-        type=click.Path(path_type=Path),
+        type=PATH,
         metavar="FILE",
         help="Write the best configuration, with fresh seeds.",
     ),

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import recordings_option, run_argument, trust_option
+from runner.cli.options import trust_option
 from runner.cli.output import Reply
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
-from runner.cli.runs import command_for, find_recording, folded, job_progress, require_over
+from runner.cli.runs import command_for, folded, job_progress, recording_and_run, require_over
 from runner.errors import ExitCode, RunnerError
 from runner.runs.locking import locked
 from runner.runs.run import Run
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @click.command("verify", cls=Command)
 def verify_command(
-    run_name: str = run_argument,
+    named: tuple[Path, Run | None] = recording_and_run,
     rerun: bool | None = option(
         "--rerun/--no-rerun",
         default=None,
@@ -44,7 +44,6 @@ def verify_command(
         help="Accept this absolute and relative difference of a loop's observations and rewards.",
     ),
     trust: bool = trust_option,
-    recordings: Path | None = recordings_option,
 ) -> Reply:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 
@@ -73,7 +72,7 @@ def verify_command(
     """
     from runner.execution.verify import check, damage_of
 
-    path, run = find_recording(run_name, recordings)
+    path, run = named
     require_over(run)
     if run is not None and (shards := shards_in_words(run)):
         raise RunnerError(f"run {run.run_id} is not complete: {shards} of it could not be added.")
@@ -216,7 +215,7 @@ _MESSAGES: Final = {
 
 
 @click.command("repair", cls=Command)
-def repair_command(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Reply:
+def repair_command(named: tuple[Path, Run | None] = recording_and_run) -> Reply:
     """Repair the recording of RUN, or one given by its path, so that every reader opens it.
 
     Every good chunk is copied to a new file, also those after a damaged place; the file is read back and
@@ -233,7 +232,7 @@ def repair_command(run_name: str = run_argument, recordings: Path | None = recor
     from runner.recording.integrity import refuse_foreign
     from runner.recording.repair import can_be_repaired, repair
 
-    path, run = find_recording(run_name, recordings)
+    path, run = named
     refuse_foreign(path)
     parts = [(path, run)]
     if run is not None:

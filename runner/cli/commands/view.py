@@ -13,7 +13,7 @@ from runner.cli.command import Command, argument, option
 from runner.cli.commands.export import print_selection
 from runner.cli.options import force_option, recordings_option, selection_options
 from runner.cli.output import echo, say
-from runner.cli.parameter_types import PICTURE_SIZE, STEP, RunName
+from runner.cli.parameter_types import FILE, PICTURE_SIZE, STEP, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new
@@ -46,7 +46,7 @@ def view_command(
     ),
     screenshot: Path | None = option(
         "--screenshot",
-        type=click.Path(dir_okay=False, path_type=Path),
+        type=FILE,
         metavar="FILE.png",
         help="Write one frame to a file; no screen is needed.",
     ),
