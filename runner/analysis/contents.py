@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Final
 
 import numpy as np
@@ -14,7 +14,7 @@ from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
-from runner.util.values import flatten, is_whole
+from runner.util.values import JsonView, flatten, is_whole
 
 ENDINGS: Final = {
     "success": "ended in success",
@@ -96,7 +96,7 @@ def whole_ranges(
     return whole
 
 
-def flat_text(config: Mapping[str, object]) -> dict[str, str]:
+def flat_text(config: JsonView) -> dict[str, str]:
     """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
     flat = flatten(config, keep_empty=True)
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in flat.items()}

@@ -17,7 +17,7 @@ from runner.recording.reader import Recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.util import humanize
 from runner.util.arrays import Ints, Records
-from runner.util.values import finite
+from runner.util.values import Json, finite
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class TrainingRecord:
     step_size: float
     discount: float
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Json:
         """Return the record as JSON can hold it."""
         rewards = [{"reward": reward, "steps": steps} for reward, steps in self.reward_counts]
         return {**vars(self), "reward_counts": rewards}
@@ -80,7 +80,7 @@ class EvaluationRecord:
             self.episode, self.trials, {metric.name: self.value(metric.name) for metric in METRICS}
         )
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Json:
         """Return the record as JSON can hold it, each metric under its `key`."""
         training = self.training.as_json() if self.training else {}
         for position in ("episode", "step"):

@@ -12,7 +12,7 @@ from runner.analysis.series import RunSeries, full_name, lines_in
 from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS, SHARES
 from runner.util.humanize import listed, setting
-from runner.util.values import flatten
+from runner.util.values import JsonView, flatten
 
 Key = TypeVar("Key", bound=Hashable)
 
@@ -152,7 +152,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     return list(dict.fromkeys(pair for name in names for pair in by_name[name]))
 
 
-def flat_config(config: Mapping[str, object]) -> dict[str, object]:
+def flat_config(config: JsonView) -> dict[str, object]:
     """Return the values of a configuration by dotted key, but for its name and seeds."""
     return {key: value for key, value in flatten(config).items() if key not in ("seeds", "name")}
 
@@ -230,7 +230,7 @@ def _differing_keys(configs: Sequence[Mapping[str, object]]) -> list[str]:
     if "env.id" not in differing:
         return differing
 
-    def repeats_id(key: str, config: Mapping[str, object]) -> bool:
+    def repeats_id(key: str, config: JsonView) -> bool:
         env_id = str(config.get("env.id"))
         return config.get(key) in (env_id, env_id.rpartition(":")[2])
 

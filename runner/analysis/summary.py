@@ -26,7 +26,7 @@ from runner.recording.spaces import Description
 from runner.replay.recorded import RecordedReset, resets_of
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
-from runner.util.values import JsonView
+from runner.util.values import Json, JsonView
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class TableFill:
     zero_cells: int | None = None
     percent_filled: float | None = None
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Json:
         """Return what is known, by name."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
@@ -53,7 +53,7 @@ class RecordedExtras:
     names: Mapping[str, tuple[str, tuple[int | None, ...]]]
     """Name to dtype, or `str`, and shape, which begins with None where the first axis varies in length."""
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Json:
         """Return it as JSON can hold it."""
         names = {name: {"dtype": dtype, "shape": list(shape)} for name, (dtype, shape) in self.names.items()}
         return {"steps": self.steps, "names": names}
@@ -123,7 +123,7 @@ class RunDetails:
             "first_resets": {phase: reset.arguments for phase, reset in self.first_resets.items()},
         }
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Json:
         """Return everything, as JSON can hold it."""
         return self.facts() | {
             "eval": [record.as_json() for record in self.evaluations],
@@ -207,7 +207,7 @@ def random_policy_sentence(recording: Recording) -> str:
     return baseline.sentence if baseline else ""
 
 
-def _loop_as_json(loop: Summary) -> dict[str, object]:
+def _loop_as_json(loop: Summary) -> Json:
     last, recent = loop.last_evaluation, loop.recent_training
     return {
         "last_evaluation": last.as_json() if last else None,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from blake3 import blake3
 
 from runner.config import ExperimentConfig
+from runner.util.values import Json, JsonView
 
 NOT_CONTENT = ("name", "seeds", "recording")
 """Keys of a configuration that change neither what is learned nor what is recorded."""
@@ -21,7 +22,7 @@ class Job:
     config: ExperimentConfig
     seed: int
 
-    def content(self) -> dict[str, object]:
+    def content(self) -> Json:
         """Return the values that determine the content of the job's recording."""
         return _content(self.config.to_mapping(), self.seed)
 
@@ -31,13 +32,13 @@ class Job:
         return identity_of(self.config.to_mapping(), self.seed)
 
 
-def identity_of(config: Mapping[str, object], seed: int) -> str:
+def identity_of(config: JsonView, seed: int) -> str:
     """Return the identity of the job of a resolved configuration, given as plain values, and a seed."""
     text = json.dumps(_content(config, seed), sort_keys=True, separators=(",", ":"))
     return blake3(text.encode()).hexdigest()[:32]
 
 
-def _content(config: Mapping[str, object], seed: int) -> dict[str, object]:
+def _content(config: JsonView, seed: int) -> Json:
     return {key: value for key, value in config.items() if key not in NOT_CONTENT} | {"seed": seed}
 
 

@@ -27,7 +27,7 @@ from runner.errors import EnvironmentNotUsable
 from runner.util.values import JsonView
 
 
-def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -> Mdp:
+def load_mdp(env_id: str, kwargs: JsonView, rewards: str = "team") -> Mdp:
     """Make the environment and return its arrays.
 
     Args:
@@ -55,7 +55,7 @@ def load_mdp(env_id: str, kwargs: Mapping[str, object], rewards: str = "team") -
     return mdp
 
 
-def load_once(env_id: str, kwargs: Mapping[str, object], rewards: str) -> Mdp:
+def load_once(env_id: str, kwargs: JsonView, rewards: str) -> Mdp:
     """Return what `load_mdp` does; a process that needs the same environment again does not make it again."""
     return _loaded(env_id, json.dumps(dict(kwargs), sort_keys=True, default=dict), rewards)
 
@@ -65,7 +65,7 @@ def _loaded(env_id: str, kwargs: str, rewards: str) -> Mdp:
     return load_mdp(env_id, json.loads(kwargs), rewards)
 
 
-def mdp_of(env: Any, kwargs: Mapping[str, object]) -> Mdp:
+def mdp_of(env: Any, kwargs: JsonView) -> Mdp:
     """Return the arrays of an environment made with `kwargs`, whose agents share the reward.
 
     Raises:
@@ -83,7 +83,7 @@ def mdp_of(env: Any, kwargs: Mapping[str, object]) -> Mdp:
     return mdp
 
 
-def _read(env_id: str, kwargs: Mapping[str, object], env: Any, rewards: str) -> Mdp:
+def _read(env_id: str, kwargs: JsonView, env: Any, rewards: str) -> Mdp:
     """Return the attributes of an environment, not yet checked; a team shares the summed reward."""
     from runner.config.values import plain  # reading a recording needs none of it
 

@@ -45,6 +45,7 @@ from runner.runs.provenance import Differences, differing_provenance, provenance
 from runner.runs.run import RECORDING_FILE, Run
 from runner.util.files import storage_errors
 from runner.util.processes import Stop
+from runner.util.values import Json
 
 DECISIVE: Final = (
     "dualtaxi",
@@ -251,7 +252,7 @@ class _ResumedSession(Session):
         """Return how much of the run is done: at least what is recorded, also while it is retrained."""
         return tuple(map(max, super().done(), self._recorded))
 
-    def summary(self, topics: dict[str, str]) -> dict[str, object]:
+    def summary(self, topics: dict[str, str]) -> Json:
         """Return the summary of the run."""
         summary, recording = super().summary(topics), self._recording
         if self._reference.exhausted:

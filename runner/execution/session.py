@@ -42,6 +42,7 @@ from runner.runs.redaction import LineRedactor
 from runner.runs.run import Run
 from runner.util.arrays import Records
 from runner.util.processes import Stop
+from runner.util.values import Json
 
 REPORT_SECONDS: Final = 0.1
 
@@ -183,7 +184,7 @@ class Session:
         self._log("interrupted", "WARNING")
         return False
 
-    def summary(self, topics: dict[str, str]) -> dict[str, object]:
+    def summary(self, topics: dict[str, str]) -> Json:
         """Return the summary of the run, for `run.json`."""
         last = self._progress.evaluations[-1] if self._progress.evaluations else None
         return self.recorder.totals(topics) | {

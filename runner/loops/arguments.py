@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.utils import EzPickle, RecordConstructorArgs
 
 from runner.environments.layers import class_name
+from runner.util.values import Json
 
 _SHOWN: Final = "render_mode"
 """A parameter that changes no step."""
@@ -29,7 +30,7 @@ class CannotBeMade(Exception):
     """Why a part of the environment cannot be made again."""
 
 
-def arguments_of(made: object, inner: str = "") -> tuple[dict[str, object], bool]:
+def arguments_of(made: object, inner: str = "") -> tuple[Json, bool]:
     """Return the keyword arguments with which an object was made, and whether all are certain.
 
     They are certain where the constructor records them, by `RecordConstructorArgs` or `EzPickle`, or keeps
@@ -67,10 +68,10 @@ def arguments_of(made: object, inner: str = "") -> tuple[dict[str, object], bool
     return {name: value for name, value in kwargs.items() if name not in (inner, _SHOWN)}, is_certain
 
 
-def _recorded(made: Any, parameters: Mapping[str, inspect.Parameter]) -> dict[str, object]:
+def _recorded(made: Any, parameters: Mapping[str, inspect.Parameter]) -> Json:
     """Return the arguments that an object's own constructor records, not only a base class's."""
     names = getattr(getattr(inspect.unwrap(type(made).__init__), "__code__", None), "co_names", ())
-    arguments: dict[str, object] = {}
+    arguments: Json = {}
     if "RecordConstructorArgs" in names and isinstance(made, RecordConstructorArgs):
         arguments = made._saved_kwargs
     elif "EzPickle" in names and isinstance(made, EzPickle):
@@ -127,7 +128,7 @@ def _assigned(statement: ast.stmt) -> Iterator[tuple[ast.expr, ast.expr | None]]
                 yield target, statement.value
 
 
-def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> dict[str, object]:
+def plain_kwargs(kwargs: Mapping[str, object], owner: str) -> Json:
     """Return keyword arguments that JSON can hold.
 
     Raises:
@@ -162,7 +163,7 @@ def plain_number(value: np.generic) -> object:
     return value.item()
 
 
-def factory_of(made: Any) -> tuple[str, dict[str, object], bool]:
+def factory_of(made: Any) -> tuple[str, Json, bool]:
     """Return the function of a module that made an object, its arguments, and whether all are certain.
 
     It is known by a function or class that was defined in it and given to the object, and its arguments by

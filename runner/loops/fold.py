@@ -59,6 +59,7 @@ from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, sh
 from runner.runs.trust_marks import merge_marks
 from runner.util.arrays import Array, Floats, Records
 from runner.util.files import storage_errors
+from runner.util.values import Json
 
 _OWN_METADATA: Final = frozenset({"run", "result", "repair"})
 """The metadata that is not copied from the process that began the run."""
@@ -182,7 +183,7 @@ class _Fold:
         """The process with the clock that the run takes over."""
         self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
 
-    def write(self, fresh: Path) -> dict[str, object]:
+    def write(self, fresh: Path) -> Json:
         """Write the new recording; return the summary of the run."""
         first, started = self._first, time.monotonic()
         facts = self._facts()

@@ -39,7 +39,7 @@ from runner.runs.redaction import LineRedactor
 from runner.runs.run import RECORDING_FILE, Run, made_by, new_run, recordings_folder, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
 from runner.runs.trust_marks import mark
-from runner.util.values import JsonView
+from runner.util.values import Json, JsonView
 
 
 class LoopRun:
@@ -174,7 +174,7 @@ class LoopRun:
         if self._actions is not None:
             self._actions.commit()
 
-    def finish(self, status: str, error: str, rewards_off_table: int) -> dict[str, object]:
+    def finish(self, status: str, error: str, rewards_off_table: int) -> Json:
         """Write everything and the result; return the summary."""
         topic_digests = self.recorder.drain()
         self._code.write(self._file, wait=True)

@@ -40,7 +40,7 @@ from runner.loops.wrappers import (
 )
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, Registered, VectorMaker
 from runner.replay.scripts import MAIN
-from runner.util.values import MAX_TEXT
+from runner.util.values import MAX_TEXT, Json
 
 NAME_MAKE: Final = 'name a function that makes it: make="module:function"'
 _SIMULATORS: Final = ("Box2D", "ale_py", "mujoco", "pettingzoo", "supersuit")
@@ -65,7 +65,7 @@ def _maker_of_spec(spec: object) -> EnvironmentMaker:
     wrappers = getattr(spec, "additional_wrappers", ())
     names = tuple(wrapper.entry_point for wrapper in reversed(wrappers))
 
-    def wrapping(assumed: list[str]) -> dict[str, object]:
+    def wrapping(assumed: list[str]) -> Json:
         left = [wrapper for wrapper in wrappers if wrapper.entry_point not in OBSERVERS]
         fields = "disable_env_checker", "order_enforce", "max_episode_steps"
         return {name: getattr(spec, name) for name in fields} | {
@@ -78,7 +78,7 @@ def _maker_of_spec(spec: object) -> EnvironmentMaker:
 def _with_spec(
     maker: EnvironmentMaker,
     spec: object,
-    wrapping: Callable[[list[str]], dict[str, object]],
+    wrapping: Callable[[list[str]], Json],
     base: object = None,
 ) -> EnvironmentMaker:
     """Return a maker with a specification.
@@ -113,7 +113,7 @@ def _with_spec(
     )
 
 
-def _spec_fields(spec: EnvSpec) -> tuple[dict[str, object], str]:
+def _spec_fields(spec: EnvSpec) -> tuple[Json, str]:
     """Return what is recorded of a specification without wrappers, and the module that registers it."""
     registered = gymnasium.registry.get(spec.id)
     try:
@@ -124,7 +124,7 @@ def _spec_fields(spec: EnvSpec) -> tuple[dict[str, object], str]:
         registered_by = entry_point.partition(":")[0]
         if registered is None or name_of(registered.entry_point) != entry_point or registered_by == MAIN:
             raise
-    fields: dict[str, object] = {
+    fields: Json = {
         "id": spec.id,
         "entry_point": entry_point,
         "reward_threshold": spec.reward_threshold,
@@ -144,7 +144,7 @@ def _registered(spec: object) -> Registered:
     return {"kwargs": plain, "max_episode_steps": known.max_episode_steps}
 
 
-def _own_fields(base: object, assumed: list[str]) -> tuple[dict[str, object], str]:
+def _own_fields(base: object, assumed: list[str]) -> tuple[Json, str]:
     """Return the same as `_spec_fields`, of an environment that was made by calling its class."""
     if base is None:
         raise CannotBeMade("it was not made by gymnasium.make, and is in another process")
@@ -152,7 +152,7 @@ def _own_fields(base: object, assumed: list[str]) -> tuple[dict[str, object], st
     if not is_certain:
         assumed.append(class_name(base))
     entry_point = entry_point_of(type(base))
-    fields: dict[str, object] = {
+    fields: Json = {
         "id": type(base).__name__,
         "entry_point": entry_point,
         "kwargs": plain_kwargs(kwargs, class_name(base)),
@@ -215,7 +215,7 @@ def _custom_vector(base: object) -> EnvironmentMaker:
         return _with_versions(EnvironmentMaker("vector"), [top], reason)
     try:
         entry_point = entry_point_of(spec.vector_entry_point)
-        fields: dict[str, object] = {
+        fields: Json = {
             "id": spec.id,
             "entry_point": entry_point_of(spec.entry_point) if spec.entry_point else None,
             "vector_entry_point": entry_point,
@@ -269,7 +269,7 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
             entry_point = f"{module}:{function}" if has_function else entry_point_of(type(base))
             arguments, is_certain = arguments_of(base)
             assumed += [] if is_certain else [class_name(base)]
-        fields: dict[str, object] = {
+        fields: Json = {
             "entry_point": entry_point,
             "kwargs": plain_kwargs(arguments, f"the game {class_name(base)}"),
         }

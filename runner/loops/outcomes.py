@@ -11,6 +11,7 @@ from runner.environments.mdp import Mdp
 from runner.recording.metrics import METRICS, RECENT_EPISODES, defined_metrics, finite_mean
 from runner.recording.schema import Topic
 from runner.util.arrays import Floats, Records
+from runner.util.values import Json
 
 MAX_NAMES: Final = 64
 """The most names with their last logged value in a summary."""
@@ -60,7 +61,7 @@ class Outcomes:
         if name in self._logged or len(self._logged) < MAX_NAMES:
             self._logged[name] = value if math.isfinite(value) else None
 
-    def summary(self) -> dict[str, object]:
+    def summary(self) -> Json:
         """Return `last_evaluation`, `recent_training` and `logged`, as JSON can hold them."""
         returns, lengths = self._recent.T
         return {
@@ -73,7 +74,7 @@ class Outcomes:
             "logged": self._logged,
         }
 
-    def _evaluation(self) -> dict[str, object] | None:
+    def _evaluation(self) -> Json | None:
         if not self._trials:
             return None
         unknown = np.empty(0)

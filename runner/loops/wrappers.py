@@ -18,7 +18,7 @@ from runner.loops.arguments import VARIABLE, CannotBeMade, arguments_of, factory
 from runner.recording.maker import FUNCTION_NAME
 from runner.replay.scripts import MAIN
 from runner.replay.trust import is_left_out
-from runner.util.values import MAX_TEXT
+from runner.util.values import MAX_TEXT, Json
 
 _SHOWS_ONLY: Final = (RecordVideo, HumanRendering, VectorRecordVideo, VectorHumanRendering)
 """Wrappers that only show or store pictures: left out when the environment is made again."""
@@ -32,7 +32,7 @@ OBSERVERS: Final = frozenset(
 """Wrappers of Stable-Baselines3 that themselves change no observation, reward or end: left out, too."""
 
 
-def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]) -> dict[str, object]:
+def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]) -> Json:
     """Return the fields of an `EnvSpec` that describe wrappers, given from the innermost out.
 
     Wrappers that the entry point itself puts around its environment are only counted: it does so again. The
@@ -79,7 +79,7 @@ def only_observes(wrapper: object) -> bool:
     return isinstance(wrapper, _SHOWS_ONLY) or class_name(wrapper) in OBSERVERS
 
 
-def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, object]:
+def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> Json:
     """Return the fields of a wrapper's specification, which has no arguments if it does not record them."""
     if spec.kwargs is None:
         module, _, name = spec.entry_point.partition(":")
@@ -93,7 +93,7 @@ def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> dict[str, 
     return {"name": spec.name, "entry_point": spec.entry_point, "kwargs": kwargs}
 
 
-def wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
+def wrapper_fields(wrapper: object, assumed: list[str]) -> Json:
     """Return the fields of a `WrapperSpec`; add the wrapper to `assumed` if its arguments are unknown."""
     name = class_name(wrapper)
     kwargs, is_certain = arguments_of(wrapper, "env")
@@ -103,7 +103,7 @@ def wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
     return {"name": type(wrapper).__name__, "entry_point": entry_point_of(type(wrapper)), "kwargs": kwargs}
 
 
-def game_wrapper_fields(wrapper: object, assumed: list[str]) -> dict[str, object]:
+def game_wrapper_fields(wrapper: object, assumed: list[str]) -> Json:
     """Return what makes a wrapper around a game: a class, or a function as SuperSuit has them."""
     name = class_name(wrapper)
     try:

@@ -98,7 +98,7 @@ class EpisodeDigests:
                 yield stop - 1, running.digest(DIGEST_BYTES)
 
 
-def packed(rows: Records, n: int) -> dict[str, object]:
+def packed(rows: Records, n: int) -> Message:
     """Return the fields of a message with a block of steps, as `unpacked` returns them.
 
     Of each episode only the last digest in the block is kept.

@@ -10,7 +10,7 @@ from typing import Final
 from runner.errors import shortened
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
-from runner.util.values import JsonView, is_whole
+from runner.util.values import Json, JsonView, is_whole
 
 _CHANGE_NOTHING: Final = frozenset(
     (
@@ -53,7 +53,7 @@ class Composition:
             parts.append(f"wrapped by {', '.join(_call(*wrapper) for wrapper in self.wrappers)}")
         return ", ".join([*parts, f"made by {self.make}"] if self.make else parts)
 
-    def as_json(self) -> dict[str, object]:
+    def as_json(self) -> Json:
         """Return it as JSON can hold it."""
         wrappers = [{"name": name, "arguments": arguments} for name, arguments in self.wrappers]
         return vars(self) | {"arguments": dict(self.arguments), "wrappers": wrappers}

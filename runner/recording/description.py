@@ -255,7 +255,7 @@ class RunDescription:
         plan = self.config.get("recording")
         return isinstance(plan, Mapping) and plan.get("steps", "all") != "all"
 
-    def _json(self, name: str) -> dict[str, object]:
+    def _json(self, name: str) -> Json:
         return json_object(self._records.metadata(name).get("json"), f"{self.path}: the metadata {name!r}")
 
 

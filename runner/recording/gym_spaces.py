@@ -151,13 +151,13 @@ class RecordedSpace(Generic[SpaceT]):
         """Return many values, of which `to_json` returned these, as Gymnasium batches them."""
         return tuple(map(self.from_json, values))
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> Description:
         """Return the space as JSON, which `runner.recording.spaces` reads."""
         text = {"type": "Text", "max_length": _MAX_TEXT, "holds": repr(self.space)[:_MAX_REPR]}
         structure = self.structure()
         return text | ({"space": structure} if structure else {})
 
-    def structure(self) -> Mapping[str, object]:
+    def structure(self) -> Description:
         """Return what describes the space of values that are recorded as text; empty if it is unknown."""
         return {}
 
@@ -210,7 +210,7 @@ class _Dict(_Composite[spaces.Dict]):
     def batch(self, values: Value) -> Value:
         return {key: part.batch([value[str(key)] for value in values]) for key, part in self.parts.items()}
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> Description:
         return {"type": "Dict", "spaces": {str(key): part.describe() for key, part in self.parts.items()}}
 
     @classmethod
@@ -241,7 +241,7 @@ class _Tuple(_Composite["spaces.Tuple[Any]"]):
     def batch(self, values: Value) -> Value:
         return tuple(part.batch([value[i] for value in values]) for i, part in self.parts.items())
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> Description:
         return {"type": "Tuple", "spaces": [part.describe() for part in self.parts.values()]}
 
     @classmethod
@@ -270,7 +270,7 @@ class _Sequence(RecordedSpace[spaces.Sequence]):
     def from_json(self, data: Value) -> Value:
         return self.part.batch(data) if self.space.stack else tuple(map(self.part.from_json, data))
 
-    def structure(self) -> Mapping[str, object]:
+    def structure(self) -> Description:
         return {"type": "Sequence", "space": self.part.describe(), "stack": bool(self.space.stack)}
 
 
@@ -290,7 +290,7 @@ class _OneOf(RecordedSpace["spaces.OneOf[Any]"]):
             raise ValueError(f"found the part {data[0]} of {self.space}")
         return np.int64(data[0]), self.parts[data[0]].from_json(data[1])
 
-    def structure(self) -> Mapping[str, object]:
+    def structure(self) -> Description:
         return {"type": "OneOf", "spaces": [part.describe() for part in self.parts]}
 
 
@@ -317,7 +317,7 @@ class _Graph(RecordedSpace[spaces.Graph]):
             edge_links=None if links is None else np.array(links, np.int64).reshape(-1, 2),
         )
 
-    def structure(self) -> Mapping[str, object]:
+    def structure(self) -> Description:
         edge = None if self.edge is None else self.edge.describe()
         return {"type": "Graph", "node_space": self.node.describe(), "edge_space": edge}
 
@@ -343,7 +343,7 @@ class _Registered(RecordedSpace[Space]):
     def from_json(self, data: Value) -> Value:
         return self._from_json(data)
 
-    def structure(self) -> Mapping[str, object]:
+    def structure(self) -> Description:
         return {"type": f"{self._cls.__module__}:{self._cls.__qualname__}"}
 
 
@@ -356,7 +356,7 @@ class _Text(RecordedSpace[spaces.Text]):
     def from_json(self, data: Value) -> Value:
         return str(data)
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> Description:
         return {"type": "Text", "max_length": int(self.space.max_length)}
 
     @classmethod
@@ -389,11 +389,11 @@ class _Box(RecordedSpace[SpaceT]):
     def batch(self, values: Value) -> Value:
         return np.array(_numbers_in(values), self.space.dtype).reshape(-1, *self.dtype.shape)
 
-    def describe(self) -> dict[str, object]:
+    def describe(self) -> Description:
         layout = {"dtype": self.dtype.base.str, "shape": list(self.dtype.shape)}
         return {"type": self.name, **layout, **self.details()}
 
-    def details(self) -> dict[str, object]:
+    def details(self) -> Description:
         """Return what describes the space besides its dtype and shape."""
         return {name: _bound(getattr(self.space, name, None)) for name in ("low", "high")}
 
@@ -428,7 +428,7 @@ class _Box(RecordedSpace[SpaceT]):
 class _Discrete(_Box[spaces.Discrete]):
     name = "Discrete"
 
-    def details(self) -> dict[str, object]:
+    def details(self) -> Description:
         return {"n": int(self.space.n), "start": int(self.space.start)}
 
     @classmethod
@@ -439,7 +439,7 @@ class _Discrete(_Box[spaces.Discrete]):
 class _MultiDiscrete(_Box[spaces.MultiDiscrete]):
     name = "MultiDiscrete"
 
-    def details(self) -> dict[str, object]:
+    def details(self) -> Description:
         return {"nvec": np.asarray(self.space.nvec).tolist()}
 
     @classmethod
@@ -450,7 +450,7 @@ class _MultiDiscrete(_Box[spaces.MultiDiscrete]):
 class _MultiBinary(_Box[spaces.MultiBinary]):
     name = "MultiBinary"
 
-    def details(self) -> dict[str, object]:
+    def details(self) -> Description:
         return {}
 
     @classmethod

@@ -17,7 +17,7 @@ from typing import Final
 
 from runner.errors import RunnerError, StorageError
 from runner.util.files import read_object, storage_errors, write_object
-from runner.util.values import is_utf8
+from runner.util.values import Json, is_utf8
 
 LABELS_FILE: Final = "labels.json"
 LOCK_FILE: Final = "labels.lock"
@@ -107,7 +107,7 @@ def file_lock(path: Path) -> Iterator[None]:
             ) from error
 
 
-def as_json(labels: Labels) -> dict[str, object]:
+def as_json(labels: Labels) -> Json:
     """Return labels as the contents of their file; empty ones are left out."""
     values = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
     return {key: value for key, value in values.items() if value}

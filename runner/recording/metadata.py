@@ -333,7 +333,7 @@ def unpacked_provenance(entries: Mapping[str, str], path: str) -> dict[str, str]
 def write_description(
     file: RecordingFile,
     run: Mapping[str, str],
-    config: Mapping[str, object],
+    config: JsonView,
     provenance: Mapping[str, str],
     environment: Attachments,
     maker: EnvironmentMaker | None = None,

@@ -30,6 +30,7 @@ from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Array, RecordDType, Records, Unsigned
 from runner.util.packing import Packing
+from runner.util.values import Json
 
 FLUSH_SECONDS: Final = 0.5
 """A block is written when it is this old, though it is not full; with the writing, well under a second."""
@@ -295,7 +296,7 @@ class Recorder:
         self._pipeline.raise_failure()
         return self._pipeline.hash.topics()
 
-    def totals(self, topic_digests: Mapping[str, str]) -> dict[str, object]:
+    def totals(self, topic_digests: Mapping[str, str]) -> Json:
         """Return the totals in a result; `topic_digests` is what `drain` returned."""
         return {
             "content_digest": combined_digest(topic_digests),

@@ -22,6 +22,7 @@ from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
 from runner.util.arrays import Records
 from runner.util.jsonable import as_json
+from runner.util.values import Json
 
 _BLOCK_BYTES: Final = 16 << 20
 _NOTHING_GIVEN: Final = ResetOptions()
@@ -64,7 +65,7 @@ class RecordedReset(NamedTuple):
         return self.seed is not None or (state is not None and not is_empty(state))
 
     @property
-    def arguments(self) -> dict[str, object]:
+    def arguments(self) -> Json:
         """The seed and the options, as JSON can hold them; None for each that it had not."""
         options = (
             self.given.options if self.given.options is not None else json.loads(self.given.json or "null")

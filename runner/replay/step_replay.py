@@ -6,7 +6,7 @@ kernel indexes its arrays by what they say, without any check of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from runner.learning.learner import Learner, NamedTables
 from runner.learning.ledger import UPDATE
 from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
 from runner.util.arrays import Array, Floats, Ints, Records
+from runner.util.values import JsonView
 
 NO_ROWS: Final = np.empty((0, 0, 0))
 NO_UPDATES: Final = np.empty(0, UPDATE)
@@ -58,7 +59,7 @@ class StepReplay:
         config: the run's resolved configuration, as its recording holds it.
     """
 
-    def __init__(self, config: Mapping[str, object], mdp: Mdp, seed: int, where: str) -> None:
+    def __init__(self, config: JsonView, mdp: Mdp, seed: int, where: str) -> None:
         self._mdp = mdp
         self._where = where
         self.learner = Learner(from_mapping(config), mdp, seed)

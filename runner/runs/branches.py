@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal
 
 from runner.util.humanize import counted, setting
-from runner.util.values import flatten, is_whole
+from runner.util.values import JsonView, flatten, is_whole
 
 PATHS: Final = ("config.origin", "branches")
 """The paths of origins in configurations."""
@@ -74,7 +74,7 @@ class TrainingOrigin:
 Origin = BranchOrigin | TrainingOrigin
 
 
-def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
+def training_branches(config: JsonView) -> list[TrainingOrigin]:
     """Return the branches that led to the job with this configuration, the first one first.
 
     A branch stores whole sections, such as `quirks`; the origin has the settings that it changed.
@@ -92,7 +92,7 @@ def training_branches(config: Mapping[str, object]) -> list[TrainingOrigin]:
     return origins
 
 
-def origin_in(config: Mapping[str, object]) -> Origin | None:
+def origin_in(config: JsonView) -> Origin | None:
     """Return what the run with this configuration was branched from; None if it is no branch."""
     if branches := training_branches(config):
         episodes = config.get("episodes")

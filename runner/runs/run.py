@@ -29,7 +29,7 @@ from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels,
 from runner.recording.liveness import is_alive, owner
 from runner.recording.run_file import ArchiveReference, RunFile, Summary, parse_run_file, run_title
 from runner.util.files import storage_errors, write_object
-from runner.util.values import Json, as_utf8, checked_run_name, is_utf8
+from runner.util.values import Json, JsonView, as_utf8, checked_run_name, is_utf8
 
 if TYPE_CHECKING:  # listing runs must be quick
     from runner.config import ExperimentConfig
@@ -289,7 +289,7 @@ def create_run(
 
 def new_run(
     recordings: Path,
-    config: Mapping[str, object],
+    config: JsonView,
     seed: int | None,
     name: str,
     run_id: str | None = None,

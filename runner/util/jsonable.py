@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from runner.util.arrays import Array
+from runner.util.values import Json
 
 MAX_VALUES: Final = 4_000_000
 _MAX_REPR: Final = 10_000
@@ -45,7 +46,7 @@ def is_packed(value: object) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind in "biuf" and value.size > _MAX_LISTED
 
 
-def packed(array: Array) -> dict[str, object]:
+def packed(array: Array) -> Json:
     """Return an array as JSON: its dtype, its shape, and its bytes in C order as base64."""
     data = binascii.b2a_base64(array.tobytes(), newline=False).decode()
     return {"dtype": array.dtype.str, "shape": list(array.shape), "base64": data}

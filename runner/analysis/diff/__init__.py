@@ -40,6 +40,7 @@ from runner.runs.run import Run
 from runner.util.arrays import Array
 from runner.util.differences import Change, changes_in, equal_values
 from runner.util.humanize import counted
+from runner.util.values import Json
 
 NOT_CONTENT: Final = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""
@@ -282,7 +283,7 @@ def without_ignored(difference: RunDiff, ignore: Sequence[str], everything: bool
     return replace(difference, **left, alike=alike, ignored=[path for path in paths if is_ignored(path)])
 
 
-def as_json(difference: RunDiff) -> dict[str, object]:
+def as_json(difference: RunDiff) -> Json:
     """Return the difference as JSON can hold it, without the whole records of steps."""
     facts = asdict(difference)
     for divergence in (facts["divergence"], facts["evaluation_divergence"]):

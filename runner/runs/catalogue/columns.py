@@ -14,6 +14,7 @@ from runner.errors import RunnerError, nearest
 from runner.recording.metrics import METRICS
 from runner.runs.run import RECORDING_FILE
 from runner.util.humanize import UNKNOWN, age, duration, measure, number, setting, size
+from runner.util.values import Json
 
 IndexRow = dict[str, Any]
 """A run as the index has it, by the names of the stored columns."""
@@ -267,7 +268,7 @@ def value(row: IndexRow, name: str) -> object:
     return column.read(row) if column.read else row[column.stored[0]]
 
 
-def as_json(row: IndexRow, columns: Sequence[str] = DEFAULT_JSON) -> dict[str, object]:
+def as_json(row: IndexRow, columns: Sequence[str] = DEFAULT_JSON) -> Json:
     """Return the values of a run by column."""
     return {name: value(row, name) for name in columns}
 

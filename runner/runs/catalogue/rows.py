@@ -19,7 +19,7 @@ from runner.runs.branches import origin_in
 from runner.runs.catalogue.columns import COLUMNS
 from runner.runs.listing import listed_run
 from runner.runs.run import Run
-from runner.util.values import is_number
+from runner.util.values import JsonView, is_number
 
 _MODES: Final = {"joint team": "cooperative", "per_agent individual": "competitive"}
 _DEPTH: Final = 20
@@ -131,7 +131,7 @@ def text(value: object, max_length: int = _TEXT) -> str | None:
     return value[:max_length].encode(errors="replace").decode()
 
 
-def _flat(config: Mapping[str, object]) -> dict[str, object]:
+def _flat(config: JsonView) -> dict[str, object]:
     """Return the plain values in a configuration by dotted path; items of lists by their position."""
     flat: dict[str, object] = {}
 
