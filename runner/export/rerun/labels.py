@@ -20,7 +20,7 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.scene import Scene
-from runner.export.rerun.tracks import ComponentColumn, Floats, Points, Track, pairs, repeated
+from runner.export.rerun.tracks import Component, Floats, Points, Track, pairs, repeated
 from runner.util.arrays import Records
 
 MAX_REWARDS: Final = 2_000
@@ -100,7 +100,7 @@ class GridLabels:
         # As Arrow, because Rerun is slow to convert thousands of labels.
         empty: Any = rr.AnnotationContext([]).context
         context = pa.array([classes], empty.as_arrow_array().type)
-        return Track("", static=[[ComponentColumn(rr.AnnotationContext.descriptor_context(), context)]])
+        return Track("", static=[[Component(rr.AnnotationContext.descriptor_context(), context)]])
 
     @cached_property
     def points(self) -> Points:

@@ -17,17 +17,11 @@ from runner.recording.metrics import METRICS
 FRAMES_PER_SECOND: Final = 10.0
 OVERVIEW: Final = "Overview"
 """The tab of a loop for lines of all its environments; other tabs are groups of their own."""
-MAX_SHOWN: Final = {
-    "train": MAX_MEMBERS,
-    "eval": MAX_MEMBERS,
-    "picture": MAX_MEMBERS,
-    "array": 2,
-    "bars": 2,
-    "logged": 6,
-}
+PICTURES: Final = ("train", "eval", "picture")
+SHARES: Final = {"grid": 4, "train": 3, "eval": 3, "picture": 3, "array": 2, "log": 1}
+"""The groups at the left of a loop, with their shares of the height; pictures share one."""
+MAX_SHOWN: Final = {**dict.fromkeys(PICTURES, MAX_MEMBERS), "array": 2, "bars": 2, "logged": 6}
 """Views of a group in the blueprint; all are sent."""
-PLACES: Final = ("grid", "log", *MAX_SHOWN)
-"""The groups of a loop's views that are no tab."""
 PLOTS: Final = (
     *(
         (metric.heading.capitalize(), (f"train/metrics/{metric.name}", f"eval/metrics/{metric.name}"))
@@ -86,24 +80,23 @@ def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
 
 def _loop(loop: Writer) -> rrb.Container:
     """Return the arrangement of a loop: its pictures at the left, its lines at the right."""
-    left: list[tuple[Shown, int]] = [(view, 4) for view in _group(loop, "grid")]
-    for place in ("train", "eval", "picture"):
-        if frames := _group(loop, place):
-            left += [(rrb.Grid(*frames, grid_columns=math.ceil(math.sqrt(len(frames)))), 3)]
-    left += [(view, 2) for view in _group(loop, "array")]
-    left += [(view, 1) for view in _group(loop, "log")]
-    groups = dict.fromkeys([OVERVIEW, *(group for group, _ in loop.views if group not in PLACES)])
+    left: list[tuple[Shown, int]] = []
+    for group, share in SHARES.items():
+        views: list[Shown] = [*_group(loop, group)]
+        if group in PICTURES and views:
+            views = [rrb.Grid(*views, grid_columns=math.ceil(math.sqrt(len(views))))]
+        left += [(view, share) for view in views]
+    further = ("bars", "logged")
     tabs = [
-        rrb.Grid(
-            *_group(loop, *([tab, "bars", "logged"] if tab == OVERVIEW else [tab])), grid_columns=2, name=tab
-        )
-        for tab in groups
+        rrb.Grid(*_group(loop, tab, *(further if tab == OVERVIEW else ())), grid_columns=2, name=tab)
+        for tab in dict.fromkeys([OVERVIEW, *(group for group, _ in loop.views)])
+        if tab not in (*SHARES, *further)
     ]
     right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
     if not left:
         return rrb.Vertical(right, name=loop.source.title)
-    views, shares = zip(*left, strict=True)
-    column = rrb.Vertical(*views, row_shares=shares)
+    shown, shares = zip(*left, strict=True)
+    column = rrb.Vertical(*shown, row_shares=shares)
     recording = loop.source.recording
     share = 3 if max(recording.environments, len(recording.agents)) > 1 else 2
     return rrb.Horizontal(column, right, column_shares=[share, 3], name=loop.source.title)

@@ -183,8 +183,7 @@ def line_colours(count: int, tint: str | None = None) -> list[Colour]:
     else:
         hue, _, saturation = colorsys.rgb_to_hls(*(part / 255 for part in palette.rgb(tint)))
         shades = [(hue, lightness, saturation) for lightness in np.linspace(0.3, 0.8, count)]
-    colours = (colorsys.hls_to_rgb(*shade) for shade in shades)
-    return [(round(255 * red), round(255 * green), round(255 * blue)) for red, green, blue in colours]
+    return [tuple(round(255 * part) for part in colorsys.hls_to_rgb(*shade)) for shade in shades]
 
 
 def phase_colours(phase: str, count: int, tint: str | None = None) -> list[Colour]:

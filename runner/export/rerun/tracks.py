@@ -30,7 +30,7 @@ MAX_QUEUED: Final = 40 * MAX_ROWS
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
 _STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
 _BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
-Colour = tuple[int, int, int]
+Colour = tuple[int, ...]
 GREY: Final[Colour] = palette.rgb(palette.MIDTONE)
 Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
@@ -125,13 +125,13 @@ class Writer:
                     self._queued = 0
 
 
-class ComponentColumn(NamedTuple):
-    """An Arrow array with the interface of Rerun's `ComponentColumn`, which would copy it."""
+class Component(NamedTuple):
+    """An Arrow array with the interface of a batch of Rerun's, which would copy it."""
 
     descriptor: rr.ComponentDescriptor
     array: pa.Array
 
-    def component_descriptor(self) -> object:
+    def component_descriptor(self) -> rr.ComponentDescriptor:
         """Return the descriptor of the component."""
         return self.descriptor
 
@@ -154,7 +154,7 @@ def times_of(log_time: ArrayLike, **timelines: Array) -> Times:
     return {"step": steps, **{name: each.astype(np.int64) for name, each in timelines.items()}}
 
 
-def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> list[ComponentColumn]:
+def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> list[rr.ComponentColumn]:
     """Return the columns of n rows of a class such as `rerun.Points2D`, without one object per row.
 
     The parts are, by component, text or numbers [n, instances], points [n, instances, 2], line strips
@@ -172,12 +172,14 @@ def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> l
             items = pa.FixedSizeListArray.from_arrays(items, type=_POINT)
         if flat.ndim == 3 or flat.dtype == np.uint8:
             kind = _BLOB if flat.dtype == np.uint8 else _STRIP
-            items = _listed(np.full(len(flat), flat.shape[1]), items, kind)
-        made.append(ComponentColumn(getattr(archetype, f"descriptor_{name}")(), _listed(counts, items)))
+            offsets = np.arange(len(flat) + 1, dtype=np.int32) * np.int32(flat.shape[1])
+            items = pa.ListArray.from_arrays(offsets, items, type=kind)
+        component = Component(getattr(archetype, f"descriptor_{name}")(), items)
+        made.append(rr.ComponentColumn(component.descriptor, component, lengths=counts))
     return made
 
 
-def scalars(values: Array) -> list[ComponentColumn]:
+def scalars(values: Array) -> list[rr.ComponentColumn]:
     """Return the column of series, [n, series]."""
     return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
 
@@ -193,8 +195,8 @@ def in_tracks(rows: Iterable[Row]) -> Iterator[Track]:
             shown = []
             for batches in zip(*(row.shown.as_component_batches() for row in group), strict=True):
                 items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
-                listed = _listed(np.ones(len(group), np.int64), items)
-                shown.append(ComponentColumn(batches[0].component_descriptor(), listed))
+                component = Component(batches[0].component_descriptor(), items)
+                shown.append(rr.ComponentColumn(component.descriptor, component))
             yield Track(entity, {"step": np.array([row.step for row in group])}, shown, view=group[0].view)
 
 
@@ -238,8 +240,3 @@ def agent_colours(agents: Iterable[int]) -> list[Colour]:
 def grey_text() -> rr.Points2D:
     """Return how a text without a point is drawn."""
     return rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[GREY])
-
-
-def _listed(counts: Ints, items: pa.Array, kind: pa.DataType | None = None) -> pa.Array:
-    offsets = pa.array(np.append(0, np.cumsum(counts)).astype(np.int32))
-    return pa.ListArray.from_arrays(offsets, items, type=kind)
