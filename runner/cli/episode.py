@@ -103,9 +103,7 @@ def _state_drawer(recording: Recording) -> Callable[[Value | None], Text]:
     def drawn(value: Value) -> Text:
         state, text = int(value) - first, Text()
         if drawing is not None and mdp.scene_cells is not None:
-            cells = mdp.scene_cells[state]
-            carriers = np.full(len(cells), -1) if mdp.scene_carriers is None else mdp.scene_carriers[state]
-            text.append(drawing.draw(cells.tolist(), carriers.tolist()))
+            text.append(drawing.draw(mdp.scene_cells[state].tolist(), mdp.carriers[state].tolist()))
             text.append(f"\n{drawing.legend}\n\n", style="dim")
         return text.append(f"{names[state]}\n")
 

@@ -106,7 +106,7 @@ class SvgDrawing:
         if mdp.scene_cells is None:
             raise ValueError("a scene without cells cannot be drawn")
         cells = mdp.scene_cells[states].astype(np.int64)
-        carriers = np.full(cells.shape, -1) if mdp.scene_carriers is None else mdp.scene_carriers[states]
+        carriers = mdp.carriers[states]
         rows, columns = np.divmod(cells, self._scene["columns"])
         middle = CELL // 2 + MARGIN
         places = np.stack((columns * CELL + middle, rows * CELL + middle, np.full(cells.shape, 100)), axis=-1)

@@ -27,14 +27,11 @@ MAX_LISTED: Final = 8
 
 def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
     """Return the name of every state, [S] of str: index it by a state, or by an array of states."""
-    scene, cells, carriers = mdp.scene, mdp.scene_cells, mdp.scene_carriers
+    scene, cells = mdp.scene, mdp.scene_cells
     if scene is None or cells is None:
         return _texts([f"state {state}" for state in range(mdp.states)])
-    if carriers is None:
-        carriers = np.full(cells.shape, -1, np.int8)
-    things = [
-        _thing_in_words(scene, thing, cells[:, i], carriers[:, i]) for i, thing in enumerate(scene["things"])
-    ]
+    placed = zip(scene["things"], cells.T, mdp.carriers.T, strict=True)
+    things = [_thing_in_words(scene, thing, where, carriers) for thing, where, carriers in placed]
     return _texts([", ".join(words) for words in zip(*things, strict=True)])
 
 

@@ -123,7 +123,7 @@ def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state
 def situation(mdp: Mdp, state: int, free: Sequence[int]) -> NDArray[np.bool_]:
     """Return which states differ from one in nothing but the places of the free things, [S]."""
     assert mdp.scene_cells is not None
-    carriers = mdp.scene_carriers if mdp.scene_carriers is not None else np.full(mdp.scene_cells.shape, -1)
+    carriers = mdp.carriers
     same_carriers = (carriers == carriers[state]).all(axis=1)
     fixed = [i for i in range(mdp.scene_cells.shape[1]) if i not in free and carriers[state, i] < 0]
     same_cells = (mdp.scene_cells[:, fixed] == mdp.scene_cells[state, fixed]).all(axis=1)

@@ -52,9 +52,10 @@ PERSON: Final = (
 class Scene:
     """Arrays over S states. Movers come first among the things drawn, then passengers."""
 
-    def __init__(self, mdp: Mdp, description: SceneDescription, cells: Ints, carriers: Ints) -> None:
-        self.mdp, self.description, self.cells, self.carriers = mdp, description, cells, carriers
-        """`cells` and `carriers`: where each thing is in each state, and what carries it, -1 for nothing."""
+    def __init__(self, mdp: Mdp, description: SceneDescription, cells: Ints) -> None:
+        self.mdp, self.description, self.cells = mdp, description, cells
+        """`cells`: where each thing is in each state."""
+        carriers = self.carriers = mdp.carriers.astype(np.int64)
         things, self.rows, self.columns = description["things"], description["rows"], description["columns"]
         self.labels = [str(thing["label"]) for thing in things]
         self.movers, self.goals = (
@@ -194,6 +195,4 @@ def scene_of(mdp: Mdp) -> Scene | None:
     """Return the scene of an environment; None if it has none that can be drawn."""
     if mdp.scene is None or mdp.scene_cells is None:
         return None
-    cells, carriers = mdp.scene_cells, mdp.scene_carriers
-    carriers = np.full(cells.shape, -1, np.int8) if carriers is None else carriers
-    return Scene(mdp, mdp.scene, cells.astype(np.int64), carriers.astype(np.int64))
+    return Scene(mdp, mdp.scene, mdp.scene_cells.astype(np.int64))
