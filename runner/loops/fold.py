@@ -136,17 +136,12 @@ def _fold(run: Run, report: Report) -> Run:
     ending = _ending_of_run(run, unfolded)
     folded = Run(run.folder, facts).update(status=ending, summary=summary)
     merge_marks(run.folder, shard_folders(run))
-    _remove_folded(run, unfolded)
-    return folded
-
-
-def _remove_folded(run: Run, unfolded: Mapping[str, str]) -> None:
-    """Remove the shards of a run that was folded; keep the shards that are not whole in it."""
     for folder in shard_folders(run):
-        if folder.name in unfolded:
+        if folder.name in unfolded:  # it is not whole in the run, and is kept
             (run.folder / UNFOLDED_FOLDER).mkdir(exist_ok=True)
             folder.rename(run.folder / UNFOLDED_FOLDER / folder.name)
     shutil.rmtree(run.folder / SHARDS_FOLDER)
+    return folded
 
 
 def _widest(a: Description, b: Description) -> Description:

@@ -37,10 +37,6 @@ class ContentHash:
         """Return the hash of each topic that has messages, in hexadecimal."""
         return {name: self._topics[name].hexdigest() for name in sorted(self._topics)}
 
-    def content(self) -> str:
-        """Return the content digest, in hexadecimal."""
-        return combined_digest(self.topics())
-
 
 def combined_digest(topics: Mapping[str, str]) -> str:
     """Return the content digest for the hashes of the topics.

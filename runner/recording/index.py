@@ -299,10 +299,12 @@ class Index:
         data_end = bytes_of(DataEnd(crc))
         start = self.end + len(data_end)
         metadata = (MetadataIndex(*place, name) for name, place in self.metadata.items())
-        attachments = (
-            _attachment_index(name, *place, self.media_types[name])
-            for name, place in self.attachments.items()
-        )
+        attachments = []
+        for name, (offset, length) in self.attachments.items():
+            kind = self.media_types[name]
+            # All but its times, the lengths of its texts and data, and its checksum.
+            size = length - RECORD_HEAD.size - 2 * 8 - 2 * 4 - len(f"{name}{kind}".encode()) - 8 - 4
+            attachments.append(AttachmentIndex(offset, length, 0, 0, size, name, kind))
         groups = [
             (Opcode.SCHEMA, self.schema_records),
             (Opcode.CHANNEL, self.channel_records),
@@ -477,12 +479,6 @@ def _chunk_index(entry: ChunkEntry) -> bytes:
         struct.pack("<QQ", packed, entry.uncompressed_size),
     )
     return b"".join((RECORD_HEAD.pack(Opcode.CHUNK_INDEX, sum(map(len, body))), *body))
-
-
-def _attachment_index(name: str, offset: int, length: int, media_type: str) -> AttachmentIndex:
-    # All but its times, the lengths of its texts and data, and its checksum.
-    size = length - RECORD_HEAD.size - 2 * 8 - 2 * 4 - len(f"{name}{media_type}".encode()) - 8 - 4
-    return AttachmentIndex(offset, length, 0, 0, size, name, media_type)
 
 
 def _parse(kind: type[T], raw: RawRecord) -> T:

@@ -100,7 +100,10 @@ class Layout:
         sizes = {"rewards": self.learners, "returns": self.learners, "events": self.events}
         types = {name: sized(message, sizes) for name, message in types.items()}
         if not all(field.has_one_size for message in types.values() for field in message.values):
-            types |= {name: _values_last(message) for name, message in types.items() if message.values}
+            for name, message in types.items():
+                if message.values:  # they come last, so that the rest has one size
+                    fields = tuple(sorted(message.fields, key=lambda field: field.is_value))
+                    types[name] = replace(message, fields=fields, varies=True)
         return {
             topic: types[topic.name.rpartition("/")[2]] for topic in self.topics if topic in schema.ROW_TOPICS
         }
@@ -117,12 +120,6 @@ def _with_values(message: MessageType, *values: Field) -> MessageType:
     left_out = schema.OF_STATES | {"observation"}
     others = tuple(field for field in message.fields if field.name not in left_out)
     return replace(message, fields=(*values, *others))
-
-
-def _values_last(message: MessageType) -> MessageType:
-    """Return a message that varies in size with its values of spaces last: the rest has one size."""
-    fields = tuple(sorted(message.fields, key=lambda field: field.is_value))
-    return replace(message, fields=fields, varies=True)
 
 
 def sized(message: MessageType, sizes: Mapping[str, int | DType]) -> MessageType:

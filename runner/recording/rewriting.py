@@ -19,7 +19,6 @@ from runner.recording.records import (
     read_record,
     walk,
 )
-from runner.recording.run_file import Summary
 from runner.recording.writer import RecordingFile
 from runner.util.files import open_regular
 
@@ -92,12 +91,17 @@ def content_of(path: Path) -> str:
     """
     check_up_to_cut(path)
     with open_recording(path) as recording:
-        seen, result = content_hash(recording), recording.result
-    if result.content_digest is not None and not _is_stated(result, seen.topics()):
+        found, result = content_hash(recording).topics(), recording.result
+    if result.content_digest is None:
+        return combined_digest(found)
+    stated = dict(result.topic_digests)
+    if not result.steps_recorded:  # of these only the digests are there
+        found |= {name: stated[name] for name in schema.STEP_TOPICS if name in stated}
+    if found != stated or combined_digest(found) != result.content_digest:
         raise RecordingError(
             f"{path}: found messages of other content than the digest it states; it was altered."
         )
-    return result.content_digest or seen.content()
+    return result.content_digest
 
 
 def content_hash(recording: Recording) -> ContentHash:
@@ -129,14 +133,6 @@ def continues(path: Path, earlier: Path) -> bool:
                 if not left:
                     break
     return seen.topics() == expected.topics()
-
-
-def _is_stated(result: Summary, seen: dict[str, str]) -> bool:
-    """Return whether a result states these digests; those of steps that are not recorded are not compared."""
-    if not result.steps_recorded:
-        stated = result.topic_digests
-        seen = seen | {name: stated[name] for name in schema.STEP_TOPICS if name in stated}
-    return dict(result.topic_digests) == seen and combined_digest(seen) == result.content_digest
 
 
 def whole_records(path: Path) -> Iterator[Record]:

@@ -202,9 +202,13 @@ class TopicChunks:
             ends[after] += stop - start
         return firsts, ends
 
+    def _chosen(self, chunks: Sequence[int] | None) -> Sequence[int]:
+        """Return the numbers of these chunks, or of all."""
+        return range(len(self)) if chunks is None else chunks
+
     def _overlapping(self, times: range, chunks: Sequence[int] | None = None) -> list[int]:
         """Return the chunks, of these or of all, that may have messages of these times."""
-        numbers = np.array(range(len(self)) if chunks is None else chunks, np.intp)
+        numbers = np.array(self._chosen(chunks), np.intp)
         start, stop = (np.uint64(max(time, 0)) for time in (times.start, times.stop))
         spans = self.file.index.chunks.columns[self.places[numbers]]
         overlapping: list[int] = numbers[(spans["end_time"] >= start) & (spans["start_time"] < stop)].tolist()
@@ -252,11 +256,11 @@ class TopicChunks:
 
     def records(self, chunks: Sequence[int] | None = None) -> Iterator[bytes]:
         """Yield the message records of each of these chunks, by default of all, as they are in the file."""
-        return self.file.chunks(map(self.entry, range(len(self)) if chunks is None else chunks))
+        return self.file.chunks(map(self.entry, self._chosen(chunks)))
 
     def stored(self, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the messages of each chunk as they are stored: message records, which must have one size."""
-        return map(self._stored, range(len(self)) if chunks is None else chunks, self.records(chunks))
+        return map(self._stored, self._chosen(chunks), self.records(chunks))
 
     def _stored(self, k: int, data: bytes) -> Records:
         self.chunk_numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
@@ -275,7 +279,7 @@ class TopicChunks:
         """
         if times is not None:
             chunks = self._overlapping(times, chunks)
-        for k in range(len(self)) if chunks is None else chunks:
+        for k in self._chosen(chunks):
             entry = self.entry(k)
             data = self.file.chunk(entry)
             channel, log_times, offsets = checked_messages(data, self.file.where(entry))

@@ -18,7 +18,7 @@ from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.blocks import message_record
 from runner.recording.consistency import check_phase
-from runner.recording.digest import ContentHash
+from runner.recording.digest import ContentHash, combined_digest
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of
 from runner.recording.topic_chunks import TopicChunks
@@ -40,7 +40,7 @@ def forged(source, target, topics=None, result=None):
             for time, payload in messages:
                 digest.update(topic, message_record(topic, time, payload))
     stored = {
-        "content_digest": digest.content(),
+        "content_digest": combined_digest(digest.topics()),
         "topic_digests": digest.topics(),
         "messages": {name: count for name, count in counts.items() if count},
         "train_steps": counts["/train/step"],
