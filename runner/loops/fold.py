@@ -193,12 +193,7 @@ class _Fold:
                 file.add_metadata(f"{SHARD_MAKER}/{name}", maker.to_metadata())
             for name, media_type, data in first.file.attachments():
                 file.add_attachment(name, media_type, data)
-            recorder = Recorder(
-                file,
-                layout,
-                packing=packing,
-                observer=Observer(fresh.parent),
-            )
+            recorder = Recorder(file, layout, packing, observer=Observer(fresh.parent))
             recorder.watch(schema.EPISODE, self._outcomes.take_episodes)
             self._recorder = recorder
             try:

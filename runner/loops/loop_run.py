@@ -75,7 +75,6 @@ class LoopRun:
             record_steps=options.steps == "all",
             beat=self._beat,
             before=self.describe,
-            grouped=True,
             observer=Observer(
                 self.run.folder,
                 options.packing.system and not is_shard,

@@ -72,8 +72,7 @@ class Pipeline:
         threads: False makes the sender do the work.
         before: called once, before anything is written. With it, the pipeline holds up to `MAX_HELD` pieces
             of work until `release`; only then are threads started, so a recording that is closed earlier
-            needs none.
-        grouped: hold chunks until `end_group`, and write them then; else each is written by itself.
+            needs none. Chunks are held until `end_group`, and written then; else each is written by itself.
     """
 
     def __init__(
@@ -83,10 +82,9 @@ class Pipeline:
         beat: Callable[[], None],
         threads: bool = True,
         before: Callable[[], None] | None = None,
-        grouped: bool = False,
     ) -> None:
         self.hash = ContentHash()
-        self._grouped = grouped
+        self._grouped = before is not None
         self._group: list[Chunk] = []
         self._is_empty = True
         """Whether no group was written yet."""

@@ -81,11 +81,11 @@ class Recorder:
         beat: called about once a second while the recorder is in use, by the thread that writes.
         threads: False packs and writes in the thread that records.
         before: called once, before the first message is written. With it, threads are started and messages
-            written only when some have gathered, or by `release`, so that a short recording costs little.
+            written only when some have gathered, or by `release`, so that a short recording costs little. The
+            chunks of all topics are written together then, at each flush: whatever ends the process, the file
+            has no steps without their resets. The caller calls `write_if_full`, and `flush`.
         observer: what it sees of the time, the machine and the output is recorded.
         packed: the chunks of another recording, used again for the same messages.
-        grouped: write the chunks of all topics together, at each flush: the file has no steps without their
-            resets then, whatever ends the process. The caller calls `write_if_full`, and `flush`.
     """
 
     def __init__(
@@ -100,14 +100,12 @@ class Recorder:
         before: Callable[[], None] | None = None,
         observer: Observer | None = None,
         packed: PackedChunks | None = None,
-        grouped: bool = False,
     ) -> None:
         packing = replace(packing or Packing(), values=not layout.has_states)
         self._file = file
         self._watchers: dict[MessageType, Watcher] = {}
-        self._packed, self._grouped = packed, grouped
+        self._packed, self._grouped = packed, before is not None
         self._chunk_steps = packing.chunk_steps
-        self._first_records = _FIRST_RECORDS if before is not None else None
         self._reference = reference or Reference()
         self._lanes = {
             topic: self._lane(topic, layout.message(topic), record_steps or topic.message is not schema.STEP)
@@ -121,7 +119,7 @@ class Recorder:
         self.counts = {topic.name: 0 for topic in schema.ALL_TOPICS}
         """Messages committed so far, by topic."""
         self._last_flush = time.monotonic()
-        self._pipeline = Pipeline(file, packing, beat, threads, before, grouped)
+        self._pipeline = Pipeline(file, packing, beat, threads, before)
         self._batches = MessageBatches(self._pipeline.send)
         self.when_full: Callable[[], None] = self.flush
         """Writes everything, also what the caller holds; called when a block of steps was full."""
@@ -368,9 +366,9 @@ class Recorder:
 
     def _take_block(self, lane: _Lane) -> Records:
         """Return a block to fill: one that was used before, or a new one while there may be more."""
-        if self._first_records is not None and not lane.has_started and record_dtype(lane.message):
+        if self._grouped and not lane.has_started and record_dtype(lane.message):
             lane.has_started = True
-            return blank_records(lane.topic, lane.message, min(self._first_records, lane.capacity))
+            return blank_records(lane.topic, lane.message, min(_FIRST_RECORDS, lane.capacity))
         if lane.made < MAX_BLOCKS and lane.free.empty():
             lane.made += 1
             return blank_records(lane.topic, lane.message, lane.capacity)
