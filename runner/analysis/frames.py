@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from runner.analysis.evaluations import evaluation_records, training_records
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
@@ -29,7 +29,7 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Recording
 from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.listing import run_at
@@ -229,11 +229,7 @@ def step_columns(
 def _opened(run: Source) -> Iterator[Recording]:
     """Yield the run's open recording, if pandas is installed; one that is open already stays open."""
     _frame([])
-    if isinstance(run, Recording):
-        yield run
-        return
-    run = run if isinstance(run, Run) else run_at(Path(run))
-    with open_recording(at_hand(run).recording) as recording:
+    with opened(run if isinstance(run, Run | Recording) else run_at(Path(run))) as recording:
         yield recording
 
 

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from datetime import UTC, datetime
 
 from runner.analysis.episodes import EpisodeRef, StepLike
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.errors import RecordingError, RunnerError
 from runner.recording.labels import MAX_TAGS, TAG_EXPECTED
 from runner.recording.marks import MAX_MARK_TEXT, Mark, Marks, change_marks
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Recording
 from runner.runs.run import Run
 from runner.util.stored import stored_as
 from runner.util.values import is_utf8
@@ -40,7 +40,7 @@ def mark_steps(
 ) -> list[Mark]:
     """Mark steps of a run with the same text; arguments and errors as for `mark`."""
     run.require_folder()
-    with open_recording(at_hand(run).recording) as recording:
+    with opened(run) as recording:
         existing = [_existing(recording, EpisodeRef.parse(at)) for at in steps]
     created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
     values = {"text": text.strip(), "tags": sorted(set(tags)), "created": created}

@@ -23,6 +23,7 @@ from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, Report
 
 if TYPE_CHECKING:
     from runner.archive.store import ArchiveStore
+    from runner.recording.reader import Recording
 
 ARCHIVE_VARIABLE: Final = "DUALTAXI_ARCHIVE"
 MAX_CACHED: Final = 8
@@ -74,6 +75,18 @@ def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Repor
                 f"{cached}: another process has been restoring it for {LOCK_SECONDS:.0f} s."
             ) from error
     return replace(run, restored=cached)
+
+
+@contextlib.contextmanager
+def opened(run: Run | Recording) -> Iterator[Recording]:
+    """Yield the recording of a run, as `at_hand` finds it; one that is open already stays open."""
+    if not isinstance(run, Run):
+        yield run
+        return
+    from runner.recording.reader import open_recording
+
+    with open_recording(at_hand(run).recording) as recording:
+        yield recording
 
 
 @contextlib.contextmanager

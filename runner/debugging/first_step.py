@@ -13,7 +13,7 @@ from runner.analysis.diff.causes import find_cause
 from runner.analysis.diff.divergence import training_divergence
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.diff.updates import replay_to
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.config import from_mapping
 from runner.config.job import Job, identity_of
 from runner.debugging.explanation import FirstStep
@@ -23,7 +23,6 @@ from runner.environments.naming import spoken
 from runner.errors import RunnerError
 from runner.execution.session import run_job
 from runner.recording.labels import Labels
-from runner.recording.reader import open_recording
 from runner.runs.catalogue.removal import plan, remove
 from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED, Run, new_run
@@ -104,10 +103,7 @@ def _discard(run: Run, folder: Path) -> None:
 
 def _difference(before: Run, after: Run, what: str) -> tuple[Place | None, tuple[str, ...]]:
     """Return where two runs differ first, and what is known of it; no sentences if they do not differ."""
-    with (
-        open_recording(at_hand(before).recording) as a,
-        open_recording(at_hand(after).recording) as b,
-    ):
+    with opened(before) as a, opened(after) as b:
         if not can_compare_steps(a, b):
             return None, (f"{what} changes the states or actions, so that no steps can be compared.",)
         divergence, sentences = training_divergence(a, b), []

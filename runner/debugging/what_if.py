@@ -18,6 +18,7 @@ import numpy as np
 
 from runner.analysis.contents import ending_of, require_steps
 from runner.analysis.episodes import EpisodeRef, StepLike
+from runner.archive.places import opened
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.debugging.continuation import Continuation, Position
 from runner.environments.mdp import Mdp, events_of
@@ -28,7 +29,7 @@ from runner.planning.evaluation import action_values, policy_values
 from runner.planning.optimum import optimal_values
 from runner.recording import schema
 from runner.recording.blocks import blank_records
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Recording
 from runner.replay.steps import episode_blocks, steps_of
 from runner.replay.tables import TableReplay
 from runner.runs.run import Run
@@ -57,11 +58,11 @@ class Branched:
     """The Q-tables of each learner that the branch was played with, [S, actions]; empty if there are none."""
 
 
-def what_if(run: Run, *, at: StepLike, actions: Sequence[str | int] = ()) -> WhatIf:
+def what_if(run: Run | Recording, *, at: StepLike, actions: Sequence[str | int] = ()) -> WhatIf:
     """Return where each joint action at a step of a job's episode leads, or some of them.
 
     Args:
-        run: a run that was trained here, with its steps.
+        run: a run that was trained here, with its steps, or its open recording.
         at: the step: `EPISODE:T` or `step:N` of training, or `eval:N:TRIAL:T`.
         actions: numbers or names of joint actions, such as `north + east`, or `AGENT=VALUE` each: those in
             which these agents act so; all if there are none. Of more than 256, those of the highest exact
@@ -72,13 +73,8 @@ def what_if(run: Run, *, at: StepLike, actions: Sequence[str | int] = ()) -> Wha
         RecordingError: there is no such episode or step, its steps were not recorded, or it is damaged.
         RunnerError: the run was recorded from a loop.
     """
-    with open_recording(run.recording) as recording:
-        return what_if_in(recording, at, actions)
-
-
-def what_if_in(recording: Recording, at: StepLike, actions: Sequence[str | int] = ()) -> WhatIf:
-    """Return where actions lead, as `what_if` does, from an open recording."""
-    return _Branches(recording, at).compare(_chosen(recording.mdp, list(map(str, actions))))
+    with opened(run) as recording:
+        return _Branches(recording, at).compare(_chosen(recording.mdp, list(map(str, actions))))
 
 
 def _chosen(mdp: Mdp, actions: list[str]) -> Iterable[int]:

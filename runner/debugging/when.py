@@ -20,11 +20,11 @@ import numpy as np
 from runner.analysis.contents import require_steps
 from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, StepLike, training_step
 from runner.analysis.sections import Grid, Section, html
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
 from runner.debugging.quantities import JobColumns, check_lost
 from runner.errors import RunnerError
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Recording
 from runner.runs.run import Run
 from runner.util.expressions import CONDITION
 from runner.util.humanize import UNKNOWN, counted
@@ -127,75 +127,63 @@ class When:
 
 
 def when(
-    run: Run,
+    run: Run | Recording,
     expression: str,
     *,
     every: bool = False,
     first: StepLike | None = None,
     last: StepLike | None = None,
     report: Report = lambda _: None,
+    limit: int = MAX_INTERVALS,
 ) -> When:
     """Return the first training step after which an expression holds, or every interval in which it does.
 
     Args:
-        run: a run that was trained here, with its steps.
+        run: a run that was trained here, with its steps, or its open recording.
         expression: such as `q[300, "north + east"] > 5 and visits[300] >= 100`.
         every: search all intervals.
         first: the first training step to evaluate it after: its number, `EPISODE:T` or `step:N`; 0 by
             default.
         last: the last one; by default that of the run.
         report: called with the number of steps searched so far.
+        limit: the most intervals to list.
 
     Raises:
         RunnerError: the expression is invalid, with a mark at its place; or the run is a loop.
         RecordingError: there is no such step, steps are not recorded, or the recording is damaged.
     """
-    with open_recording(at_hand(run).recording) as recording:
-        return when_in(recording, expression, every, first, last, report)
-
-
-def when_in(
-    recording: Recording,
-    expression: str,
-    every: bool = False,
-    first: StepLike | None = None,
-    last: StepLike | None = None,
-    report: Report = lambda _: None,
-    limit: int = MAX_INTERVALS,
-) -> When:
-    """Return when an expression held in the training of an open recording; see `when`.
-
-    It lists at most `limit` intervals.
-    """
-    recording.require_job("`when`", "A loop has no Q-tables; `dualtaxi plot` shows what it logged.")
-    parser = JobParser(expression, recording)
-    parsed = parser.parse()
-    require_steps(recording, "search")
-    start = 0 if first is None else _step_number(recording, first)
-    stop = recording.train.steps.count() if last is None else _step_number(recording, last) + 1
-    if start >= stop:
-        raise RunnerError(f"found first step {start:,} and last step {stop - 1:,}, expected them in order.")
-    columns = JobColumns(recording, list(parser.quantities), max(start - 1, 0))
-    for block in recording.train.steps.blocks(start - 1, start) if start else ():
-        deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
-    terms = parsed.terms
-    with np.errstate(all="ignore"):
-        held_before = bool(_values(parsed.condition, columns.last)[0])
-        knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
-        search = _search(recording, parsed, columns, every, limit, start, stop, report)
-    starts, ends = search.moments[::2], search.moments[1::2]
-    return When(
-        run_id=recording.run_id,
-        expression=parsed.text,
-        every=every,
-        searched=(start, search.last.step),
-        held_before=held_before if knows else None,
-        intervals=tuple(map(Interval, starts, [*ends, None])),
-        count=search.count,
-        steps=search.steps if every else None,
-        last=search.last,
-        states=parser.states,
-    )
+    with opened(run) as recording:
+        recording.require_job("`when`", "A loop has no Q-tables; `dualtaxi plot` shows what it logged.")
+        parser = JobParser(expression, recording)
+        parsed = parser.parse()
+        require_steps(recording, "search")
+        start = 0 if first is None else _step_number(recording, first)
+        stop = recording.train.steps.count() if last is None else _step_number(recording, last) + 1
+        if start >= stop:
+            raise RunnerError(
+                f"found first step {start:,} and last step {stop - 1:,}, expected them in order."
+            )
+        columns = JobColumns(recording, list(parser.quantities), max(start - 1, 0))
+        for block in recording.train.steps.blocks(start - 1, start) if start else ():
+            deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
+        terms = parsed.terms
+        with np.errstate(all="ignore"):
+            held_before = bool(_values(parsed.condition, columns.last)[0])
+            knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
+            search = _search(recording, parsed, columns, every, limit, start, stop, report)
+        starts, ends = search.moments[::2], search.moments[1::2]
+        return When(
+            run_id=recording.run_id,
+            expression=parsed.text,
+            every=every,
+            searched=(start, search.last.step),
+            held_before=held_before if knows else None,
+            intervals=tuple(map(Interval, starts, [*ends, None])),
+            count=search.count,
+            steps=search.steps if every else None,
+            last=search.last,
+            states=parser.states,
+        )
 
 
 @dataclass(frozen=True)

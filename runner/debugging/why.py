@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.episodes import EpisodeRef, StepLike
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.debugging.q_value import EpisodesPart, RewardPart, StepPart, ValuePart, Why
 from runner.debugging.weights import Cell, Weights, weights_of
 from runner.drawing import svg
@@ -36,7 +36,7 @@ from runner.environments.naming import (
 from runner.errors import ConfigError, RunnerError, nearest
 from runner.learning.algorithms import ALGORITHMS
 from runner.recording import schema
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Recording
 from runner.replay.steps import last_step
 from runner.runs.run import Run
 from runner.util.arrays import Floats, Records
@@ -58,7 +58,7 @@ _OF_STEP: Final = ["state", "action", "next_state", "episode", "t", "explored"]
 
 
 def why(
-    run: Run,
+    run: Run | Recording,
     *,
     state: int | str | None = None,
     action: int | str | None = None,
@@ -70,7 +70,7 @@ def why(
     """Return where a Q-value of a run comes from.
 
     Args:
-        run: a run that was trained here, with its steps.
+        run: a run that was trained here, with its steps, or its open recording.
         state: the number of the state, or its name; by default that of the step `at`.
         action: the learner's own action, or the joint one of a joint table: its number, or its name such as
             `north + east`; by default the one taken at the step `at`.
@@ -86,77 +86,73 @@ def why(
         RunnerError: the run was recorded from a loop, or its algorithm has no Q-values.
         StorageError: the folder of temporary files cannot be written.
     """
-    with open_recording(at_hand(run).recording) as recording:
-        state, action = (None if given is None else str(given) for given in (state, action))
-        return why_in(recording, state, action, agent, at, limit, report)
+    with opened(run) as recording:
+        recording.require_job(
+            "`why`",
+            "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
+        )
+        step = None if at is None else EpisodeRef.parse(at).resolved(recording)
+        if refusal := why_refusal(recording):
+            raise RunnerError(refusal)
+        if not 0 <= limit <= MAX_LIMIT:
+            raise ConfigError(f"limit: found {limit}, expected 0 to {MAX_LIMIT:,}.")
+        mdp = recording.mdp
+        is_joint = len(recording.agents) < len(mdp.agents)
+        cell = _cell(recording, state, action, _learner(recording, agent), step)
+        names = actions_in_words(mdp) if is_joint else numbered_actions(mdp)[cell.learner]
+        stop = last_step(recording) if step is None else _steps_before(recording, step)
+        weights = weights_of(recording, cell, stop, limit or MAX_LIMIT, report)
+        rewarded = ValuePart(*(float(total) for total in weights.episodes.sum(axis=0)))
+        initial = ValuePart(
+            float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum())
+        )
+        moves = tuple(_moves(mdp, weights.outcomes, "" if is_joint else mdp.agents[cell.learner]))
+        return Why(
+            run_id=recording.run_id,
+            agent=recording.agents[cell.learner],
+            state=cell.state,
+            state_in_words=str(states_in_words(mdp)[cell.state]),
+            action=cell.action,
+            action_in_words=str(names[cell.action]),
+            step=stop,
+            value=weights.value,
+            total=rewarded.contribution + initial.contribution,
+            counted=weights.counted,
+            rewarded=rewarded,
+            initial=initial,
+            rewards=tuple(_by_reward(mdp, weights, cell.learner, len(recording.agents))),
+            episodes=tuple(
+                EpisodesPart(
+                    weight,
+                    contribution,
+                    k * weights.stretch,
+                    min((k + 1) * weights.stretch, weights.last_episode + 1),
+                )
+                for k, (weight, contribution) in enumerate(weights.episodes.tolist())
+            ),
+            steps=tuple(_steps(recording, weights.largest, cell.learner)),
+            moves=moves,
+            note=POLICY_NOTE if ALGORITHMS[recording.config["algorithm"]].draws_actions else "",
+            picture=_picture(mdp, cell.state, moves),
+        )
 
 
-def why_in(
+def _cell(
     recording: Recording,
-    state: str | None = None,
-    action: str | None = None,
-    agent: str | None = None,
-    at: StepLike | None = None,
-    limit: int = LIMIT,
-    report: Report = lambda _: None,
-) -> Why:
-    """Return where a Q-value comes from, as `why` does, from an open recording."""
-    recording.require_job(
-        "`why`",
-        "`dualtaxi values` shows what a loop's checkpoint expects along a recorded episode.",
-    )
-    step = None if at is None else EpisodeRef.parse(at).resolved(recording)
-    if refusal := why_refusal(recording):
-        raise RunnerError(refusal)
-    if not 0 <= limit <= MAX_LIMIT:
-        raise ConfigError(f"limit: found {limit}, expected 0 to {MAX_LIMIT:,}.")
-    mdp = recording.mdp
-    learner = _learner(recording, agent)
-    is_joint = len(recording.agents) < len(mdp.agents)
-    names = actions_in_words(mdp) if is_joint else numbered_actions(mdp)[learner]
+    state: int | str | None,
+    action: int | str | None,
+    learner: int,
+    at: EpisodeRef | None,
+) -> Cell:
+    """Return the place of the value of a state and an action, by default those of a step."""
+    mdp, is_joint = recording.mdp, len(recording.agents) < len(recording.mdp.agents)
     if state is None or action is None:
-        taken = _step_at(recording, step)
-        state = str(taken["state"]) if state is None else state
+        taken = _step_at(recording, at)
         own = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]
+        state = str(taken["state"]) if state is None else state
         action = str(own) if action is None else action
-    cell = Cell(
-        learner,
-        state_of(mdp, state),
-        joint_action(mdp, action) if is_joint else own_action(mdp, learner, action),
-    )
-    stop = last_step(recording) if step is None else _steps_before(recording, step)
-    weights = weights_of(recording, cell, stop, limit or MAX_LIMIT, report)
-    rewarded = ValuePart(*(float(total) for total in weights.episodes.sum(axis=0)))
-    initial = ValuePart(float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum()))
-    moves = tuple(_moves(mdp, weights.outcomes, "" if is_joint else mdp.agents[learner]))
-    return Why(
-        run_id=recording.run_id,
-        agent=recording.agents[learner],
-        state=cell.state,
-        state_in_words=str(states_in_words(mdp)[cell.state]),
-        action=cell.action,
-        action_in_words=str(names[cell.action]),
-        step=stop,
-        value=weights.value,
-        total=rewarded.contribution + initial.contribution,
-        counted=weights.counted,
-        rewarded=rewarded,
-        initial=initial,
-        rewards=tuple(_by_reward(mdp, weights, cell.learner, len(recording.agents))),
-        episodes=tuple(
-            EpisodesPart(
-                weight,
-                contribution,
-                k * weights.stretch,
-                min((k + 1) * weights.stretch, weights.last_episode + 1),
-            )
-            for k, (weight, contribution) in enumerate(weights.episodes.tolist())
-        ),
-        steps=tuple(_steps(recording, weights.largest, learner)),
-        moves=moves,
-        note=POLICY_NOTE if ALGORITHMS[recording.config["algorithm"]].draws_actions else "",
-        picture=_picture(mdp, cell.state, moves),
-    )
+    number = joint_action(mdp, str(action)) if is_joint else own_action(mdp, learner, str(action))
+    return Cell(learner, state_of(mdp, str(state)), number)
 
 
 def why_refusal(recording: Recording) -> str:

@@ -303,19 +303,14 @@ def new_run(
     """
     check_folder_name(recordings)
     with storage_errors(recordings, f"choose another folder by --recordings or {RECORDINGS_VARIABLE}"):
-        run_id = run_id or (next(ids) if ids else _random_id())
-        is_made = False
+        recordings.mkdir(parents=True, exist_ok=True)
         while True:
+            run_id = run_id or (next(ids) if ids else _random_id())
             try:
                 (folder := recordings / run_id).mkdir()
                 break
-            except FileNotFoundError:
-                if is_made:  # the id is the path of a folder inside of another
-                    raise
-                recordings.mkdir(parents=True, exist_ok=True)
-                is_made = True
             except FileExistsError:
-                run_id = next(ids) if ids else _random_id()
+                run_id = None
         facts = {
             "run_id": run_id,
             "name": name,

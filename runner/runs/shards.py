@@ -20,7 +20,7 @@ from runner.runs.listing import run_at, run_entries, run_in
 from runner.runs.resolve import find_run
 from runner.runs.run import SHARDS_FOLDER, Run, new_run
 from runner.util.files import storage_errors
-from runner.util.humanize import size
+from runner.util.humanize import counted, size
 from runner.util.values import JsonView
 
 RUN_VARIABLE: Final = "DUALTAXI_RUN"
@@ -139,7 +139,7 @@ def shards_in_words(run: Run) -> str:
         return ""
     parts = [shard.recording for shard in shards if shard.recording.exists()]
     recorded = size(sum(part.stat().st_size for part in parts))
-    return f"{len(shards)} {'shard' if len(shards) == 1 else 'shards'} ({recorded})"
+    return f"{counted(len(shards), 'shard')} ({recorded})"
 
 
 @contextlib.contextmanager

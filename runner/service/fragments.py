@@ -29,7 +29,7 @@ from runner.analysis.histograms import histograms
 from runner.analysis.sections import Grid
 from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
-from runner.debugging.what_if import branch_playback, what_if_in
+from runner.debugging.what_if import branch_playback, what_if
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
 from runner.errors import ConfigError, RecordingError, RunnerError, shortened
@@ -129,7 +129,7 @@ def what_if_page(run: Run, at: EpisodeRef, action: str | None, start: int, steps
         return f"/runs/{run.run_id}/what-if/{at}/{number}"
 
     with open_recording(run.recording) as recording:
-        branches = what_if_in(recording, at)
+        branches = what_if(recording, at=at)
         number = next(row.action for row in branches.actions if row.is_recorded)
         if action is not None:
             number = joint_action(recording.mdp, action)

@@ -24,12 +24,6 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def require_ray() -> ModuleType:
-    """Return the module `ray`."""
-    ray: ModuleType = require("ray", extra="ray", purpose="a sweep on Ray")
-    return ray
-
-
 def connect(address: str | None, processors: int | None = None) -> ModuleType:
     """Return the module `ray`, connected to a cluster.
 
@@ -39,7 +33,7 @@ def connect(address: str | None, processors: int | None = None) -> ModuleType:
     Raises:
         RunnerError: the cluster cannot be reached.
     """
-    ray = require_ray()
+    ray: ModuleType = require("ray", extra="ray", purpose="a sweep on Ray")
     options = {"log_to_driver": False, "logging_level": "ERROR"}
     if address is None:
         options |= {"num_cpus": processors or os.cpu_count(), "include_dashboard": False}
@@ -76,11 +70,6 @@ class RayActor:
         return self._stopping.is_set()
 
 
-def start_actor(ray: ModuleType) -> Any:
-    """Return the handle of a new `RayActor`; its function and two other calls run at the same time."""
-    return ray.remote(RayActor).options(num_cpus=1, max_concurrency=3, max_restarts=0).remote()
-
-
 def _run(actor: RayActor, task: Work) -> object:
     return task.run(actor.stop)
 
@@ -107,7 +96,10 @@ class RayWorkers(Generic[TaskT, R]):
 
     def submit(self, task: TaskT) -> None:
         """Start a task on an idle worker."""
-        actor = self._idle.pop() if self._idle else start_actor(self._ray)
+        if not self._idle:  # a task and two other calls run at the same time
+            options = {"num_cpus": 1, "max_concurrency": 3, "max_restarts": 0}
+            self._idle.append(self._ray.remote(RayActor).options(**options).remote())
+        actor = self._idle.pop()
         remote = task.placed(threads=False, on_own_disk=self._on_own_disk)
         self._busy[actor.run.remote(_run, remote)] = actor, task
 

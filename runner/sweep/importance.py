@@ -53,9 +53,8 @@ def effects_of(
     Empty for too few trials, or if no value differs.
     The parameters are the values tried, by path; the values are the objective of each trial, finite.
     """
-    purpose = "the importance of a sweep's parameters"
     optuna = require_optuna()
-    require("sklearn.ensemble", extra="sweep", purpose=purpose)
+    require("sklearn.ensemble", extra="sweep", purpose="the importance of a sweep's parameters")
     if len(trials) < MIN_TRIALS:
         return []
     names = list(parameters)

@@ -12,7 +12,7 @@ from typing import Final
 from pydantic import ValidationError
 
 from runner.config import ConfigError, ExperimentConfig, load
-from runner.config.document import Document, Problem, read_yaml, write_yaml
+from runner.config.document import Document, Place, Problem, read_yaml, write_yaml
 from runner.config.loading import experiment_in, put, read_text
 from runner.config.model import SECTION_OF
 from runner.config.problems import found, problems_in, refuse
@@ -123,16 +123,16 @@ def _base(
         within = read_yaml(read_text(path), str(path))
     else:
         within = _part(document, "base")
-    at = {key: _part(document, key).places for key in ("seeds", "recording")}
-    seeds = file.model_dump(mode="json")["seeds"]
-    values: list[tuple[tuple[str, ...], Document]] = [
-        (("name",), Document(name)),
-        (("seeds",), Document(seeds, at["seeds"])),
-    ]
-    for key, value in file.recording.items():
-        places = {where[1:]: place for where, place in at["recording"].items() if where[:1] == (key,)}
-        values.append((("recording", key), Document(value, places)))
-    put(within, values)
+    seeds, places = file.model_dump(mode="json")["seeds"], _places(document.places, "recording")
+    recorded = {key: Document(value, _places(places, key)) for key, value in file.recording.items()}
+    put(
+        within,
+        [
+            (("name",), Document(name)),
+            (("seeds",), Document(seeds, _places(document.places, "seeds"))),
+            *((("recording", key), value) for key, value in recorded.items()),
+        ],
+    )
     base = experiment_in(within, (), name, named_by=repr(name))
     return base, _start_of_trials(base, given=within.value, parameters=file.parameters)
 
@@ -155,8 +155,11 @@ def _start_of_trials(
 
 def _part(document: Document, key: str) -> Document:
     """Return the part of a document under a key, with its places."""
-    places = {where[1:]: place for where, place in document.places.items() if where[:1] == (key,)}
-    return Document(document.value.get(key), places)
+    return Document(document.value.get(key), _places(document.places, key))
+
+
+def _places(places: Mapping[tuple[str, ...], Place], key: str) -> dict[tuple[str, ...], Place]:
+    return {where[1:]: place for where, place in places.items() if where[:1] == (key,)}
 
 
 def _with_checked_parameters(sweep: Sweep, document: Document, require: Require = lambda *_: None) -> Sweep:

@@ -20,7 +20,7 @@ from runner.analysis.sections import Grid, Section
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
 from runner.sweep.model import Range, Sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded_trials
-from runner.util.humanize import UNKNOWN
+from runner.util.humanize import UNKNOWN, counted
 from runner.util.values import Json
 
 DEFAULT_SHOWN: Final = 20
@@ -238,10 +238,9 @@ def _heading(results: Results, shown: int) -> list[str]:
     states = [trial.state for trial in results.suggested]
     counts = [f"{states.count(state)} {state}" for state in get_args(State) if state in states]
     duplicates = sum(len(entry.duplicates) for entry in ranking)
-    seeds = "1 seed" if len(sweep.seeds) == 1 else f"{len(sweep.seeds)} seeds"
     return [
         f"{sweep.file.strategy}, {results.trials:,} trials ({', '.join(counts) or 'none started'}), "
-        f"{seeds} each. Objective: {sweep.objective.description}.",
+        f"{counted(len(sweep.seeds), 'seed')} each. Objective: {sweep.objective.description}.",
         *([f"{duplicates} trials repeated earlier values, and are listed with them."] if duplicates else []),
         *([f"The best {shown} of {len(ranking):,}; --all shows all."] if shown < len(ranking) else []),
     ]

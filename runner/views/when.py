@@ -74,9 +74,9 @@ def when(
       dualtaxi when k3v9m2xq 'greedy_success[300] and visits[300] < 100' --from 2000:0
       dualtaxi when rivals 'max(q.taxi_1[300]) > max(q.taxi_2[300]) > 0' --to step:50000
     """
-    from runner.debugging.when import when_in
+    from runner.debugging.when import when
 
-    return when_in(recording, expression, every, first, last, report, **limits)
+    return when(recording, expression, every=every, first=first, last=last, report=report, **limits)
 
 
 VIEW: Final = View(

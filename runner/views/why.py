@@ -70,9 +70,9 @@ def why(
       dualtaxi why rivals --state 300 --action pickup --agent taxi_2 --at 2000:0
       dualtaxi why k3v9m2xq --at eval:3000:7:5 --limit 30
     """
-    from runner.debugging.why import why_in
+    from runner.debugging.why import why
 
-    return why_in(recording, state, action, agent, at, limit, report)
+    return why(recording, state=state, action=action, agent=agent, at=at, limit=limit, report=report)
 
 
 def _refusal(recording: Recording) -> str:

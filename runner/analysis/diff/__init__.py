@@ -130,8 +130,7 @@ def diff(
     The first crossing of each target, metric to level, is reported. `first` compares only settings, and where
     and in what training first diverges, not the tables.
     """
-    digests = [recording.result.content_digest for recording in (a, b)]
-    are_jobs = _are_jobs(a, b)
+    digest, are_jobs = a.result.content_digest, _are_jobs(a, b)
     by_path: dict[str, list[Mapping[str, object]]] = {"config": [_settings(run) for run in (a, b)]}
     if not (first and are_jobs):
         by_path["provenance"] = [run.provenance for run in (a, b)]
@@ -140,8 +139,10 @@ def diff(
     difference = RunDiff(
         a=_identity(a),
         b=_identity(b),
-        same_content=digests[0] is not None and digests[0] == digests[1],
-        environment=environment_diff(a.mdp, b.mdp) if are_jobs else loop_environment_diff(a, b),
+        same_content=digest is not None and digest == b.result.content_digest,
+        environment=environment_diff(a.mdp, b.mdp)
+        if are_jobs
+        else EnvironmentDiff(changes_in(*({"spaces": run.spaces, **run.environment} for run in (a, b)))),
         code=[] if first and are_jobs else code_changes(a, b),
         config=changes["config"],
         provenance=changes.get("provenance", []),

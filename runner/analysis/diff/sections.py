@@ -77,8 +77,9 @@ def summary(difference: RunDiff) -> str:
     ]
     if settings:
         named = [f"{c.path} ({setting(c.a)} in A, {setting(c.b)} in B)" for c in settings]
-        more = len(named) - _MAX_SETTINGS
-        listed = "; ".join([*named[:_MAX_SETTINGS], *([f"and {more} more"] if more > 0 else [])])
+        if len(named) > _MAX_SETTINGS:
+            named[_MAX_SETTINGS:] = [f"and {len(named) - _MAX_SETTINGS} more"]
+        listed = "; ".join(named)
         sentences.append(f"Of the settings, {listed} {'differ' if len(settings) > 1 else 'differs'}.")
     elif not is_branch:
         other = "other " if difference.ignored else ""

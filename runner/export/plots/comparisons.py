@@ -54,12 +54,6 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
     return chart.svg()
 
 
-def profile_svg(metric: MetricResult, labels: list[str]) -> str:
-    """Return the share of each group's runs that are at least as good as a level, over the levels."""
-    title, lower = f"{metric.title}: performance profile", metric.higher_is_better is False
-    return profile_chart("", title, metric.unit, metric.thresholds, metric.groups, labels, lower).svg()
-
-
 def profile_chart(
     heading: str,
     title: str,

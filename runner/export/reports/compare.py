@@ -13,11 +13,11 @@ from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
 from runner.analysis.sections import Grid, Section
-from runner.export.plots.comparisons import intervals_svg, letter, profile_svg
+from runner.export.plots.comparisons import intervals_svg, letter, profile_chart
 from runner.export.plots.curves import plots_of
 from runner.export.plots.tasks import task_charts
 from runner.export.reports.rendering import Figure, LegendEntry, render
-from runner.util.humanize import UNKNOWN
+from runner.util.humanize import UNKNOWN, counted
 
 
 class ComparedMetric(NamedTuple):
@@ -49,7 +49,7 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
         lead=summary(comparison),
         notes=comparison.notes,
         legend=[
-            LegendEntry(letter(i), f"{group.label}: {len(group.runs)} run{'s'[: len(group.runs) - 1]}")
+            LegendEntry(letter(i), f"{group.label}: {counted(len(group.runs), 'run')}")
             for i, group in enumerate(groups)
         ],
         metrics=[_metric(metric, labels) for metric in comparison.metrics],
@@ -65,7 +65,11 @@ def _metric(metric: MetricResult, labels: list[str]) -> ComparedMetric:
     section = metric_section(metric, profile=False)
     figures = [Figure(intervals_svg(metric, labels), "Values")] if metric.groups else []
     if metric.groups and len(metric.thresholds) > 1:
-        figures.append(Figure(profile_svg(metric, labels), "Performance profile"))
+        title, is_lower_better = f"{metric.title}: performance profile", metric.higher_is_better is False
+        chart = profile_chart(
+            "", title, metric.unit, metric.thresholds, metric.groups, labels, is_lower_better
+        )
+        figures.append(Figure(chart.svg(), "Performance profile"))
     return ComparedMetric("metric-" + re.sub(r"\W+", "-", metric.name), section, figures)
 
 

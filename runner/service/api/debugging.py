@@ -10,7 +10,7 @@ from pydantic import BaseModel
 
 from runner.analysis.episodes import EXPECTED
 from runner.debugging.action_outcomes import ActionOutcome, Outcome
-from runner.debugging.what_if import what_if_in
+from runner.debugging.what_if import what_if as outcomes_of
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, ReplayPart, Start, Steps
 from runner.service.dependencies import ComputationOf, RecordedRun
@@ -61,7 +61,7 @@ async def what_if(
     return await compute.json(
         computed.answer,
         run.recording,
-        what_if_in,
+        outcomes_of,
         (("at", at), ("actions", tuple(action or ()))),
     )
 

@@ -13,7 +13,7 @@ import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluations_of
 from runner.cli import cli
-from runner.debugging.what_if import branched, what_if_in
+from runner.debugging.what_if import branched, what_if
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.recording.reader import open_recording
 from runner.replay.tables import named_tables_at
@@ -82,7 +82,7 @@ def test_each_action_leads_where_its_own_episode_says(run):
         number, place = list(trials(recording))[-1]
         steps = recording.eval.episode_steps(number)
         at = EpisodeRef(place.episode, len(steps) // 2, place.after)
-        found = what_if_in(recording, at)
+        found = what_if(recording, at=at)
         assert sorted(row.action for row in found.actions) == list(range(recording.mdp.joint_actions))
         before = steps["rewards"][: at.t].sum(axis=0)
         for row in found.actions:
@@ -268,7 +268,7 @@ def test_a_damaged_step_is_refused(taxis, tmp_path):
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(data)
     with open_recording(damaged) as recording, pytest.raises(RecordingError):
-        list(map(what_if_in, [recording] * 60, map(EpisodeRef, range(60))))
+        [what_if(recording, at=EpisodeRef(k)) for k in range(60)]
 
 
 def test_the_command_prints_a_table_and_json(taxis):

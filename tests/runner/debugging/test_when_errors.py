@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.debugging.when import when_in
+from runner.debugging.when import when
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -258,7 +258,7 @@ def test_steps_that_the_environment_cannot_have_are_refused(cooperative, tmp_pat
 
     path = altered(cooperative.recording, tmp_path / "bad.mcap", schema.TRAIN_STEP, change)
     with open_recording(path) as recording, pytest.raises(RecordingError, match="found state 1000000"):
-        when_in(recording, "max(q[0]) > 1e6")
+        when(recording, "max(q[0]) > 1e6")
 
 
 # --- the command --------------------------------------------------------------------------------------------
