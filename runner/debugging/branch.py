@@ -92,10 +92,10 @@ class EpisodeBranch:
     """How an episode of a loop is branched; the arguments of `branch`."""
 
     at: EpisodeRef
-    action: Value = None
-    policy: str = "recorded"
-    seed: int = 0
-    name: str | None = None
+    action: Value
+    policy: str
+    seed: int
+    name: str | None
     max_steps: int = MAX_STEPS
     trust: bool = False
     run_id: str | None = None

@@ -59,10 +59,10 @@ class Quantity:
     """What is read after each step."""
 
     name: str
-    learner: int = 0
+    learner: int
     """`JOINT` for joint actions."""
-    state: int = -1
-    action: int = -1
+    state: int
+    action: int
     """-1 for all."""
 
 

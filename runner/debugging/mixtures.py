@@ -156,7 +156,7 @@ class Mixtures:
         seeds: Sequence[int],
         recordings: Path,
         folder: Path,
-        report: Callable[[int, int], None] = lambda *_: None,
+        report: Callable[[int, int], None],
     ) -> None:
         self.mixing, self.seeds, self._recordings = mixing, tuple(seeds), recordings
         self._path, self._report = folder / VALUES, report

@@ -98,7 +98,7 @@ def branched(recording: Recording, at: StepLike, action: str | int) -> Branched:
 
 
 def branch_playback(
-    recording: Recording, at: StepLike, action: str | int, limit: int, first: int = 0
+    recording: Recording, at: StepLike, action: str | int, limit: int, first: int
 ) -> Playback:
     """Return what a page plays of the episode to which a joint action leads: at most `limit` steps.
 

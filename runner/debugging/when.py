@@ -170,29 +170,21 @@ def when(
         with np.errstate(all="ignore"):
             held_before = bool(_values(parsed.condition, columns.last)[0])
             knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
-            search = _search(recording, parsed, columns, every, limit, start, stop, report)
-        starts, ends = search.moments[::2], search.moments[1::2]
+            moments, count, steps, end = _search(
+                recording, parsed, columns, every, limit, start, stop, report
+            )
         return When(
             run_id=recording.run_id,
             expression=parsed.text,
             every=every,
-            searched=(start, search.last.step),
+            searched=(start, end.step),
             held_before=held_before if knows else None,
-            intervals=tuple(map(Interval, starts, [*ends, None])),
-            count=search.count,
-            steps=search.steps if every else None,
-            last=search.last,
+            intervals=tuple(map(Interval, moments[::2], [*moments[1::2], None])),
+            count=count,
+            steps=steps if every else None,
+            last=end,
             states=parser.states,
         )
-
-
-@dataclass(frozen=True)
-class _Found:
-    moments: list[WhenMoment]
-    """The steps at which the expression begins and ceases to hold, in turn."""
-    count: int
-    steps: int
-    last: WhenMoment
 
 
 def _search(
@@ -204,8 +196,13 @@ def _search(
     start: int,
     stop: int,
     report: Report,
-) -> _Found:
-    """Evaluate an expression after the steps from `start` to before `stop`; unless `every`, to the first."""
+) -> tuple[list[WhenMoment], int, int, WhenMoment]:
+    """Evaluate an expression after the steps from `start` to before `stop`; unless `every`, to the first.
+
+    Returns:
+        The steps at which it begins and ceases to hold, in turn; the number of intervals; the number of steps
+        after which it holds; and the last step.
+    """
     moments: list[WhenMoment] = []
     count = 0
     steps = 0
@@ -230,11 +227,11 @@ def _search(
                 parts = [(term, _values(term, values)) for term in expression.terms]
                 moments += [_moment(block[places[k]], parts, k, k + 1) for k in listed]
             if not every:
-                return _Found(moments, 1, 0, moments[0])
+                return moments, 1, 0, moments[0]
         report(expected - start)
     check_lost(recording, expected, stop)
     parts = [(term, _values(term, columns.last)) for term in expression.terms]
-    return _Found(moments, count, steps + stop * holds, _moment(block[-1], parts, 0, 0))
+    return moments, count, steps + stop * holds, _moment(block[-1], parts, 0, 0)
 
 
 def _values(term: Series, columns: Columns) -> Array:

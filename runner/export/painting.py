@@ -87,9 +87,7 @@ def _like(pixels: Pixels, before: Pixels | None) -> Pixels:
     return np.asarray(Image.fromarray(pixels).resize(before.shape[1::-1]))
 
 
-def paint_redrawn(
-    recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0
-) -> Painted:
+def paint_redrawn(recording: Recording, phase: str, episode: int, trust: bool, first: int) -> Painted:
     """Draw each state by the environment, from the one after `first` steps on; see `redrawn`."""
     shown: Pixels | None = None
     with closing(redrawn(recording, phase, [episode], trust, first)) as pictures:

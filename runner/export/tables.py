@@ -139,23 +139,21 @@ def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
     """Yield a row for each value of a metric; its seconds of wall time are empty without a clock."""
     clock = wall_clock(recording)
     rows = (
-        (
-            recording.run_id,
-            moment.phase,
-            moment.position,
-            moment.step,
-            moment.episode,
-            None if clock is None else clock(moment.position),
-            name,
-            value,
-        )
+        {
+            "run_id": recording.run_id,
+            "phase": moment.phase,
+            "position": moment.position,
+            "step": moment.step,
+            "episode": moment.episode,
+            "seconds": None if clock is None else clock(moment.position),
+            "metric": name,
+            "value": value,
+        }
         for moment in measures(recording)
         for name, value in moment.values.items()
     )
     while batch := list(islice(rows, _ROWS)):
-        columns = zip(*batch, strict=True)
-        arrays = [pa.array(column, field.type) for column, field in zip(columns, _METRICS, strict=True)]
-        yield pa.RecordBatch.from_arrays(arrays, schema=_METRICS)
+        yield pa.RecordBatch.from_pylist(batch, _METRICS)
 
 
 def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | None:

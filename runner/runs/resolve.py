@@ -79,7 +79,7 @@ def run_of_id(run_id: str, recordings: Path) -> Run | None:
     return next((run for run in runs if run and run.run_id == run_id), None)
 
 
-def find_runs(name: str, recordings: Path, report: Report = lambda _: None) -> list[Run]:
+def find_runs(name: str, recordings: Path, report: Report) -> list[Run]:
     """Return all runs of a name or a filter, the oldest first; else the run that `find_run` returns.
 
     Raises:

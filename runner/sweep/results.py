@@ -179,7 +179,7 @@ def sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> list[Sectio
     return [*ranking_sections(results, shown), *effects_sections(results)]
 
 
-def ranking_sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> list[Section]:
+def ranking_sections(results: Results, shown: int | None) -> list[Section]:
     """Return the ranking and the trials without a value as sections; arguments as for `sections`."""
     ranked = results.ranking[:shown]
     grid = _ranking_grid(results.sweep, ranked)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -117,7 +117,7 @@ class Comparison:
     groups: dict[str, list[str]]
     """Label to the ids of its runs."""
     metrics: list[MetricResult]
-    notes: list[str] = field(default_factory=list)
+    notes: list[str]
 
 
 def compare(

@@ -73,7 +73,7 @@ class TransitionChange:
 class EnvironmentDiff:
     """How two environments differ."""
 
-    description: list[Change] = field(default_factory=list)
+    description: list[Change]
     transitions: int = 0
     """How many (state, action) pairs have other outcomes."""
     of: int = 0
@@ -88,7 +88,7 @@ class EnvironmentDiff:
         return not (self.description or self.transitions or self.other_starts)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunDiff:
     """All differences of two runs, `a` and `b`."""
 
@@ -99,7 +99,7 @@ class RunDiff:
     config: list[Change]
     provenance: list[Change]
     environment: EnvironmentDiff
-    code: list[FileChange] = field(default_factory=list)
+    code: list[FileChange]
     """The files of the user's code that differ."""
     divergence: Divergence | None = None
     """The first step of training that differs."""
@@ -112,9 +112,9 @@ class RunDiff:
     evaluation_cause: Cause | None = None
     tables: list[TableDiff] = field(default_factory=list)
     metrics: list[MetricDiff] = field(default_factory=list)
-    costs: list[Change] = field(default_factory=list)
+    costs: list[Change]
     """Steps, seconds and size."""
-    alike: dict[str, dict[str, object]] = field(default_factory=dict)
+    alike: dict[str, dict[str, object]]
     """What is the same in both, by path, of config, provenance and costs."""
     ignored: list[str] = field(default_factory=list)
     """Paths that differ but were excluded by the options."""
@@ -394,12 +394,6 @@ def environment_diff(a: Mdp, b: Mdp) -> EnvironmentDiff:
         examples=_examples(a, b, pairs[:: max(1, len(pairs) // _MAX_EXAMPLES)][:_MAX_EXAMPLES]),
         other_starts=not np.array_equal(a.start, b.start),
     )
-
-
-def loop_environment_diff(a: Recording, b: Recording) -> EnvironmentDiff:
-    """Return how the descriptions of two environments and their spaces differ."""
-    described = [{"spaces": recording.spaces, **recording.environment} for recording in (a, b)]
-    return EnvironmentDiff(changes_in(*described))
 
 
 def _outcome(mdp: Mdp, k: int) -> list[Array]:

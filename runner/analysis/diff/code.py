@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from runner.recording.code import patch_parts, unified_diff
@@ -33,9 +33,9 @@ class FileChange:
     """Lines of B that A does not have."""
     removed: int
     """Lines of A that B does not have."""
-    lines: list[str] = field(default_factory=list)
+    lines: list[str]
     """A unified diff from A to B, without secrets; its first lines if it is long."""
-    left_out: int = 0
+    left_out: int
     """Lines of the diff that are not in `lines`."""
 
     @property

@@ -110,7 +110,7 @@ def first_difference(
         left, right = left[n:], right[n:]
 
 
-def differing_steps(a: Records, b: Records, fields: tuple[str, ...] = FIELDS) -> Flags:
+def differing_steps(a: Records, b: Records, fields: tuple[str, ...]) -> Flags:
     """Return which of two equally long blocks of records differ in any of the fields."""
     if a.dtype == b.dtype and not a.dtype.hasobject and "digest" not in (a.dtype.names or ()):
         left, right = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from runner.analysis.axes import first_crossing, mean_height
@@ -30,7 +30,7 @@ class MetricDiff:
     end_b: float
     area: float
     """Mean difference b - a: the area between the curves over the episodes both have, by their span."""
-    crossings: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)
+    crossings: dict[str, tuple[int | None, int | None]]
     """Target level, as text, to the episodes at which a and b first reach it."""
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -38,7 +38,7 @@ class Update:
     """The value after the update, in each run."""
     rewards_a: list[float]
     rewards_b: list[float]
-    reasons: list[str] = field(default_factory=list)
+    reasons: list[str]
     """Descriptions of the inputs of the update that differ."""
 
 

@@ -31,6 +31,7 @@ from runner.export.reports.loop_playback import loop_playback
 from runner.export.reports.player_data import (
     Playback,
     PlayerGrid,
+    Value,
     Words,
     frame_times,
     logged_near,
@@ -156,18 +157,18 @@ def _values(recording: Recording, steps: NDArray[np.void], at: EpisodeRef) -> QV
 
 def _highest(values: NDArray[np.float64], taken: list[int]) -> dict[str, object]:
     """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
-    rows: dict[str, int] = {}
+    rows: dict[tuple[tuple[int, Value], ...], int] = {}
     which: list[int] = []
-    packed: list[list[list[float | int | str | None]]] = []
     for row, action in zip(values, taken, strict=True):
         best = np.argsort(-row, kind="stable")[:MAX_VALUES].tolist()
         shown = best if action in best else [*best[:-1], action]
         if len(row) <= MAX_VALUES:
             shown = sorted(shown)
-        pairs = [[int(choice), short(float(row[choice]))] for choice in shown]
-        key = str(pairs)
-        if key not in rows:
-            rows[key] = len(packed)
-            packed.append(pairs)
-        which.append(rows[key])
-    return {"rows": packed, "row": which, "taken": [int(action) for action in taken], "of": values.shape[1]}
+        pairs = tuple((int(choice), short(float(row[choice]))) for choice in shown)
+        which.append(rows.setdefault(pairs, len(rows)))
+    return {
+        "rows": list(rows),
+        "row": which,
+        "taken": [int(action) for action in taken],
+        "of": values.shape[1],
+    }

@@ -105,9 +105,7 @@ class CatalogueIndex:
         select = f"SELECT {', '.join(columns)} FROM runs WHERE root = ? AND entry = ?"
         return [row for place in places for row in _as_rows(self._database.execute(select, place))], total
 
-    def page_by_name(
-        self, sort: str = "", *, limit: int, offset: int = 0
-    ) -> tuple[list[tuple[IndexRow, int]], int]:
+    def page_by_name(self, sort: str, *, limit: int, offset: int) -> tuple[list[tuple[IndexRow, int]], int]:
         """Return the first run of each name, the number of its runs, and how many names there are.
 
         Args:

@@ -70,7 +70,7 @@ class Removal:
     is_archived: bool
     root: Path
     contents: Contents
-    refusal: str = ""
+    refusal: str
     """Why it must not be removed; empty if it may."""
 
     @property
@@ -97,7 +97,7 @@ def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     return _removal(row, root, run.folder, _why_not_in(run, root) or _protected(run), foreign)
 
 
-def plan_row(row: IndexRow, foreign: bool = False) -> Removal:
+def plan_row(row: IndexRow, foreign: bool) -> Removal:
     """Return the removal of a run by its row in the index, which is quicker for very many runs."""
     folder = Path(row["root"], row["entry"])
     return _removal(row, folder.parent, folder, _linked(folder) or _unreadable(folder), foreign)
@@ -188,11 +188,11 @@ class Criteria:
     """Which runs to remove: those that meet all of these."""
 
     filter: Filter
-    older_than: float | None = None
+    older_than: float | None
     """Seconds since they began."""
-    keep_last: int | None = None
+    keep_last: int | None
     """The number of newest runs of each configuration's name to keep."""
-    statuses: tuple[str, ...] = ()
+    statuses: tuple[str, ...]
     """Their status; any if empty, but `archived` only if named."""
 
 
