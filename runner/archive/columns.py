@@ -22,7 +22,7 @@ from runner.recording.extras import ExtraLayout
 from runner.recording.fields import Field
 from runner.recording.layout import NUMBERS
 from runner.recording.schema import MessageType, Topic
-from runner.util.arrays import Array, Records
+from runner.util.arrays import Array, RecordDType, Records
 
 _INT32, _FLOAT, _FLAG = pa.int32(), pa.float64(), pa.bool_()
 _TYPES: Final[Mapping[int, pa.DataType]] = {
@@ -110,7 +110,7 @@ class Shape:
         """Return the space of a field's values; None for another field."""
         return self._varying.get(topic) if field == "varying" else self.spaces.get(field)
 
-    def _dtype(self, topic: Topic, message: MessageType) -> np.dtype[np.void]:
+    def _dtype(self, topic: Topic, message: MessageType) -> RecordDType:
         """Return the dtype of messages of varying size: time, bytes of the message record, and fields."""
 
         def held(field: Field) -> object:

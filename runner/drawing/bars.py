@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.drawing.raster import Pixels, font, shortened
+from runner.util.arrays import Floats
 from runner.util.humanize import UNKNOWN
 
 MAX_BARS: Final = 24
@@ -29,7 +29,7 @@ class BarRaster:
     Those after the first `MAX_BARS` are counted in a line, and not drawn.
     """
 
-    def __init__(self, names: Sequence[str], low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+    def __init__(self, names: Sequence[str], low: Floats, high: Floats) -> None:
         from PIL import Image, ImageDraw
 
         self._shown = min(len(names), MAX_BARS)
@@ -50,7 +50,7 @@ class BarRaster:
             text = f"and {len(names) - self._shown:,} more values"
             pen.text((_MARGIN, _middle(self._shown)), text, palette.GREY, font(_TEXT), anchor="lm")
 
-    def draw(self, values: NDArray[np.float64]) -> Pixels:
+    def draw(self, values: Floats) -> Pixels:
         """Return the picture of values, float64 [values]; one that is not finite has no bar."""
         from PIL import ImageDraw
 

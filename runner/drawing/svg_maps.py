@@ -10,12 +10,12 @@ from html import escape
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.drawing import palette
 from runner.drawing.palette import LEVELS, NO_VALUE, ink_on, ramp_colour
 from runner.drawing.svg import CELL, SvgDrawing, corner, picture
 from runner.environments.scene import SceneAction, SceneDescription
+from runner.util.arrays import Floats, Ints
 
 _FONT: Final = "font-family:'DejaVu Sans',sans-serif"
 STYLE: Final = (
@@ -30,7 +30,7 @@ _ANGLES: Final = {(-1, 0): 0, (0, 1): 90, (1, 0): 180, (0, -1): 270}
 """Degrees by which an arrow is turned, by (rows, columns) of a move."""
 
 
-def levels_of(values: NDArray[np.float64], low: float, high: float) -> NDArray[np.int64]:
+def levels_of(values: Floats, low: float, high: float) -> Ints:
     """Return the level of each value between `low` and `high`; -1 where it is nan."""
     span = high - low
     share = (values - low) / span if span > 0 else np.zeros_like(values)
@@ -39,8 +39,8 @@ def levels_of(values: NDArray[np.float64], low: float, high: float) -> NDArray[n
 
 def policy_map(
     scene: SceneDescription,
-    values: NDArray[np.float64],
-    greedy: NDArray[np.float64] | None,
+    values: Floats,
+    greedy: Floats | None,
     bounds: tuple[float, float],
     title: str,
 ) -> str:
@@ -72,9 +72,7 @@ def policy_map(
     return _map(scene, "".join(parts), title, "".join(labels))
 
 
-def pair_map(
-    scene: SceneDescription, values: NDArray[np.float64], bounds: tuple[float, float], title: str
-) -> str:
+def pair_map(scene: SceneDescription, values: Floats, bounds: tuple[float, float], title: str) -> str:
     """Return the map of two movers, `values` [cells of the first, cells of the second]; see the module."""
     columns, rows = scene["columns"], scene["rows"]
     wide, high = (CELL - 10) / columns, (CELL - 10) / rows

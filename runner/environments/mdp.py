@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from runner.environments.scene import SceneDescription, scene_mistake
 from runner.errors import EnvironmentNotUsable, RecordingError
-from runner.util.arrays import Array, Flags, Floats, Ints, Records
+from runner.util.arrays import Array, Flags, Floats, Ints, Ints32, Records
 from runner.util.values import JsonView, is_text, is_whole
 
 Indices = NDArray[np.integer[Any]]
@@ -40,7 +40,7 @@ _DTYPES = {
 class Transitions(TypedDict):
     """The arrays of an environment's outcomes, as `Mdp` has them."""
 
-    next_state: NDArray[np.int32]
+    next_state: Ints32
     probability: Floats
     rewards: Floats
     terminated: Flags
@@ -71,7 +71,7 @@ class Mdp:
 
     env_id: str
     kwargs: JsonView
-    next_state: NDArray[np.int32]
+    next_state: Ints32
     """[S, J, K]."""
     probability: Floats
     """[S, J, K]; 0 where a pair has fewer outcomes; these come last."""

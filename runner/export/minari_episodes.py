@@ -18,7 +18,7 @@ from runner.export.values import acted, observed
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value, least_number
 from runner.recording.turns import turns_of
-from runner.util.arrays import Records
+from runner.util.arrays import Flags, Floats, Records
 from runner.util.values import Ranges
 
 MAX_EPISODE_BYTES: Final = 1 << 30
@@ -32,10 +32,10 @@ class MinariEpisode:
     observations: Value
     """T + 1 of them."""
     actions: Value
-    rewards: NDArray[np.float64]
+    rewards: Floats
     """[T, agents]."""
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
+    terminated: Flags
+    truncated: Flags
     acted: NDArray[np.uint32] | None = None
     """[T]: bit i, whether agent i took part; None where all always do."""
     seed: int | None = None

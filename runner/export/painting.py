@@ -24,6 +24,7 @@ from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
 from runner.replay.steps import recorded_frames
+from runner.util.arrays import Floats
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -159,7 +160,7 @@ def paint_values(recording: Recording, phase: str, episode: int, seen: Iterator[
     names = [*values.names, *([f"reward {agent}" for agent in learners] if len(learners) > 1 else ["reward"])]
     unknown, unpaid = np.full(len(values.names), np.nan), np.full(len(learners), np.nan)
 
-    def numbers(steps: Iterator[Seen]) -> Iterator[NDArray[np.float64]]:
+    def numbers(steps: Iterator[Seen]) -> Iterator[Floats]:
         for observation, step in steps:
             own = unknown if observation is None else values.numbers_in(observation)
             yield np.append(own, unpaid if step is None else step["rewards"])

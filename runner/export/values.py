@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.contents import Step
 from runner.drawing.raster import Pixels
@@ -18,7 +17,7 @@ from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
 from runner.replay.recorded import reset_of
 from runner.replay.steps import transitions_of
-from runner.util.arrays import Records
+from runner.util.arrays import Floats, Records
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
@@ -46,7 +45,7 @@ class Values:
         self.names = [each for leaf in self._leaves for each in number_names(leaf, name, known=known)]
         self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
 
-    def numbers_in(self, value: object) -> NDArray[np.float64]:
+    def numbers_in(self, value: object) -> Floats:
         """Return the numbers of a value, float64 [names]."""
         parts = [np.asarray(_part(value, leaf), np.float64).ravel() for leaf in self._leaves]
         return np.concatenate([np.empty(0), *parts])

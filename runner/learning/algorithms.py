@@ -24,13 +24,12 @@ from typing import Any, Final, NamedTuple
 import numba
 import numpy as np
 from numba.extending import overload
-from numpy.typing import NDArray
 
 from runner.learning import draws
 from runner.learning.compiling import INLINED, inlined
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
-from runner.util.arrays import Floats, Ints
+from runner.util.arrays import Floats, Ints, Ints32
 
 FIRST, SECOND = 0, 1
 """Rows of `Tables.extra` of Double Q-learning: its two Q-tables."""
@@ -61,7 +60,7 @@ class Tables(NamedTuple):
     follow them; of Double Q-learning the mean of both tables."""
     offset: tuple[int, ...]
     """[L]; a tuple, as `Model.width`: their length is known when the kernel is compiled."""
-    greedy: NDArray[np.int32]
+    greedy: Ints32
     """[L, S]: the lowest action of the highest value."""
     value: Floats
     """[L, S]: the highest value."""

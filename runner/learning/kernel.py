@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning import draws
 from runner.learning.algorithms import (
@@ -30,7 +29,7 @@ from runner.learning.compiling import inlined, loop
 from runner.learning.ledger import outcome_of
 from runner.learning.model import Model
 from runner.learning.schedules import schedule_value
-from runner.util.arrays import Floats, Ints, Records
+from runner.util.arrays import Floats, Ints, Ints32, Records
 
 
 class Tally(NamedTuple):
@@ -40,7 +39,7 @@ class Tally(NamedTuple):
     """[L]: rewards of the current episode so far."""
     event_classes: Ints
     """[E]: steps of the current episode by event class."""
-    recent_outcomes: NDArray[np.int32]
+    recent_outcomes: Ints32
     """Ring over the last steps: outcome class of step k at k modulo its length."""
     recent_lengths: Ints
     """Ring over the last episodes: length of episode k at k modulo its length."""
@@ -152,7 +151,7 @@ def train(
     ends: Ends,
     until_episode: int,
     until_step: int,
-    replacement: NDArray[np.int32],
+    replacement: Ints32,
 ) -> tuple[int, int]:
     """Train until a block is full, or an episode or a step is reached; return (steps, episodes) filled.
 
@@ -261,7 +260,7 @@ def evaluate(
     seed: np.uint64,
     model: Model,
     tables: Tables,
-    policy: NDArray[np.int32],
+    policy: Ints32,
     tally: Tally,
     steps: Records,
     ends: Ends,
@@ -425,7 +424,7 @@ def replay(
 
 
 @loop
-def read_states(tables: Tables, states: NDArray[np.int32], value: Floats, greedy: NDArray[np.int32]) -> None:
+def read_states(tables: Tables, states: Ints32, value: Floats, greedy: Ints32) -> None:
     """Read the highest value and the greedy action of states, [n], into [L, n]; nan and -1 for state -1."""
     for i in range(value.shape[0]):
         for k in range(value.shape[1]):
@@ -447,9 +446,9 @@ def replay_probed(
     steps: Records,
     rows: Floats,
     before: Ints,
-    states: NDArray[np.int32],
+    states: Ints32,
     value: Floats,
-    greedy: NDArray[np.int32],
+    greedy: Ints32,
 ) -> None:
     """Replay steps, and read the states of row k of `states` before step `before[k]`; they ascend."""
     at = 0

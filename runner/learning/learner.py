@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig
 from runner.config.model import SECTION_OF
@@ -20,7 +19,7 @@ from runner.learning.algorithms import ALGORITHMS, Memory, Rules, Tables
 from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
-from runner.util.arrays import Floats, Ints, Records
+from runner.util.arrays import Floats, Ints, Ints32, Records
 
 NEVER: Final = 2**62
 """A step that no training reaches."""
@@ -39,7 +38,7 @@ class Segment(NamedTuple):
     stop: int
     """The step after the last one."""
     rules: Rules
-    replacement: NDArray[np.int32]
+    replacement: Ints32
     """[J]: the joint action that is taken at `start` instead of each one chosen; empty to take the chosen."""
 
 
@@ -158,12 +157,12 @@ class Learner:
         self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
     @property
-    def trial_actions(self) -> NDArray[np.int32]:
+    def trial_actions(self) -> Ints32:
         """The joint action of each state in the present evaluation, [S], or how it is drawn: see `kernel`."""
         return self._policy
 
     @property
-    def policy(self) -> NDArray[np.int32] | list[Floats]:
+    def policy(self) -> Ints32 | list[Floats]:
         """The policy of the present evaluation.
 
         The joint action of each state, [S]; of an algorithm that draws its actions one array a learner,
@@ -316,7 +315,7 @@ def _segments(config: ExperimentConfig, mdp: Mdp) -> list[Segment]:
     ]
 
 
-def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.int32]:
+def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> Ints32:
     """Return the joint action to take instead of each one, [J], where branches set it; else empty."""
     chosen = {
         agent: action
@@ -330,7 +329,7 @@ def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> NDArray[np.in
     for agent, action in chosen.items():
         number = agent_of(mdp, agent)
         own[:, number] = own_action(mdp, number, action)
-    replacement: NDArray[np.int32] = np.ravel_multi_index(tuple(own.T), mdp.action_counts).astype(np.int32)
+    replacement: Ints32 = np.ravel_multi_index(tuple(own.T), mdp.action_counts).astype(np.int32)
     return replacement
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
-from runner.util.arrays import Flags, Floats, Ints, Records
+from runner.util.arrays import Flags, Floats, Ints, Ints32, Records
 
 PENALTY_BIT = np.uint32(1 << 31)
 """Bit of an event class that marks a penalty; events themselves use the bits below it."""
@@ -27,9 +27,9 @@ class Model(NamedTuple):
     S states, J joint actions, K outcomes a pair at most, L learners, C outcome classes, E event classes.
     """
 
-    next_state: NDArray[np.int32]
+    next_state: Ints32
     """[S * J * K]."""
-    outcome_class: NDArray[np.int32]
+    outcome_class: Ints32
     """[S * J * K]; an array of its own, so that the one that every step waits for is small."""
     cumulative: Floats
     """[S * J, K]: cumulative probability of the outcomes; the last real one and all after it are 1."""
@@ -37,15 +37,15 @@ class Model(NamedTuple):
     """[C, L]: reward of each learner."""
     terminated: Flags
     """[C]."""
-    event_class: NDArray[np.int32]
+    event_class: Ints32
     """[C]."""
     event_mask: NDArray[np.uint32]
     """[E]: bit i is event i, bit 31 a penalty."""
-    start_states: NDArray[np.int32]
+    start_states: Ints32
     """States an episode can start in."""
     start_cumulative: Floats
     """Their cumulative probability; the last is 1."""
-    own_action: NDArray[np.int32]
+    own_action: Ints32
     """[J, L]: each learner's part of a joint action."""
     stride: tuple[int, ...]
     """[L]: a joint action is the sum of own actions times these."""

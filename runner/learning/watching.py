@@ -7,13 +7,12 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning.algorithms import Index, Rules, Tables, exploring
 from runner.learning.compiling import inlined, loop
 from runner.learning.kernel import relearn
 from runner.learning.model import Model
-from runner.util.arrays import Flags, Floats, Ints, Records
+from runner.util.arrays import Flags, Floats, Ints, Ints32, Records
 
 
 class Watch(NamedTuple):
@@ -29,7 +28,7 @@ class Watch(NamedTuple):
     """[P]: where the greedy paths start."""
     success: np.uint32
     """The bits of an event mask that mean success."""
-    path: NDArray[np.int32]
+    path: Ints32
     """[P, S]: the states on each path, in order."""
     length: Ints
     """[P]: how many there are."""
@@ -46,7 +45,7 @@ class WatchedValues(NamedTuple):
     """[k]: the step, as its place in the block, ascending."""
     q: Floats
     """[k, n]."""
-    greedy: NDArray[np.int32]
+    greedy: Ints32
     """[k, m]."""
     succeeds: Flags
     """[k, P]."""

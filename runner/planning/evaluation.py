@@ -16,7 +16,7 @@ from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
 from runner.planning.kernel import Chain, Paths
 from runner.planning.optimum import require_discount, sweep_tolerance
-from runner.util.arrays import Flags, Floats, Ints
+from runner.util.arrays import Flags, Floats, Ints, Ints32
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class PolicyOutcome:
 class _Chosen:
     """The outcomes of the action that a policy chooses in each state, [S, K] each."""
 
-    next_state: NDArray[np.int32]
+    next_state: Ints32
     probability: Floats
     rewards: Floats
     """[S, K, L]."""
@@ -76,7 +76,7 @@ class _AtStarts(NamedTuple):
     cycles: tuple[Cycle, ...] = ()
 
 
-def evaluate_policy(mdp: Mdp, policy: NDArray[np.int32], learners: int, discount: float) -> PolicyOutcome:
+def evaluate_policy(mdp: Mdp, policy: Ints32, learners: int, discount: float) -> PolicyOutcome:
     """Return the exact outcome of a deterministic policy.
 
     In a deterministic environment every state has one successor, and each path ends, or closes a cycle;
@@ -170,7 +170,7 @@ def _is_certain(chosen: _Chosen) -> bool:
     return bool(only_one and np.isin(chosen.penalty, (0, 1)).all())
 
 
-def _chosen(mdp: Mdp, policy: NDArray[np.int32], learners: int) -> _Chosen:
+def _chosen(mdp: Mdp, policy: Ints32, learners: int) -> _Chosen:
     """Return the outcomes of each state under a deterministic policy."""
     rows = np.arange(mdp.states)
     return _Chosen(

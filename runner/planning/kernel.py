@@ -6,10 +6,9 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning.numba_cache import leave_out_scipy
-from runner.util.arrays import Flags, Floats, Ints
+from runner.util.arrays import Flags, Floats, Ints, Ints32
 
 leave_out_scipy()
 
@@ -45,7 +44,7 @@ class Paths(NamedTuple):
 
 @numba.njit(cache=True, nogil=True)
 def iterate_values(
-    next_state: NDArray[np.int32],
+    next_state: Ints32,
     weight: Floats,
     reward: Floats,
     values: Floats,
@@ -184,7 +183,7 @@ def play_all(chain: Chain, paths: Paths, starts: Ints, limit: int) -> tuple[Ints
 
 @numba.njit(cache=True, nogil=True)
 def expect(
-    next_state: NDArray[np.int32],
+    next_state: Ints32,
     probability: Floats,
     terminated: Flags,
     success: Flags,
@@ -222,7 +221,7 @@ def expect(
 
 @numba.njit(cache=True, nogil=True)
 def discounted(
-    next_state: NDArray[np.int32],
+    next_state: Ints32,
     weight: Floats,
     rewards: Floats,
     values: Floats,

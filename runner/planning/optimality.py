@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.environments.mdp import Mdp
 from runner.planning.evaluation import PolicyOutcome, evaluate_policy, evaluate_stochastic_policy, start_mean
 from runner.planning.optimum import best_response, best_response_to_stochastic, greedy_policy, optimal_values
-from runner.util.arrays import Floats
+from runner.util.arrays import Floats, Ints32
 
-Policy = NDArray[np.int32] | Sequence[Floats]
+Policy = Ints32 | Sequence[Floats]
 """The joint action of each state; or for each learner the probabilities of its own actions."""
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
-from runner.util.arrays import Floats, Scalar
+from runner.util.arrays import Floats, Ints32, Scalar
 
 TOLERANCE: Final = 1e-10
 """How far a value may be from the true one."""
@@ -28,7 +28,7 @@ def optimal_values(mdp: Mdp, discount: float) -> Floats:
     return _iterated(mdp.next_state, weight, reward, discount)
 
 
-def greedy_policy(mdp: Mdp, discount: float, values: Floats) -> NDArray[np.int32]:
+def greedy_policy(mdp: Mdp, discount: float, values: Floats) -> Ints32:
     """Return the joint action that leads to the most of these values, [S]; the first of equals.
 
     Values that differ by rounding only count as equal.
@@ -39,9 +39,7 @@ def greedy_policy(mdp: Mdp, discount: float, values: Floats) -> NDArray[np.int32
     return np.asarray(close.argmax(axis=1), np.int32)
 
 
-def best_response(
-    mdp: Mdp, policy: NDArray[np.int32], learner: int, learners: int, discount: float
-) -> Floats:
+def best_response(mdp: Mdp, policy: Ints32, learner: int, learners: int, discount: float) -> Floats:
     """Return what one learner can get at most from each state while all others keep to a policy, [S].
 
     Args:
@@ -111,7 +109,7 @@ def _weight(mdp: Mdp, discount: float) -> Floats:
     return np.asarray(discount * mdp.probability * ~mdp.terminated)
 
 
-def _iterated(next_state: NDArray[np.int32], weight: Floats, reward: Floats, discount: float) -> Floats:
+def _iterated(next_state: Ints32, weight: Floats, reward: Floats, discount: float) -> Floats:
     values = np.zeros(len(next_state))
     kernel.iterate_values(
         np.ascontiguousarray(next_state),

@@ -19,7 +19,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 from pyarrow.fs import LocalFileSystem
 
 from runner.archive import layout
@@ -35,6 +34,7 @@ from runner.recording.reader import Phase, Recording, open_recording
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.topic_chunks import TopicChunks
 from runner.runs.run import Run
+from runner.util.arrays import Ints
 
 Known = Mapping[str, tuple[Any, Any]]
 """The least and the greatest value of columns of a chunk that was not read."""
@@ -207,15 +207,13 @@ def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -
     return [same | dict(zip(columns, row, strict=True)) for row in rows]
 
 
-def _times_of(chunks: TopicChunks) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _times_of(chunks: TopicChunks) -> tuple[Ints, Ints]:
     """Return the times of the first and the last message of each chunk."""
     spans = chunks.file.index.chunks.columns[chunks.places]
     return spans["start_time"].astype(np.int64), spans["end_time"].astype(np.int64)
 
 
-def _episodes_of_steps(
-    phase: Phase, starts: NDArray[np.int64], ends: NDArray[np.int64]
-) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _episodes_of_steps(phase: Phase, starts: Ints, ends: Ints) -> dict[str, tuple[Ints, Ints]]:
     """Return the first and the last episode of chunks of steps, as an episode has the time of its last step.
 
     Nothing is known where a repair lost episodes, or environments take turns: each counts its own episodes.

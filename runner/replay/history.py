@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.learning.watching import Watch
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
-from runner.util.arrays import Ints
+from runner.util.arrays import Ints, Ints32
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +69,7 @@ def _watch_of(replay: TableReplay, state: int) -> Watch:
     )
 
 
-def _count(visits: Ints, actions: NDArray[np.int32]) -> None:
+def _count(visits: Ints, actions: Ints32) -> None:
     """Count each learner's own `actions`, [visits, learners]."""
     for i in range(len(visits)):
         visits[i] += np.bincount(actions[:, i], minlength=visits.shape[1])

@@ -19,7 +19,7 @@ from runner.learning import kernel
 from runner.learning.learner import Learner, NamedTables
 from runner.learning.ledger import UPDATE
 from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
-from runner.util.arrays import Array, Floats, Ints, Records
+from runner.util.arrays import Array, Floats, Ints, Ints32, Records
 from runner.util.values import JsonView
 
 NO_ROWS: Final = np.empty((0, 0, 0))
@@ -31,11 +31,11 @@ class StateProbe(NamedTuple):
 
     before: Ints
     """[k]: rows of the block, ascending."""
-    states: NDArray[np.int32]
+    states: Ints32
     """[k, n]: the states that are read before each of these rows; -1 for none."""
     value: NDArray[np.float32]
     """[k, learners, n]: filled with the highest value of each state; nan for none."""
-    greedy: NDArray[np.int32]
+    greedy: Ints32
     """[k, learners, n]: filled with the greedy action in each state; -1 for none."""
 
     def between(self, start: int, stop: int) -> StateProbe:

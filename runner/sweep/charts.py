@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
@@ -29,8 +28,9 @@ from runner.export.reports.rendering import LegendEntry, render
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range
 from runner.sweep.results import Ranked, Results, sections, value_text, values_text
+from runner.util.arrays import Floats
 
-Values = NDArray[np.float64]
+Values = Floats
 
 _TRIAL: Final = series_colour(0)
 _BEST: Final = series_colour(1)

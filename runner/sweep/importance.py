@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.sweep.model import Parameter, Range
 from runner.sweep.search import require_optuna
+from runner.util.arrays import Floats
 from runner.util.extras import require
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def effects_of_grid(
     shape = tuple(each.steps + 1 if isinstance(each, Range) else len(each) for each in parameters.values())
     names, rng = list(parameters), np.random.default_rng(0)
 
-    def shares_of(points: Iterable[NDArray[np.float64]]) -> dict[tuple[str, ...], float]:
+    def shares_of(points: Iterable[Floats]) -> dict[tuple[str, ...], float]:
         shares = shares_of_variance(np.array(list(map(np.median, points))).reshape(shape))
         return {tuple(names[axis] for axis in axes): share for axes, share in shares.items()}
 
@@ -103,7 +103,7 @@ def effects_of_grid(
     return _effects([shares for shares in resampled if shares], exact) if exact else []
 
 
-def shares_of_variance(values: NDArray[np.float64]) -> dict[tuple[int, ...], float]:
+def shares_of_variance(values: Floats) -> dict[tuple[int, ...], float]:
     """Return the share of the variance over a full grid of each axis, (i,), and of each pair, (i, j).
 
     The interaction of two axes is the variance of their joint means beyond the two main effects. Empty if

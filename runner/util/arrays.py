@@ -18,6 +18,7 @@ DType = np.dtype[Any]
 """A dtype that is known only at run time."""
 RecordDType = np.dtype[np.void]
 Ints = NDArray[np.int64]
+Ints32 = NDArray[np.int32]
 Unsigned = NDArray[np.uint64]
 """Log times in nanoseconds, or offsets in a file."""
 Floats = NDArray[np.float64]

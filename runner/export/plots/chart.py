@@ -15,12 +15,12 @@ from html import escape
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.axes import round_width
 from runner.drawing import palette
+from runner.util.arrays import Floats
 
-Values = NDArray[np.float64]
+Values = Floats
 
 TEXT: Final = 8.5
 SMALL: Final = 7.5

@@ -13,7 +13,6 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Group
@@ -33,6 +32,7 @@ from runner.export.plots.chart import (
 )
 from runner.export.plots.style import PLAIN, CurveStyle, not_drawn, style_of, visible
 from runner.recording.metrics import SHARES
+from runner.util.arrays import Floats
 
 WIDTH: Final = 288.0
 HEIGHT: Final = 180.0
@@ -182,7 +182,7 @@ def _y_scale(panel: Panel, style: CurveStyle) -> Scale:
     return Scale(low, high, _BOTTOM, _TOP)
 
 
-def _shown(panel: Panel, curve: Curve, style: CurveStyle) -> NDArray[np.float64]:
+def _shown(panel: Panel, curve: Curve, style: CurveStyle) -> Floats:
     """Return the values of a curve's line: its own, or their exponential mean; NaN where it is not drawn."""
     values = curve.middle
     if style.smooth and panel.last > 0:

@@ -5,15 +5,15 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.export.plots.chart import Chart, Scale, labelled, series_colour, series_marker
 from runner.export.plots.curves import HEIGHT, WIDTH, Plot, draw_legend
 from runner.recording.clock import SAMPLE_SECONDS, Clock
 from runner.recording.host import HostMetrics
 from runner.util import humanize
+from runner.util.arrays import Floats
 
-Values = NDArray[np.float64]
+Values = Floats
 _INTERVALS: Final = 200
 """The most intervals of the time in which steps are counted."""
 _GB, _MB = 1e9, 1e6

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.panels import Panel
 from runner.errors import RunnerError
 from runner.recording.metrics import SHARES
+from runner.util.arrays import Flags, Floats
 from runner.util.humanize import listed
 
 
@@ -51,7 +51,7 @@ def style_of(panel: Panel, style: CurveStyle) -> CurveStyle:
     return replace(style, log_x=log_x, log_y=style.log_y and positive and panel.metric != SHARES)
 
 
-def visible(places: NDArray[np.float64], values: NDArray[np.float64], style: CurveStyle) -> NDArray[np.bool_]:
+def visible(places: Floats, values: Floats, style: CurveStyle) -> Flags:
     """Return which points have a place on the axes of a style, bool [n]."""
     is_visible = ~np.isnan(values)
     if style.log_x:

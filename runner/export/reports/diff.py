@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.diff import RunDiff
 from runner.analysis.diff.causes import Cause, Row
@@ -42,6 +41,7 @@ from runner.export.reports.maps import drawn, on_grid, situation, situation_in_w
 from runner.export.reports.rendering import Figure, LegendEntry, Link, render
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
+from runner.util.arrays import Floats
 from runner.util.humanize import capitalised
 
 _MAX_VALUES: Final = 6
@@ -204,7 +204,7 @@ def _table_figures(difference: RunDiff, a: Recording, b: Recording) -> Iterator[
     if not any(table.largest > 0 for table in difference.tables):
         return
     yield Figure(tables_svg(difference.tables), "Difference of the tables over training")
-    last: dict[int, NDArray[np.float64]] = {}
+    last: dict[int, Floats] = {}
     for ours, theirs in common_snapshots(a, b):
         last[ours.table] = np.abs(ours.values - theirs.values).max(axis=1)
     agents = [table.agent for table in difference.tables[-len(last) :]]
@@ -212,7 +212,7 @@ def _table_figures(difference: RunDiff, a: Recording, b: Recording) -> Iterator[
         yield from _map(a.mdp, distances, spoken(agents[number]))
 
 
-def _map(mdp: Mdp, distances: NDArray[np.float64], agent: str) -> Iterator[Figure]:
+def _map(mdp: Mdp, distances: Floats, agent: str) -> Iterator[Figure]:
     """Yield the map of the largest difference in each state, in the situation where it is largest."""
     drawing = svg.drawing_of(mdp)
     if drawing is None or len(drawing.movers) not in (1, 2) or not distances.max() > 0:

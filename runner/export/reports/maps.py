@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.qtable import recorded_tables
 from runner.drawing.svg import drawing_of
@@ -23,9 +22,9 @@ from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
 from runner.replay.steps import step_of_episode
 from runner.replay.tables import tables_at
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Flags, Floats, Ints
 
-Values = NDArray[np.float64]
+Values = Floats
 Bounds = tuple[float, float]
 
 _HALFWAY: Final = 0.05
@@ -120,7 +119,7 @@ def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state
     return rows
 
 
-def situation(mdp: Mdp, state: int, free: Sequence[int]) -> NDArray[np.bool_]:
+def situation(mdp: Mdp, state: int, free: Sequence[int]) -> Flags:
     """Return which states differ from one in nothing but the places of the free things, [S]."""
     assert mdp.scene_cells is not None
     carriers = mdp.carriers
@@ -162,7 +161,7 @@ def _row(
     state: int,
     movers: list[int],
     learner: int,
-    own_actions: NDArray[np.int64] | None = None,
+    own_actions: Ints | None = None,
 ) -> MapRow:
     """Return the maps of a learner's table at each stage; `own_actions` has a mover's part of its actions."""
     states = np.flatnonzero(situation(mdp, state, movers))
@@ -184,7 +183,7 @@ def _row(
     return MapRow(title, explanation + (f" Situation: {fixed}." if fixed else ""), tuple(svgs), *bounds)
 
 
-def on_grid(mdp: Mdp, states: NDArray[np.int64], movers: list[int], values: Array) -> Values:
+def on_grid(mdp: Mdp, states: Ints, movers: list[int], values: Array) -> Values:
     """Return the values of states by the cells of one or two movers, [cells] or [cells, cells], else NaN."""
     assert mdp.scene is not None
     assert mdp.scene_cells is not None

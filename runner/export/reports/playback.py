@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.contents import ENDINGS, ending_of, require_steps
 from runner.analysis.episodes import EpisodeRef
@@ -44,6 +43,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import steps_of
 from runner.replay.tables import TableReplay, tables_at
+from runner.util.arrays import Floats, Records
 from runner.util.humanize import capitalised
 
 MAX_STEPS: Final = 1000
@@ -51,7 +51,7 @@ MAX_STEPS: Final = 1000
 MAX_VALUES: Final = 6
 """Q-values of a state that a page shows: the highest, and that of the action taken."""
 
-QValues = tuple[NDArray[np.float64], ...]
+QValues = tuple[Floats, ...]
 """For each learner the Q-values in the states of T steps, [T, actions]; empty if they are unknown."""
 
 
@@ -90,7 +90,7 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
 def tabular_playback(
     recording: Recording,
     at: EpisodeRef,
-    steps: NDArray[np.void],
+    steps: Records,
     ended: str,
     values: QValues,
     first: int = 0,
@@ -138,7 +138,7 @@ def tabular_playback(
     )
 
 
-def _values(recording: Recording, steps: NDArray[np.void], at: EpisodeRef) -> QValues:
+def _values(recording: Recording, steps: Records, at: EpisodeRef) -> QValues:
     """Return each learner's Q-values in the states of an episode's steps; those of a trial do not change."""
     if not recording.has_tables:
         return ()
@@ -155,7 +155,7 @@ def _values(recording: Recording, steps: NDArray[np.void], at: EpisodeRef) -> QV
     return tuple(rows[:, i, :width] for i, width in enumerate(widths))
 
 
-def _highest(values: NDArray[np.float64], taken: list[int]) -> dict[str, object]:
+def _highest(values: Floats, taken: list[int]) -> dict[str, object]:
     """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
     rows: dict[tuple[tuple[int, Value], ...], int] = {}
     which: list[int] = []

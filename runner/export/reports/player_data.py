@@ -12,13 +12,12 @@ from itertools import chain, islice
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.analysis.contents import ENDINGS
 from runner.drawing import svg
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Ints
 from runner.util.humanize import counted
 from runner.util.values import Json
 
@@ -133,7 +132,7 @@ def outcome_in_words(length: int, ended: str, total: float | None) -> str:
     return f"{counted(length, 'step')}, {ENDINGS[ended]}.{rewards}"
 
 
-def frame_times(after: NDArray[np.int64]) -> list[int]:
+def frame_times(after: Ints) -> list[int]:
     """Return the number of steps of the run before each of T + 1 frames, from those after T steps."""
     return [int(after[0]) - 1, *after.tolist()]
 
