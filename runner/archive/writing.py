@@ -134,7 +134,8 @@ class _ArchiveWriter:
                     writer.add(batch)
                     self._report(self._batches.steps)
         self._copy_contents()
-        self._copy_marks()
+        if (marks := read_marks(self._recording.path.parent)) != Marks():
+            write_object(self._folder / MARKS_FILE, marks.as_json())
         topics = self._batches.entries
         self._compare(topics)
         facts = recorded_facts(self._recording) | {"name": self._recording.name}
@@ -185,11 +186,6 @@ class _ArchiveWriter:
                 checkpoint.check()
                 path.parent.mkdir(exist_ok=True)
                 shutil.copyfile(checkpoint.path, path)
-
-    def _copy_marks(self) -> None:
-        marks = read_marks(self._recording.path.parent)
-        if marks != Marks():
-            write_object(self._folder / MARKS_FILE, marks.as_json())
 
     def _write_learning(self, table: Table, steps: TableWriter) -> None:
         """Write the steps of a job, and its snapshots, which follow from them."""

@@ -46,14 +46,11 @@ def _effect(values: Floats, settings: Sequence[int]) -> Floats:
         beyond = np.diff(beyond, axis=count - 1 - i)
     beyond = beyond.reshape(-1, values.shape[1])
     sizes = np.bitwise_count(np.arange(len(beyond)))
-    averaged: Floats = _weights(count + 1 - len(settings))[sizes] @ beyond
+    n, factorial = count + 1 - len(settings), math.factorial
+    # The share of the orders of n settings in which s given ones come before a given one.
+    weights = np.array([factorial(s) * factorial(n - s - 1) / factorial(n) for s in range(n)])
+    averaged: Floats = weights[sizes] @ beyond
     return averaged
-
-
-def _weights(count: int) -> Floats:
-    """Return the share of the orders of `count` settings in which s given ones come before a given one."""
-    factorial = math.factorial
-    return np.array([factorial(s) * factorial(count - s - 1) / factorial(count) for s in range(count)])
 
 
 def minimal_set(items: Sequence[T], holds: Callable[[Sequence[T]], bool]) -> list[T]:

@@ -115,7 +115,10 @@ def weights_of(recording: Recording, cell: Cell, stop: int, limit: int, report: 
                     shares,
                 )
                 counted += filled
-                largest = _largest(largest, shares[:filled], limit)
+                added = shares[:filled]
+                largest = np.concatenate([largest, added[added["contribution"] != 0]])
+                order = np.lexsort((largest["step"], -np.abs(largest["contribution"])))
+                largest = largest[order[:limit]]
                 end = first
     return Weights(
         value=float(replay.tables[cell.learner][cell.state, cell.action]),
@@ -148,9 +151,3 @@ def _updates(recording: Recording, replay: TableReplay, learner: int, stop: int)
             )
         episode = episodes[-1]
         yield updates
-
-
-def _largest(known: Records, shares: Records, limit: int) -> Records:
-    """Return the shares that add or take most, of those that are known and further ones."""
-    both = np.concatenate([known, shares[shares["contribution"] != 0]])
-    return both[np.lexsort((both["step"], -np.abs(both["contribution"])))[:limit]]

@@ -276,7 +276,8 @@ def _section_of(found: When) -> Section:
     if found.first is None:
         sentences.append(f"It holds after none of the training steps {first:,} to {last:,}.")
         return Section(found.expression, sentences, [_values_grid("at the end", found.last, False)])
-    where = _named(found.first)
+    moment = found.first
+    where = f"training step {moment.step:,}, step {moment.t:,} of episode {moment.episode:,} ({moment.at})"
     if not found.every:
         sentences.append(f"It holds first after {where}.")
     else:
@@ -292,10 +293,6 @@ def _section_of(found: When) -> Section:
         if len(found.intervals) < found.count:
             sentences.append(f"The first {len(found.intervals):,} intervals are listed.")
     return Section(found.expression, sentences, grids, replay=found.first.at.replay)
-
-
-def _named(moment: WhenMoment) -> str:
-    return f"training step {moment.step:,}, step {moment.t:,} of episode {moment.episode:,} ({moment.at})"
 
 
 def _values_grid(heading: str, moment: WhenMoment, with_before: bool) -> Grid:

@@ -150,12 +150,9 @@ def _episode(recording: Recording, steps: Records, first: Value, seed: int | Non
     else:
         observations = _split(seen, np.concatenate([np.array([first], after.dtype), after]))
     taken = _collected(done, actions) if isinstance(actions, list) else _split(done, actions)
-    return MinariEpisode(observations, taken, seed=seed, **_outcomes(steps))
-
-
-def _outcomes(steps: Records) -> dict[str, Any]:
-    fields = ("rewards", "terminated", "truncated", "acted")
-    return {name: steps[name].copy() for name in fields if name in (steps.dtype.names or ())}
+    fields = {"rewards", "terminated", "truncated", "acted"} & {*(steps.dtype.names or ())}
+    outcomes: dict[str, Any] = {name: steps[name].copy() for name in fields}
+    return MinariEpisode(observations, taken, seed=seed, **outcomes)
 
 
 def _split(description: Description, values: NDArray[Any]) -> Value:

@@ -157,9 +157,10 @@ def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
 
 
 def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | None:
-    """Return the `_key` of the steps and resets of each episode; None where one environment is alone.
+    """Return a key of the steps and resets of each episode; None where one environment is alone.
 
-    The rows count the episodes of their own environment, the phase those of all as they ended.
+    It is made of the environment and the episode as the rows count it, in their own environment; the phase
+    counts the episodes of all as they ended.
     """
     own = recording.phase(phase)
     if not own.steps.have_turns:
@@ -171,12 +172,6 @@ def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | N
     return pa.array(keys, pa.int64())
 
 
-def _key(rows: pa.RecordBatch) -> pa.Array:
-    """Return one number for each row: its environment, and its episode as counted in that environment."""
-    environment = pc.shift_left(rows["environment"].cast(pa.int64()), _ENVIRONMENT_BITS)
-    return pc.bit_wise_or(environment, rows["episode"].cast(pa.int64()))
-
-
 def _selected(
     batches: Iterator[pa.RecordBatch], phase: str | None, episodes: Ranges, keys: pa.Array | None
 ) -> Iterator[pa.RecordBatch]:
@@ -185,7 +180,8 @@ def _selected(
         rows = batch if phase is None else batch.filter(pc.equal(batch["phase"], phase))
         is_ended = "length" in rows.schema.names  # an episode, which has its number in the phase
         if keys is not None and not is_ended and {"episode", "environment"} <= set(rows.schema.names):
-            is_selected = pc.is_in(_key(rows), keys)
+            environment = pc.shift_left(rows["environment"].cast(pa.int64()), _ENVIRONMENT_BITS)
+            is_selected = pc.is_in(pc.bit_wise_or(environment, rows["episode"].cast(pa.int64())), keys)
             if "taken" in rows.schema.names:
                 is_selected = pc.and_(is_selected, rows["taken"])
             rows = rows.filter(is_selected)

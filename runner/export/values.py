@@ -40,7 +40,11 @@ class Values:
     def __init__(self, recording: Recording, name: str = "observation") -> None:
         leaves = leaves_of(recording.spaces["observation"], "the observation space")
         known = observation_names(recording)
-        self._leaves = [leaf for leaf in leaves if 0 < _count(leaf) <= MAX_NUMBERS]
+        self._leaves = [
+            leaf
+            for leaf in leaves
+            if leaf.dtype is not None and 0 < math.prod(leaf.dtype.shape) <= MAX_NUMBERS
+        ]
         self._texts = [leaf for leaf in leaves if leaf.dtype is None]
         self.names = [each for leaf in self._leaves for each in number_names(leaf, name, known=known)]
         self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
@@ -181,10 +185,6 @@ def _part(value: Value, leaf: Leaf) -> Value:
     for key in leaf.path:
         value = value[int(key) if isinstance(value, tuple) else key]
     return value
-
-
-def _count(leaf: Leaf) -> int:
-    return 0 if leaf.dtype is None else math.prod(leaf.dtype.shape)
 
 
 def number_names(leaf: Leaf, name: str, skip: int = 0, known: Sequence[str] = ()) -> Iterator[str]:

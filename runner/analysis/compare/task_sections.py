@@ -30,8 +30,22 @@ EXPLANATION: Final = (
 
 def task_sections(comparison: TaskComparison) -> list[Section]:
     """Return the text of a comparison over environments."""
+    rows = [
+        (
+            task,
+            number(bounds.zero),
+            number(bounds.one),
+            *(
+                f"{number(float(np.mean(result.scores[task])))} ({result.seeds[task]})"
+                for result in comparison.algorithms
+            ),
+        )
+        for task, bounds in comparison.tasks.items()
+    ]
+    labels = [f"{result.label}, mean (seeds)" for result in comparison.algorithms]
+    headings = ("environment", "score 0 at", "score 1 at", *labels)
     return [
-        Section("Algorithms", summary(comparison), [_tasks(comparison)]),
+        Section("Algorithms", summary(comparison), [Grid(headings, rows)]),
         Section(
             f"Normalised scores: {comparison.title}",
             [f"{comparison.metric}, {comparison.moment}; normalised by {comparison.normalised_by}."],
@@ -77,20 +91,3 @@ def grids(comparison: TaskComparison) -> list[Grid]:
         places = (f"{comparison.positions[k]:,.6g}" for k in at)
         all_grids.append(Grid((f"IQM after {comparison.axis}", *places), curves))
     return all_grids
-
-
-def _tasks(comparison: TaskComparison) -> Grid:
-    rows = [
-        (
-            task,
-            number(bounds.zero),
-            number(bounds.one),
-            *(
-                f"{number(float(np.mean(result.scores[task])))} ({result.seeds[task]})"
-                for result in comparison.algorithms
-            ),
-        )
-        for task, bounds in comparison.tasks.items()
-    ]
-    labels = [f"{result.label}, mean (seeds)" for result in comparison.algorithms]
-    return Grid(("environment", "score 0 at", "score 1 at", *labels), rows)

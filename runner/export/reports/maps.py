@@ -169,7 +169,9 @@ def _row(
     for stage in stages:
         rows = stage.tables[learner][states]
         greedy = rows.argmax(axis=1)
-        grids.append(on_grid(mdp, states, movers, _highest(rows)))
+        best = rows.max(axis=1)
+        # Where all actions have the same value, none is preferred.
+        grids.append(on_grid(mdp, states, movers, np.where(best > rows.min(axis=1), best, np.nan)))
         policies.append(on_grid(mdp, states, movers, greedy if own_actions is None else own_actions[greedy]))
     numbers = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
     bounds = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 0.0)
@@ -198,9 +200,3 @@ def drawn(mdp: Mdp, grid: Values, bounds: Bounds, title: str, greedy: Values | N
     if grid.ndim == 2:
         return pair_map(mdp.scene, grid, bounds, title)
     return policy_map(mdp.scene, grid, greedy, bounds, title)
-
-
-def _highest(rows: Values) -> Values:
-    """Return the highest value of each row; nan where all are the same, so that no action is preferred."""
-    best = rows.max(axis=1)
-    return np.where(best > rows.min(axis=1), best, np.nan)

@@ -136,6 +136,12 @@ def _run(
     environment = recording.environment
     episodes = _episodes(recording, chosen)
     replay = _replay(recording, episodes, progress)
+    notes = shortcomings(recording)
+    if not recording.has_actions:
+        notes.append(
+            f"No episode of run {recording.run_id} can be replayed, as there are no steps: "
+            f"{why_no_steps(recording)}."
+        )
     drawing = None if environment["scene"] is None else svg.SvgDrawing(environment["scene"])
     return ReportedRun(
         number=number,
@@ -157,22 +163,11 @@ def _run(
         facts=_facts(recording),
         config=flat_text(recording.config),
         provenance=brief_provenance(recording.provenance),
-        notes=_notes(recording),
+        notes=notes,
         maps=_maps(recording, next(iter(episodes), None)),
         replay=replay,
         has_tables=recording.has_tables,
     )
-
-
-def _notes(recording: Recording) -> list[str]:
-    """Return what is missing from the recording, a sentence each."""
-    notes = shortcomings(recording)
-    if not recording.has_actions:
-        notes.append(
-            f"No episode of run {recording.run_id} can be replayed, as there are no steps: "
-            f"{why_no_steps(recording)}."
-        )
-    return notes
 
 
 def _facts(recording: Recording) -> dict[str, str]:
