@@ -173,13 +173,15 @@ class WhatIf:
         levels = svg_maps.levels_of(totals, float(totals.min()), float(totals.max()))
         rows, columns = numbered_actions(mdp)
         first, second = map(spoken, mdp.agents)
-        parts = [_text(_HEAD[0] + _CELL[0] * len(columns) / 2, 20, second, "currentColor", bold=True)]
-        parts += [_text(6, _HEAD[1] - 10, first, "currentColor", anchor="start", bold=True)]
-        for i, name in enumerate(columns):
-            parts.append(_text(_HEAD[0] + _CELL[0] * (i + 0.5), _HEAD[1] - 10, name, "currentColor"))
-        for i, name in enumerate(rows):
-            middle = _HEAD[1] + _CELL[1] * (i + 0.5) + 5
-            parts.append(_text(6, middle, name, "currentColor", anchor="start"))
+        parts = [
+            _text(_HEAD[0] + _CELL[0] * len(columns) / 2, 20, second, bold=True),
+            _text(6, _HEAD[1] - 10, first, anchor="start", bold=True),
+            *(_text(_HEAD[0] + _CELL[0] * (i + 0.5), _HEAD[1] - 10, name) for i, name in enumerate(columns)),
+            *(
+                _text(6, _HEAD[1] + _CELL[1] * (i + 0.5) + 5, name, anchor="start")
+                for i, name in enumerate(rows)
+            ),
+        ]
         for row in self.actions:
             i, j = divmod(row.action, len(columns))
             x, y, colour = _HEAD[0] + j * _CELL[0], _HEAD[1] + i * _CELL[1], ramp_colour(levels[row.action])
@@ -213,7 +215,9 @@ def _short(value: float) -> str:
     return number(value, 0 if value % 1 == 0 else 2)
 
 
-def _text(x: float, y: float, text: str, colour: str, anchor: str = "middle", bold: bool = False) -> str:
+def _text(
+    x: float, y: float, text: str, colour: str = "currentColor", anchor: str = "middle", bold: bool = False
+) -> str:
     weight = ' font-weight="bold"' if bold else ""
     return (
         f'<text x="{x:g}" y="{y:g}" text-anchor="{anchor}" fill="{colour}" font-size="15" '

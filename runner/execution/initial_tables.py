@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
 from runner.config.sections import RunTable
 from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
 from runner.learning.learner import NamedTables
-from runner.recording.reader import Recording, open_recording
+from runner.recording.reader import Recording
 from runner.replay.steps import last_step
 from runner.replay.tables import named_tables_at, tables_before_training
 from runner.runs.resolve import find_run
@@ -33,7 +33,7 @@ def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str =
         return config
     source, step = find_run(start.run, recordings, exclude), start.step
     if step is None:
-        with open_recording(at_hand(source).recording) as recording:
+        with opened(source) as recording:
             step = last_step(recording)
     return from_mapping(
         config.to_mapping() | {"initial_q": {"run": address(source, recordings), "step": step}}
@@ -74,7 +74,7 @@ def tables_of(
     if not isinstance(start, RunTable):
         return None
     source = find_run(start.run, recordings, exclude=exclude)
-    with open_recording(at_hand(source).recording) as recording:
+    with opened(source) as recording:
         tables = named_tables_at(recording, last_step(recording) if start.step is None else start.step)
     joint = config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]

@@ -22,11 +22,10 @@ from runner.analysis.evaluations import evaluation_records
 from runner.analysis.frames import evaluation_column
 from runner.archive import layout
 from runner.archive.columns import Shape
-from runner.archive.places import at_hand
+from runner.archive.places import opened
 from runner.environments.mdp import events_of
 from runner.errors import NotInRecording, RunnerError
 from runner.recording.marks import read_marks
-from runner.recording.reader import open_recording
 from runner.runs.catalogue.columns import COLUMNS, IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
@@ -139,7 +138,7 @@ class SelectedRuns:
         for row in self.rows:
             with (
                 self.reading("evaluations", row) as run,
-                open_recording(at_hand(run).recording) as recording,
+                opened(run) as recording,
             ):
                 for record in evaluation_records(recording):
                     values = flatten(record.as_json())

@@ -32,14 +32,10 @@ _CHOICE: Final = ("explored", "acted")
 """The fields that tell how an action came about: a difference there comes before that of the action."""
 
 
-def _as_they_come_about() -> tuple[str, ...]:
-    """Return the fields of steps of any kind that are compared, in the order in which a step comes about."""
-    names = [name for name in schema.STEP_COLUMNS if name not in _NOT_COMPARED + _CHOICE]
-    at = names.index("action")
-    return (*names[:at], *_CHOICE, *names[at:])
-
-
-_COMPARED: Final = _as_they_come_about()
+_OTHERS: Final = [name for name in schema.STEP_COLUMNS if name not in _NOT_COMPARED + _CHOICE]
+_AT_ACTION: Final = _OTHERS.index("action")
+_COMPARED: Final = (*_OTHERS[:_AT_ACTION], *_CHOICE, *_OTHERS[_AT_ACTION:])
+"""The fields of steps of any kind that are compared, in the order in which a step comes about."""
 FIELDS: Final = tuple(name for name in _COMPARED if name in [field.name for field in schema.STEP.fields])
 """The fields that are compared of steps of jobs."""
 _EVALUATION_FIELDS: Final = FIELDS[1:]  # trials are numbered over all evaluations of a run

@@ -80,16 +80,18 @@ class _ShownPart:
 def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     phase, number = recording.phase(at.phase), at.number_in(recording)
-    episode = phase.episode(number)
-    length = len(episode)
+    length = len(episode := phase.episode(number))
     if not 0 <= first < length:
         raise at.no_step(recording, length, max(first, at.t))
     parts, notes = _shown_parts(recording)
     in_words = step_actions_in_words(recording, at.phase)
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     before = np.zeros(len(recording.agents))
-    rewards, log_times = [np.empty((0, len(before)))], [np.empty(0, np.int64)]
-    numbers = [np.empty(0, np.int64)]
+    rewards, numbers, log_times = (
+        [np.empty((0, len(before)))],
+        [np.empty(0, np.int64)],
+        [np.empty(0, np.int64)],
+    )
     actions: list[dict[str, str]] = []
     observations: list[list[Column]] = []
     reset = reset_of(recording, at.phase, number)
@@ -109,10 +111,10 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
         if seen < len(steps):
             after = observed(recording, steps[seen:])
             observations.append([part.column(after) for part in parts])
-    reward, time = np.concatenate(rewards), np.concatenate(log_times)
+    reward = np.concatenate(rewards)
     if len(reward) != min(limit, length - first):
         raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
-    frames = frame_times(time // schema.STEP_NANOSECONDS)
+    frames = frame_times(np.concatenate(log_times) // schema.STEP_NANOSECONDS)
     ended = ending_of(recording, at.phase, number)
     total = None
     if ended != "cut off":

@@ -50,6 +50,7 @@ class Folders:
         self._roots = roots
         self._quick = quick
         self._tokens: dict[str, dict[str, str]] = {}
+        """By root and entry, the token of each run's folder at the first check, or when it was read."""
         self._read: dict[str, set[str]] = {root: set() for root in roots}
 
     def differences(self) -> list[FolderChanges]:
@@ -84,7 +85,10 @@ class Folders:
         indexed: dict[str, str] = dict(
             self._database.execute(f"SELECT entry, {stored} FROM runs WHERE root = ?", (root,))
         )
-        tokens = self._tokens_of(root)
+        if root not in self._tokens:  # as the folders are at the first check
+            entries = [entry for entry in run_entries(Path(root)) if entry.isprintable()]
+            self._tokens[root] = {entry: self._token(root, entry) for entry in entries}
+        tokens = self._tokens[root]
         changed = [entry for entry, token in tokens.items() if indexed.get(entry) != token]
         unsteady = (
             "SELECT entry, status, stable FROM runs WHERE root = ? AND (status = 'running' OR NOT stable)"
@@ -99,13 +103,6 @@ class Folders:
         missing = {*indexed} - {*tokens} | {*changed} - {*there}
         gone = [entry for entry in missing if entry in indexed and _state_of(root, entry) is None]
         return FolderChanges(root, there, gone)
-
-    def _tokens_of(self, root: str) -> dict[str, str]:
-        """Return the token of each run's folder at the first check, or when it was read."""
-        if root not in self._tokens:
-            entries = [entry for entry in run_entries(Path(root)) if entry.isprintable()]
-            self._tokens[root] = {entry: self._token(root, entry) for entry in entries}
-        return self._tokens[root]
 
     def _token(self, root: str, entry: str) -> str:
         if self._quick:
