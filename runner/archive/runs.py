@@ -29,6 +29,7 @@ from runner.runs.resolve import run_of_id
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.store import Store
 from runner.util.processes import Report
+from runner.util.values import Json
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,25 @@ class Archived:
     """Whether the recording was removed from the run's folder."""
     recording_bytes: int
     """Bytes of the recording when it was archived."""
+
+    @property
+    def steps(self) -> int:
+        """Number of the steps in the archive."""
+        topics = self.manifest.topics
+        return sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
+
+    def as_json(self) -> Json:
+        """Return it as JSON, without its place."""
+        return {
+            "run_id": self.run.run_id,
+            "name": self.run.name,
+            "content_digest": self.manifest.digest,
+            "steps": self.steps,
+            "bytes": self.manifest.size,
+            "recording_bytes": self.recording_bytes,
+            "new": self.new,
+            "removed": self.removed,
+        }
 
 
 def archive_run(

@@ -289,12 +289,12 @@ def film(run: Run, step: EpisodeRef, ending: str) -> bytes:
         return file.read_bytes()
 
 
-def archive(run: Run, remove: bool) -> None:
+def archive(run: Run, remove: bool) -> bytes:
     """Archive a run as `dualtaxi archive` does; `remove` its recording once the archive was compared."""
     require("pyarrow", extra="archive", purpose="an archive")
     from runner.archive.runs import archive_run
 
-    archive_run(run, default_target(run.folder.parent), remove)
+    return as_json(archive_run(run, default_target(run.folder.parent), remove).as_json())
 
 
 def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:

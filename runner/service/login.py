@@ -10,7 +10,7 @@ from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
 from runner.service.errors import Unauthorized
-from runner.service.pages.rendering import Form, message_of, page
+from runner.service.pages.rendering import Form, Page
 from runner.service.problems import status_of
 from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
 
@@ -22,7 +22,7 @@ def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") ->
     """Ask for a token, where one is needed."""
     if not request.app.state.settings.needs_token:
         return RedirectResponse(_local(next), HTTPStatus.SEE_OTHER)
-    return page(request, "login.html", {"next": next, "problem": ""})
+    return Page("login.html", {"next": next, "problem": ""})
 
 
 @router.post("/login")
@@ -37,8 +37,7 @@ def login(request: Request, sent: Form) -> Response:
             raise Unauthorized("token: found one that is unknown, or was revoked.")
         session = sessions.begin(token)
     except RunnerError as error:
-        values = {"next": target, "problem": message_of(error, request)}
-        return page(request, "login.html", values, status_of(error))
+        return Page("login.html", {"next": target, "problem": error}, status_of(error))
     response = RedirectResponse(_local(target), HTTPStatus.SEE_OTHER)
     response.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_options(request))
     return response

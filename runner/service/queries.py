@@ -9,7 +9,6 @@ from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field, TypeAdapter
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Grid
 from runner.errors import RunnerError
@@ -17,7 +16,7 @@ from runner.query.text import cell_of
 from runner.service import computed
 from runner.service.addresses import link
 from runner.service.dependencies import ProcessesOf, SettingsOf, json_response
-from runner.service.pages.rendering import message_of, page
+from runner.service.pages.rendering import Page
 from runner.service.problems import error_docs
 from runner.service.processes import ProcessPool
 from runner.service.settings import ServiceSettings
@@ -89,9 +88,8 @@ async def find_page(request: Request, search: SearchOf) -> Response:
             kept = link("", search.model_dump()).removeprefix("?")
             shown |= {"found": found, "links": [link(hit.replay, {"found": kept}) for hit in found.hits]}
     except RunnerError as error:
-        shown["problem"] = message_of(error, request)
-    status = HTTPStatus.BAD_REQUEST if shown["problem"] else HTTPStatus.OK
-    return await run_in_threadpool(page, request, "find.html", shown, status)
+        shown["problem"] = error
+    return Page("find.html", shown)
 
 
 async def _found(request: Request, search: EpisodeQuestion) -> bytes:
@@ -105,7 +103,7 @@ async def _found(request: Request, search: EpisodeQuestion) -> bytes:
 
 @pages.get("/sql")
 async def sql_page(
-    request: Request, processes: ProcessesOf, settings: SettingsOf, query: Sql = "", runs: Runs = ""
+    processes: ProcessesOf, settings: SettingsOf, query: Sql = "", runs: Runs = ""
 ) -> Response:
     """Show the form, and the answer to a query."""
     shown: dict[str, object] = {"query": query, "runs": runs, "problem": "", "left_out": [], "grid": None}
@@ -115,9 +113,8 @@ async def sql_page(
             rows = [tuple(map(cell_of, row)) for row in answer["rows"]]
             shown |= answer | {"grid": Grid(tuple(answer["columns"]), rows)}
     except RunnerError as error:
-        shown["problem"] = message_of(error, request)
-    status = HTTPStatus.BAD_REQUEST if shown["problem"] else HTTPStatus.OK
-    return await run_in_threadpool(page, request, "sql.html", shown, status)
+        shown["problem"] = error
+    return Page("sql.html", shown)
 
 
 async def _answer(processes: ProcessPool, settings: ServiceSettings, query: str, runs: str) -> bytes:

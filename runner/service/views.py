@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import BaseModel, Field, ValidationError, create_model
-from starlette.concurrency import run_in_threadpool
 
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
@@ -17,8 +16,7 @@ from runner.runs.run import Run
 from runner.service import computed, fragments
 from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
-from runner.service.pages.frame import installed_names, run_page
-from runner.service.pages.rendering import message_of
+from runner.service.pages.frame import RunPage, installed_names
 from runner.service.problems import RUN_ERRORS, error_docs, media_docs
 from runner.views import VIEWS, installed_view
 from runner.views.view import Given, Input, View
@@ -61,7 +59,7 @@ def _add_routes(view: View) -> None:
         """Show the form, and the answer to what it asks."""
         query = request.query_params
         form = {each.name: query.get(each.name, "").strip() for each in view.inputs.values()}
-        body, problem = b"", ""
+        body, problem = b"", None
         try:
             if view.has_default or any(form.values()):
                 given = given_type.model_validate({name: text for name, text in form.items() if text})
@@ -69,10 +67,9 @@ def _add_routes(view: View) -> None:
         except ValidationError as error:
             raise RequestValidationError(error.errors()) from error
         except RunnerError as error:
-            problem = message_of(error, request)
+            problem = error
         shown = {"view": view, "form": form, "body": body.decode(), "problem": problem}
-        status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
-        return await run_in_threadpool(_page, request, run, shown, status)
+        return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view))
 
 
 async def _computed(
@@ -104,9 +101,8 @@ def _type_of(view: View) -> type[BaseModel]:
     return made
 
 
-def _page(request: Request, run: Run, shown: dict[str, Any], status: HTTPStatus) -> Response:
-    """Return the page of a view, with the texts to choose from in its form, or why it has none."""
-    view: View = shown["view"]
+def _form_values(run: Run, view: View) -> dict[str, object]:
+    """Return the texts to choose from in the form of a view, or why it has none."""
     choices, refusal = {}, ""
     if view.refusal is not None and run.can_train_again:
         with open_recording(run.recording) as recording:
@@ -115,9 +111,7 @@ def _page(request: Request, run: Run, shown: dict[str, Any], status: HTTPStatus)
         if each.choices is not None:
             with open_recording(run.recording) as recording:
                 choices[each.name] = each.choices(recording)
-    return run_page(
-        request, run, view.name, "run_view.html", shown | {"choices": choices, "refusal": refusal}, status
-    )
+    return {"choices": choices, "refusal": refusal}
 
 
 for _view in (*VIEWS.values(), *map(installed_view, installed_names())):

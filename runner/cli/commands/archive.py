@@ -66,21 +66,8 @@ def archive_command(
 
 def _reply(archived: Archived, dry_run: bool) -> Reply:
     run, manifest = archived.run, archived.manifest
-    topics = manifest.topics
-    steps = sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
-    values = {
-        "run_id": run.run_id,
-        "name": run.name,
-        "place": archived.place,
-        "content_digest": manifest.digest,
-        "steps": steps,
-        "bytes": manifest.size,
-        "recording_bytes": archived.recording_bytes,
-        "new": archived.new,
-        "removed": archived.removed,
-        "dry_run": dry_run,
-    }
-    per_step = f", {manifest.size / steps:.2f} bytes per step" if steps else ""
+    values = archived.as_json() | {"place": archived.place, "dry_run": dry_run}
+    per_step = f", {manifest.size / archived.steps:.2f} bytes per step" if archived.steps else ""
     fate = "removed" if archived.removed else "kept"
     state = "" if archived.new else "  (existed already, undamaged)"
     rows = {

@@ -15,7 +15,9 @@ from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
+from runner.analysis.episodes import TYPICAL, EpisodeRef
 from runner.errors import RunNotFound
+from runner.export.encoder import FORMATS
 from runner.export.plugin import installed_export
 from runner.export.rerun.selection import Request
 from runner.runs.run import Run
@@ -157,6 +159,20 @@ async def replay(
 async def report(run: RecordedRun, compute: ComputationOf) -> Response:
     """Return what `dualtaxi report` writes, as a download."""
     return attachment(await compute(computed.report, run.recording), f"{run.file_stem}.html")
+
+
+@router.post(
+    "/film", response_class=Response, responses=FILE | BUSY_ERRORS, summary="A film of an episode of the run."
+)
+async def film(
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: Annotated[str, Query(max_length=60, description="The episode, and its first step.")] = TYPICAL,
+    ending: Annotated[str, Query(max_length=20, description=f"Of its name: {', '.join(FORMATS)}.")] = ".mp4",
+) -> Response:
+    """Return what `dualtaxi export film` writes, as a download."""
+    body = await compute(computed.film, run, EpisodeRef.parse(at), ending, alone=True)
+    return attachment(body, f"{run.file_stem}{ending}")
 
 
 @router.get(

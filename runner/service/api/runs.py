@@ -19,11 +19,21 @@ from runner.runs.catalogue.columns import as_json as row_as_json
 from runner.runs.catalogue.filters import parse
 from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.run import Run, label
+from runner.service import computed
 from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
-from runner.service.dependencies import CacheOf, CatalogueOf, FoundRun, RecordedRun, SettingsOf
+from runner.service.dependencies import (
+    CacheOf,
+    CatalogueOf,
+    FoundRun,
+    ProcessesOf,
+    RecordedRun,
+    SettingsOf,
+    json_response,
+    require_written,
+)
 from runner.service.errors import Refused
-from runner.service.problems import error_docs
+from runner.service.problems import BUSY_ERRORS, error_docs
 from runner.service.settings import ServiceSettings
 from runner.util.values import Json
 
@@ -217,6 +227,26 @@ def stop_run(run: FoundRun) -> StopResponse:
     """Make `should_stop` of the recorded environment True; the loop ends when it looks at it."""
     run.request_stop()
     return StopResponse(run_id=run.run_id, stop_requested=True)
+
+
+@router.post(
+    "/runs/{run}/archive",
+    response_model=dict[str, object],
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT) | BUSY_ERRORS,
+    summary="Archive a run.",
+)
+async def archive_run(
+    run: FoundRun,
+    catalogue: CatalogueOf,
+    settings: SettingsOf,
+    processes: ProcessesOf,
+    remove: Annotated[bool, Query(description="Remove the recording once its archive was compared.")] = False,
+) -> Response:
+    """Archive a run, and return what `dualtaxi archive --json` prints, without the archive's place."""
+    require_written(run, settings.recordings[0], "archive")
+    result = await processes(computed.archive, run, remove)
+    catalogue.changed()
+    return json_response(result)
 
 
 def relabelled(run: Run, labels: LabelChanges, catalogue: Catalogue) -> dict[str, object]:

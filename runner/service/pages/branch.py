@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from http import HTTPStatus
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
-from starlette.concurrency import run_in_threadpool
 
 from runner.environments.naming import numbered_actions
 from runner.errors import RunnerError
@@ -19,8 +18,8 @@ from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
 from runner.service.dependencies import JobsOf, RecordedRun
 from runner.service.jobs.checking import BranchQuestion
-from runner.service.pages.frame import run_page
-from runner.service.pages.rendering import Form, message_of, number_in, to_job
+from runner.service.pages.frame import RunPage
+from runner.service.pages.rendering import Form, number_in, to_job
 
 MAX_CHOICES: Final = 200
 """More actions are typed, not listed."""
@@ -28,19 +27,19 @@ router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
 
 
 @router.get("")
-def form(request: Request, run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
+def form(run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
     """Show the form for a step."""
-    return _page(request, run, {"at": at})
+    return _page(run, {"at": at})
 
 
 @router.post("")
-async def branch(request: Request, run: RecordedRun, sent: Form, jobs: JobsOf) -> Response:
+async def branch(run: RecordedRun, sent: Form, jobs: JobsOf) -> Response:
     """Queue the branch, or show what is wrong."""
     given = {name: text.strip() for name, text in sent.items()}
     try:
         job = await queue_branch(run, jobs, _question(given))
     except RunnerError as error:
-        return await run_in_threadpool(_page, request, run, given, message_of(error, request))
+        return _page(run, given, error)
     return to_job(job.number)
 
 
@@ -65,20 +64,23 @@ def _question(given: Mapping[str, str]) -> BranchQuestion:
         raise RequestValidationError(error.errors()) from error
 
 
-def _page(request: Request, run: Run, fields: Mapping[str, str], problem: str = "") -> Response:
+def _page(run: Run, fields: Mapping[str, str], problem: RunnerError | None = None) -> Response:
     """Return the form with the fields as they were sent, or why an episode of a loop cannot be played on."""
-    phase = "eval" if fields.get("at", "").startswith("eval:") else "train"
-    with open_recording(run.recording) as recording:
-        values = {
-            "form": fields,
-            "problem": problem,
-            "actions": _choices(recording, phase),
-            "max_choices": MAX_CHOICES,
-            "is_trained": recording.can_train_again,
-            "refusal": "" if recording.can_train_again else why_not_rerun(recording),
-        }
-    status = HTTPStatus.UNPROCESSABLE_ENTITY if problem else HTTPStatus.OK
-    return run_page(request, run, "replay", "run_branch.html", values, status)
+
+    def values() -> dict[str, object]:
+        phase = "eval" if fields.get("at", "").startswith("eval:") else "train"
+        with open_recording(run.recording) as recording:
+            return {
+                "form": fields,
+                "problem": problem,
+                "actions": _choices(recording, phase),
+                "max_choices": MAX_CHOICES,
+                "is_trained": recording.can_train_again,
+                "refusal": "" if recording.can_train_again else why_not_rerun(recording),
+            }
+
+    status = HTTPStatus.UNPROCESSABLE_ENTITY if problem else None
+    return RunPage(run, "replay", "run_branch.html", values, status)
 
 
 def _choices(recording: Recording, phase: str) -> dict[str, list[str]]:

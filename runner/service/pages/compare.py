@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import HTMLResponse
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.diff.sections import made_sections
@@ -28,7 +27,7 @@ from runner.service.api.reading import AxisName
 from runner.service.dependencies import CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, last_results, result_of
-from runner.service.pages.rendering import page
+from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
 from runner.util import humanize
 from runner.util.humanize import counted
@@ -123,7 +122,7 @@ TwoRuns = Annotated[list[Run], Depends(two_runs)]
 
 
 @router.get("")
-def overview(request: Request, runs: ChosenRuns, scores: Scores = "") -> Response:
+def overview(runs: ChosenRuns, scores: Scores = "") -> Response:
     """Show the differences of runs, and their curves in common plots."""
     settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in runs]
     rows = [
@@ -144,7 +143,7 @@ def overview(request: Request, runs: ChosenRuns, scores: Scores = "") -> Respons
         "scores": scores,
         "tasks": tasks_address if len(environments) > 1 else "",
     }
-    return page(request, "compare_overview.html", values)
+    return Page("compare_overview.html", values)
 
 
 @router.get("/tasks")
@@ -157,33 +156,33 @@ async def tasks(
 
 
 @router.get("/divergence")
-async def divergence(request: Request, runs: TwoRuns, compute: ComputationOf) -> Response:
+async def divergence(runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the first step at which two runs differ, and the cause."""
     difference = await compute.shown(ShownDifference, fragments.difference, *runs)
     values = {"compared": _compared(runs, "/divergence"), "found": difference}
-    return await run_in_threadpool(page, request, "compare_divergence.html", values)
+    return Page("compare_divergence.html", values)
 
 
 @router.get("/tables")
-async def tables(request: Request, runs: TwoRuns, compute: ComputationOf) -> Response:
+async def tables(runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the difference of the Q-tables of two runs."""
     body = (await compute.shown(ShownDifference, fragments.difference, *runs)).tables
     values = {"compared": _compared(runs, "/tables"), "body": body}
-    return await run_in_threadpool(page, request, "compare_tables.html", values)
+    return Page("compare_tables.html", values)
 
 
 @router.get("/code")
-def code(request: Request, runs: TwoRuns) -> Response:
+def code(runs: TwoRuns) -> Response:
     """Show how the code of two runs differs, and how else they were made."""
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
         lead, files, provenance = made_sections(a, b)
     values = {"compared": _compared(runs, "/code"), "lead": lead, "code": files, "provenance": provenance}
-    return page(request, "compare_code.html", values)
+    return Page("compare_code.html", values)
 
 
 @router.get("/replay")
 async def replay(
-    request: Request, runs: TwoRuns, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
+    runs: TwoRuns, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
     if at:
@@ -198,13 +197,13 @@ async def replay(
         has_one = other.episode >= 0 and places == [step, step]
         return link("/compare/replay", {"run": names, "at": str(other)}) if has_one else ""
 
-    def show() -> Response:
+    def show() -> dict[str, object]:
         head, shown = _compared(runs, "/replay"), []
         for one, place in zip(head.runs, places, strict=True):
             source = f"/api/v1/runs/{one.head.id}/replay/{place.episode_path}"
             with open_recording(one.recording) as recording:
                 shown.append(panel_of(recording, place.phase, source, one.label, one.number))
-        values = {
+        return {
             "compared": head,
             "shown": shown,
             "episode": step.heading,
@@ -214,9 +213,8 @@ async def replay(
             "after": neighbour(1),
             "base": link("/compare/replay", {"run": names}),
         }
-        return page(request, "compare_replay.html", values)
 
-    return await run_in_threadpool(show)
+    return Page("compare_replay.html", show)
 
 
 def _compared(runs: list[Run], here: str) -> Compared:

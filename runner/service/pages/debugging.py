@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Response
 from pydantic import Field
-from starlette.concurrency import run_in_threadpool
 
 from runner.service import fragments
 from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.fragments import ShownBranches
-from runner.service.pages.frame import run_page
+from runner.service.pages.frame import RunPage
 from runner.service.pages.replay import BEFORE, T, stage_of, step_of
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -24,7 +23,6 @@ Action = Annotated[str, Field(max_length=200)]
 @router.get("/what-if/{at}")
 @router.get("/what-if/{at}/{action}")
 async def what_if(
-    request: Request,
     run: RecordedRun,
     compute: ComputationOf,
     at: At,
@@ -37,8 +35,8 @@ async def what_if(
     start = max(0, shown_t - BEFORE)
     branches = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
 
-    def show() -> Response:
-        values = {
+    def show() -> dict[str, object]:
+        return {
             "at": str(step),
             "title": f"What if? {step.heading}, step {step.t:,}",
             "found": branches,
@@ -46,6 +44,5 @@ async def what_if(
             "source": f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",
             "recorded": f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
         }
-        return run_page(request, run, "replay", "run_what_if.html", values)
 
-    return await run_in_threadpool(show)
+    return RunPage(run, "replay", "run_what_if.html", show)

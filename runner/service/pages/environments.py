@@ -6,14 +6,14 @@ from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Final
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Depends, Response
 
 from runner.analysis.episodes import EpisodeRef
 from runner.recording.reader import Recording, open_recording
 from runner.recording.steps import EpisodeSteps
 from runner.runs.run import Run
 from runner.service.dependencies import EPISODES, RecordedRun
-from runner.service.pages.frame import run_page
+from runner.service.pages.frame import RunPage
 from runner.service.pages.replay import T, panel_of
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
@@ -25,14 +25,13 @@ MAX_PANELS: Final = 8
 def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
     @router.get(f"{path}/environments")
     def environments(
-        request: Request,
         run: RecordedRun,
         at: EpisodeRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
         t: T = 0,
     ) -> Response:
         """Show all environments of a vector during an episode of one of them."""
         values = _environments(run, replace(at, t=t))
-        return run_page(request, run, "replay", "run_environments.html", values)
+        return RunPage(run, "replay", "run_environments.html", values)
 
 
 for _path, _episode in EPISODES.items():

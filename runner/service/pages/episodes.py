@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 
 from runner.analysis.episodes import UNKNOWN_EVALUATION, references
 from runner.analysis.frames import episode_columns
@@ -13,7 +13,7 @@ from runner.analysis.sections import Grid
 from runner.environments.naming import event_in_words
 from runner.service.addresses import Paging, link
 from runner.service.dependencies import OpenRecording, RecordedRun
-from runner.service.pages.frame import run_page
+from runner.service.pages.frame import RunPage
 from runner.util.humanize import number_column
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -25,7 +25,6 @@ _HIDDEN: Final = ("episode", "success", "terminated", "truncated", "last_step")
 
 @router.get("/episodes")
 def episodes(
-    request: Request,
     run: RecordedRun,
     recording: OpenRecording,
     phase: Literal["train", "eval"] = "train",
@@ -56,7 +55,7 @@ def episodes(
     paging = Paging(number, total, ROWS, link(f"/runs/{run.run_id}/episodes", {"phase": phase}))
     grid = Grid(tuple(headings), rows)
     shown = {"phase": phase, "total": total, "paging": paging, "grid": grid, "links": links}
-    return run_page(request, run, "episodes", "run_episodes.html", shown)
+    return RunPage(run, "episodes", "run_episodes.html", shown)
 
 
 def _heading(column: str, agents: int) -> str:

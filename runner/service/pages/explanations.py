@@ -5,8 +5,7 @@ from __future__ import annotations
 from http import HTTPStatus
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
-from starlette.concurrency import run_in_threadpool
+from fastapi import APIRouter, Query, Response
 
 from runner.analysis.episodes import EpisodeRef
 from runner.debugging.explain import DEFAULT_SEEDS
@@ -17,20 +16,20 @@ from runner.service.api.comparing import Part, found_explanation
 from runner.service.api.questions import queue_explanation
 from runner.service.dependencies import JobsOf, SettingsOf
 from runner.service.jobs.explanations import ExplainQuestion
-from runner.service.pages.rendering import Form, message_of, number_in, page, to_job
+from runner.service.pages.rendering import Form, Page, number_in, to_job
 
 router = APIRouter(include_in_schema=False)
 Name = Annotated[str, Query(max_length=200)]
 
 
 @router.get("/explain")
-def form(request: Request, a: Name = "", b: Name = "") -> Response:
+def form(a: Name = "", b: Name = "") -> Response:
     """Show the form."""
-    return page(request, "explain.html", {"form": {"a": a, "b": b}, "problem": ""})
+    return Page("explain.html", {"form": {"a": a, "b": b}, "problem": ""})
 
 
 @router.post("/explain")
-async def explain(request: Request, sent: Form, jobs: JobsOf) -> Response:
+async def explain(sent: Form, jobs: JobsOf) -> Response:
     """Queue the explanation, or show what is wrong."""
     given = {name: text.strip() for name, text in sent.items()}
     try:
@@ -44,18 +43,18 @@ async def explain(request: Request, sent: Form, jobs: JobsOf) -> Response:
         )
         job = await queue_explanation(jobs, question)
     except RunnerError as error:
-        values = {"form": given, "problem": message_of(error, request)}
-        return await run_in_threadpool(page, request, "explain.html", values, HTTPStatus.UNPROCESSABLE_ENTITY)
+        values = {"form": given, "problem": error}
+        return Page("explain.html", values, HTTPStatus.UNPROCESSABLE_ENTITY)
     return to_job(job.number)
 
 
 @router.get("/sweeps/explanations/{pair}/{metric}")
-def explanation(request: Request, pair: Part, metric: Part, settings: SettingsOf) -> Response:
+def explanation(pair: Part, metric: Part, settings: SettingsOf) -> Response:
     """Show an explanation."""
     result = found_explanation(pair, metric, settings)
     first, *others = sections(result)
     values = {"title": first.title, "lead": first.sentences, "links": _links(result)}
-    return page(request, "explanation.html", {**values, "plots": plots(result), "results": others})
+    return Page("explanation.html", {**values, "plots": plots(result), "results": others})
 
 
 def _links(found: Explanation) -> list[Link]:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Final
-
-from fastapi import Request, Response
 
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.qtable import recorded_tables
@@ -19,7 +16,7 @@ from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
 from runner.runs.run import Run
-from runner.service.pages.rendering import page
+from runner.service.pages.rendering import Page, Values, made
 from runner.util import humanize
 from runner.util.plugins import VIEWS, plugin_names
 from runner.views import installed_view
@@ -61,16 +58,13 @@ class RunHead:
     tabs: tuple[tuple[str, str], ...]
 
 
-def run_page(
-    request: Request,
-    run: Run,
-    here: str,
-    template: str,
-    values: Mapping[str, object],
-    status: HTTPStatus = HTTPStatus.OK,
-) -> Response:
-    """Return a page of a run; `here` is the path of its tab."""
-    return page(request, template, {"run": head_of(run), "here": here, **values}, status)
+class RunPage(Page):
+    """A page of a run; `here` is the path of its tab."""
+
+    def __init__(
+        self, run: Run, here: str, template: str, values: Values, status: HTTPStatus | None = None
+    ) -> None:
+        super().__init__(template, lambda: {"run": head_of(run), "here": here, **made(values)}, status)
 
 
 def head_of(run: Run) -> RunHead:

@@ -6,7 +6,7 @@ from datetime import datetime
 from http import HTTPStatus
 from typing import Annotated, Final
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 
 from runner.debugging.explanation_files import explanations_in
 from runner.service.addresses import Paging
@@ -15,7 +15,7 @@ from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import QueuedJob
-from runner.service.pages.rendering import page, to_job
+from runner.service.pages.rendering import Page, to_job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
 
@@ -26,24 +26,22 @@ PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**6)]
 
 
 @router.get("")
-def queue(
-    request: Request, jobs: JobsOf, uploads: UploadsOf, owner: OwnerOf, number: PageNumber = 1
-) -> Response:
+def queue(jobs: JobsOf, uploads: UploadsOf, owner: OwnerOf, number: PageNumber = 1) -> Response:
     """Show the jobs, the newest first, and the uploads that are not yet runs."""
     pending = [upload for upload in list_uploads(uploads, owner).uploads if upload.state != "stored"]
-    return page(request, "queue.html", {**_rows(jobs, number), "uploads": pending[:ROWS]})
+    return Page("queue.html", {**_rows(jobs, number), "uploads": pending[:ROWS]})
 
 
 @router.get("/status")
-def queue_status(request: Request, jobs: JobsOf, number: PageNumber = 1) -> Response:
+def queue_status(jobs: JobsOf, number: PageNumber = 1) -> Response:
     """Return the jobs as a part of their page; 204 if all are over."""
     rows = _rows(jobs, number)
     no_change = Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, "queue_rows.html", rows) if rows["is_active"] else no_change
+    return Page("queue_rows.html", rows) if rows["is_active"] else no_change
 
 
 @router.get("/{number}")
-def job(request: Request, jobs: JobsOf, number: Number) -> Response:
+def job(jobs: JobsOf, number: Number) -> Response:
     """Show a job: its progress, its log, its runs."""
     events, place = jobs.store.last_events(number, MAX_LINES)
     own_job = jobs.store.job(number)  # read after its log: the script of the page receives later events
@@ -58,7 +56,7 @@ def job(request: Request, jobs: JobsOf, number: Number) -> Response:
         "seconds": _seconds(own_job),
         "explanations": [name for name in answers if name.startswith(f"{own_job.name}/")],
     }
-    return page(request, "job.html", values)
+    return Page("job.html", values)
 
 
 @router.post("/{number}/cancel")

@@ -7,15 +7,14 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.responses import HTMLResponse
-from starlette.concurrency import run_in_threadpool
 
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
-from runner.service.pages.frame import run_page
+from runner.service.pages.frame import RunPage
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -31,10 +30,10 @@ def _add_page(tab: str, body_of: Callable[[Path], bytes], is_live: bool = False)
     """Add a page of the HTML that a function returns; a live one loads it again while the run is running."""
 
     @router.get(f"/{tab}")
-    async def body_page(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
+    async def body_page(run: RecordedRun, compute: ComputationOf) -> Response:
         body = (await compute(body_of, run.recording)).decode()
         values = {"body": body, "live": _live(run, f"{tab}/part") if is_live else ""}
-        return await run_in_threadpool(run_page, request, run, tab, "run_body.html", values)
+        return RunPage(run, tab, "run_body.html", values)
 
     if is_live:
 
@@ -51,25 +50,21 @@ _add_page("pictures", fragments.pictures)
 
 
 @router.get("/learned")
-async def learned(
-    request: Request, run: RecordedRun, compute: ComputationOf, state: StateParts = None
-) -> Response:
+async def learned(run: RecordedRun, compute: ComputationOf, state: StateParts = None) -> Response:
     """Show the maps of what was learned, in the situation of a state."""
     body = (await compute(fragments.maps, run.recording, tuple(state or ()))).decode()
-    return await run_in_threadpool(
-        run_page, request, run, "learned", "run_body.html", {"body": body, "live": ""}
-    )
+    return RunPage(run, "learned", "run_body.html", {"body": body, "live": ""})
 
 
 @router.get("/console")
 async def console(
-    request: Request, run: RecordedRun, compute: ComputationOf, sought: Sought = "", stream: Stream = ""
+    run: RecordedRun, compute: ComputationOf, sought: Sought = "", stream: Stream = ""
 ) -> Response:
     """Show the last lines of the output, or the last that have a text."""
     body = (await compute(fragments.console, run.recording, sought, stream)).decode()
     live = _live(run, "console/part", q=sought, stream=stream)
     values = {"body": body, "sought": sought, "stream": stream, "live": live}
-    return await run_in_threadpool(run_page, request, run, "console", "run_console.html", values)
+    return RunPage(run, "console", "run_console.html", values)
 
 
 @router.get("/console/part")

@@ -16,6 +16,8 @@ import jinja2
 from fastapi import Depends, FastAPI, Request, Response
 from fastapi.responses import RedirectResponse
 from markupsafe import Markup
+from starlette.concurrency import run_in_threadpool
+from starlette.types import Receive, Scope, Send
 
 from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
@@ -39,6 +41,9 @@ MAX_FIELDS: Final = 100
 """Fields of a form."""
 
 
+Values = Mapping[str, object] | Callable[[], Mapping[str, object]]
+
+
 @dataclass(frozen=True)
 class Viewer:
     """The user of a page, who decides what it offers."""
@@ -48,12 +53,37 @@ class Viewer:
     can_write: bool
 
 
-def page(
-    request: Request, template: str, values: Mapping[str, object], status: HTTPStatus = HTTPStatus.OK
-) -> Response:
-    """Return a template filled with values as the response to a request."""
-    body = render(request.url.path, viewer_of(request), template, values)
-    return Response(body, status, media_type="text/html")
+class Page(Response):
+    """A template, filled with values in a thread when it is sent; a function makes them there.
+
+    The value `problem` is why a request was refused, an error or its message; the status is then 400 by
+    default.
+    """
+
+    media_type = "text/html"
+
+    def __init__(self, template: str, values: Values, status: HTTPStatus | None = None) -> None:
+        super().__init__()
+        self._template, self._values, self._status = template, values, status
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send the page."""
+        self.body = await run_in_threadpool(self._render, Request(scope))
+        self.headers["content-length"] = str(len(self.body))
+        await super().__call__(scope, receive, send)
+
+    def _render(self, request: Request) -> bytes:
+        values = dict(made(self._values))
+        problem = values.get("problem")
+        self.status_code = self._status or (HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK)
+        if isinstance(problem, RunnerError):
+            values["problem"] = message_of(problem, request)
+        return render(request.url.path, viewer_of(request), self._template, values)
+
+
+def made(values: Values) -> Mapping[str, object]:
+    """Return the values of a page."""
+    return values() if callable(values) else values
 
 
 def to_job(number: int) -> Response:
@@ -157,7 +187,7 @@ def _error_page(request: Request, response: Response) -> Response:
     status = HTTPStatus(response.status_code)
     message = json.loads(bytes(response.body))["error"]["message"]
     values = {"title": status.phrase.capitalize(), "message": message}
-    error_page = page(request, "problem.html", values, status)
+    error_page = Page("problem.html", values, status)
     headers = {key: value for key, value in response.headers.items() if not key.startswith("content-")}
     error_page.headers.update(headers)
     return error_page

@@ -10,9 +10,8 @@ from http import HTTPStatus
 from itertools import islice
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import RedirectResponse
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
@@ -36,8 +35,8 @@ from runner.service.dependencies import (
     PicturesOf,
     RecordedRun,
 )
-from runner.service.pages.frame import run_page
-from runner.service.pages.rendering import Form, message_of, page
+from runner.service.pages.frame import RunPage
+from runner.service.pages.rendering import Form, Page
 from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
@@ -147,7 +146,6 @@ async def thumbnail(
 
 @router.get("/latest")
 async def latest(
-    request: Request,
     run: RecordedRun,
     compute: ComputationOf,
     shown: Annotated[str, Query(max_length=40)] = "",
@@ -161,22 +159,21 @@ async def latest(
         over = {} if run.status == "running" else {"X-Run-Over": "true"}
         return Response(status_code=HTTPStatus.NO_CONTENT, headers=over)
 
-    def show() -> Response:
+    def show() -> dict[str, object]:
         address = f"/runs/{run.run_id}/replay/{path}"
         label = f"{run.title}: training episode {int(path.partition('/')[2]):,}"
         with open_recording(run.recording) as recording:
             panel = panel_of(
                 recording, "train", f"/api/v1{address}", label, None, address=address, episode=path
             )
-        return page(request, "latest.html", {"panel": panel})
+        return {"panel": panel}
 
-    return await run_in_threadpool(show)
+    return Page("latest.html", show)
 
 
 def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
     @router.get(path)
     async def replay(
-        request: Request,
         run: RecordedRun,
         compute: ComputationOf,
         streams: PicturesOf,
@@ -195,16 +192,15 @@ def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None
             part = error
         await preparing
 
-        def show() -> Response:  # in a thread, as it reads the recording
+        def show() -> dict[str, object]:
             with open_recording(run.recording) as recording:
                 branches = _branches(recording, run, catalogue)
             if isinstance(part, RunnerError):
-                values = _values(run, at, branches, None, message_of(part, request))
-                return run_page(request, run, "replay", "run_replay.html", values, HTTPStatus.NOT_FOUND)
-            values = _values(run, at, branches, stage_of(json.loads(part), t))
-            return run_page(request, run, "replay", "run_replay.html", values)
+                return _values(run, at, branches, None) | {"problem": part}
+            return _values(run, at, branches, stage_of(json.loads(part), t)) | {"problem": ""}
 
-        return await run_in_threadpool(show)
+        status = HTTPStatus.NOT_FOUND if isinstance(part, RunnerError) else None
+        return RunPage(run, "replay", "run_replay.html", show, status)
 
 
 for _path, _episode in EPISODES.items():
@@ -239,9 +235,7 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
     ]
 
 
-def _values(
-    run: Run, at: EpisodeRef, branches: list[Link], stage: ReplayStage | None, problem: str = ""
-) -> dict[str, object]:
+def _values(run: Run, at: EpisodeRef, branches: list[Link], stage: ReplayStage | None) -> dict[str, object]:
     with open_recording(run.recording) as recording:
         episodes = recording.train.episodes.count()
         environments, is_job = recording.environments, recording.can_train_again
@@ -258,7 +252,6 @@ def _values(
     return {
         "at": at,
         "stage": stage,
-        "problem": problem,
         "episodes": episodes,
         "evaluations": evaluations,
         "before": neighbour(at.episode - 1),

@@ -14,18 +14,17 @@ from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Final
 
-from fastapi import APIRouter, HTTPException, Query, Request, Response
+from fastapi import APIRouter, HTTPException, Query, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
-from starlette.concurrency import run_in_threadpool
 
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import ComputationOf, RecordedRun
 from runner.service.guard import POLICY
-from runner.service.pages.frame import run_page
-from runner.service.pages.rendering import page
+from runner.service.pages.frame import RunPage
+from runner.service.pages.rendering import Page
 from runner.service.pages.replay import step_of
 from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
@@ -45,7 +44,7 @@ _SECONDS: Final = 60
 
 @router.get("/runs/{run}/rerun")
 async def viewer(
-    request: Request, run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
+    run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show the Rerun viewer, opened at a step."""
     step = await step_of(run, compute, at) if at else None
@@ -55,12 +54,12 @@ async def viewer(
     back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
     values = {"content": content, "back": back, "frame": frame}
-    return await run_in_threadpool(run_page, request, run, "rerun", "run_rerun.html", values)
+    return RunPage(run, "rerun", "run_rerun.html", values)
 
 
 @router.get("/runs/{run}/rerun/frame")
 async def frame(
-    request: Request, run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
+    run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
 ) -> Response:
     """Show the viewer alone, opened at a step."""
     step = await step_of(run, compute, at) if at else None
@@ -76,7 +75,7 @@ async def frame(
         "recording": link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
         "step": place["time"],
     }
-    response = page(request, "rerun_frame.html", values)
+    response = Page("rerun_frame.html", values)
     response.headers["content-security-policy"] = FRAME_POLICY
     return response
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import contextlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
-from runner.analysis.episodes import TYPICAL, EpisodeRef
+from runner.analysis.episodes import TYPICAL
 from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
@@ -28,8 +29,8 @@ from runner.recording.run_file import EvaluationMetrics, RecentTraining, has_env
 from runner.runs.catalogue.removal import clean, plan, remove
 from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
-from runner.service import computed, fragments
-from runner.service.api.files import attachment
+from runner.service import fragments
+from runner.service.api import files, runs
 from runner.service.api.reading import AxisName
 from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
@@ -41,11 +42,10 @@ from runner.service.dependencies import (
     ProcessesOf,
     RecordedRun,
     SettingsOf,
-    require_written,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import environment_of, last_results, result_of, run_page
-from runner.service.pages.rendering import Form, message_of, page, viewer_of
+from runner.service.pages.frame import RunPage, environment_of, last_results, result_of
+from runner.service.pages.rendering import Form, Page, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
 from runner.util.values import Json
@@ -76,15 +76,33 @@ class Status:
 
 
 @router.get("")
-def overview(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+async def overview(request: Request, run: FoundRun) -> Response:
     """Show the status of a run and its metrics; what may take longer is loaded by the page."""
-    return _overview(request, run, jobs, settings)
+    return _overview(request, run)
 
 
-@router.post("/labels")
-def label(
-    request: Request, run: FoundRun, form: Form, jobs: JobsOf, catalogue: CatalogueOf, settings: SettingsOf
-) -> Response:
+class _Act(APIRoute):
+    """A change of a run; if it is refused, the page of the run says why."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """Return the function that handles a request."""
+        handle = super().get_route_handler()
+
+        async def act(request: Request) -> Response:
+            try:
+                return await handle(request)
+            except RunnerError as error:
+                run = await run_in_threadpool(request.app.state.catalogue.find, request.path_params["run"])
+                return _overview(request, run, error)
+
+        return act
+
+
+acts = APIRouter(route_class=_Act)
+
+
+@acts.post("/labels")
+def label(run: FoundRun, form: Form, catalogue: CatalogueOf) -> Response:
     """Change the labels of a run."""
     tags = form.get("tags", "").split()
     changed = LabelChanges.model_construct(
@@ -93,78 +111,45 @@ def label(
         untag=sorted(set(run.tags) - set(tags)),
         note=form.get("note", ""),
     )
-    try:
-        relabelled(run, changed, catalogue)
-    except RunnerError as error:
-        return _overview(request, run, jobs, settings, problem=message_of(error, request))
+    relabelled(run, changed, catalogue)
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
-@router.post("/stop")
-def stop(request: Request, run: FoundRun, jobs: JobsOf, settings: SettingsOf) -> Response:
+@acts.post("/stop")
+def stop(run: FoundRun) -> Response:
     """Request that the loop which records the run stops."""
-    try:
-        run.request_stop()
-    except RunnerError as error:
-        return _overview(request, run, jobs, settings, problem=message_of(error, request))
+    run.request_stop()
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
 
-@router.post("/remove")
-def remove_run(
-    request: Request, run: FoundRun, form: Form, jobs: JobsOf, catalogue: CatalogueOf, settings: SettingsOf
-) -> Response:
+@acts.post("/remove")
+def remove_run(run: FoundRun, form: Form, catalogue: CatalogueOf, settings: SettingsOf) -> Response:
     """Remove a run for good, once that was confirmed by its id."""
-    try:
-        if form.get("confirm", "").strip() != run.run_id:
-            raise ConfigError(f"To remove the run and its recording for good, type its id, {run.run_id}.")
-        remove(plan(run, settings.recordings[0]))
-    except RunnerError as error:
-        return _overview(request, run, jobs, settings, problem=message_of(error, request))
+    if form.get("confirm", "").strip() != run.run_id:
+        raise ConfigError(f"To remove the run and its recording for good, type its id, {run.run_id}.")
+    remove(plan(run, settings.recordings[0]))
     catalogue.changed()
     clean(settings.recordings[0], [run.run_id])
     return RedirectResponse("/runs", HTTPStatus.SEE_OTHER)
 
 
-@router.post("/archive")
+@acts.post("/archive")
 async def archive(
-    request: Request,
-    run: FoundRun,
-    form: Form,
-    jobs: JobsOf,
-    catalogue: CatalogueOf,
-    settings: SettingsOf,
-    processes: ProcessesOf,
+    run: FoundRun, form: Form, catalogue: CatalogueOf, settings: SettingsOf, processes: ProcessesOf
 ) -> Response:
     """Archive a run, and remove its recording if the form says so."""
-    try:
-        require_written(run, settings.recordings[0], "archive")
-        await processes(computed.archive, run, "remove" in form)
-    except RunnerError as error:
-        problem = message_of(error, request)
-        return await run_in_threadpool(_overview, request, run, jobs, settings, problem)
-    catalogue.changed()
+    await runs.archive_run(run, catalogue, settings, processes, "remove" in form)
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
 
-@router.post("/film")
-async def film(
-    request: Request, run: RecordedRun, form: Form, jobs: JobsOf, settings: SettingsOf, compute: ComputationOf
-) -> Response:
+@acts.post("/film")
+async def film(run: RecordedRun, form: Form, compute: ComputationOf) -> Response:
     """Return a film of an episode as a download."""
-    ending = form.get("ending", "")
-    try:
-        step = EpisodeRef.parse(form.get("at", "").strip() or TYPICAL)
-        body = await compute(computed.film, run, step, ending, alone=True)
-    except RunnerError as error:
-        problem = message_of(error, request)
-        return await run_in_threadpool(_overview, request, run, jobs, settings, problem)
-    return attachment(body, f"{run.file_stem}{ending}")
+    return await files.film(run, compute, form.get("at", "").strip() or TYPICAL, form.get("ending", ""))
 
 
 @router.get("/status")
 def status(
-    request: Request,
     run: FoundRun,
     jobs: JobsOf,
     settings: SettingsOf,
@@ -177,14 +162,14 @@ def status(
     now = _status(run, jobs, settings)
     if run.status != status or not now.is_live:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return page(request, "run_status.html", {"status": now})
+    return Page("run_status.html", {"status": now})
 
 
 @router.get("/branches")
-def branches(request: Request, run: FoundRun, catalogue: CatalogueOf) -> Response:
+def branches(run: FoundRun, catalogue: CatalogueOf) -> Response:
     """Return the tree of branches that a run belongs to, as a part of its page; empty without any."""
     tree = catalogue.read(lambda index: index.branch_tree(run.run_id))
-    return page(request, "run_branches.html", {"run": run.run_id, "branches": tree})
+    return Page("run_branches.html", {"run": run.run_id, "branches": tree})
 
 
 @router.get("/random-policy")
@@ -203,7 +188,7 @@ async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisName
 
 
 @router.get("/evaluations")
-def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
+def evaluations(run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the last evaluations."""
     agents, events = recording.agents, recording.environment["event_names"]
     if recording.eval.has_metrics:
@@ -216,23 +201,23 @@ def evaluations(request: Request, run: RecordedRun, recording: OpenRecording) ->
     links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
     section = evaluations_section(recording, records) if records else None
     values = {"section": section, "links": links, "total": total}
-    return run_page(request, run, "evaluations", "run_evaluations.html", values)
+    return RunPage(run, "evaluations", "run_evaluations.html", values)
 
 
-def _overview(
-    request: Request, run: Run, jobs: JobQueue, settings: ServiceSettings, problem: str = ""
-) -> Response:
+def _overview(request: Request, run: Run, problem: RunnerError | None = None) -> Response:
     """Return the first page of a run; `problem` is why a request was refused."""
-    removal = plan(run, settings.recordings[0]) if viewer_of(request).can_write else None
-    values = {
-        "status": _status(run, jobs, settings),
-        "problem": problem,
-        "max_note": MAX_NOTE,
-        "removal": removal,
-        "film_endings": tuple(FORMATS),
-    }
-    status = HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK
-    return run_page(request, run, "", "run_overview.html", values, status)
+
+    def values() -> dict[str, object]:
+        settings = request.app.state.settings
+        return {
+            "status": _status(run, request.app.state.jobs, settings),
+            "problem": problem,
+            "max_note": MAX_NOTE,
+            "removal": plan(run, settings.recordings[0]) if viewer_of(request).can_write else None,
+            "film_endings": tuple(FORMATS),
+        }
+
+    return RunPage(run, "", "run_overview.html", values)
 
 
 def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
@@ -314,3 +299,6 @@ def _duration(run: Run) -> str:
         return f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
     seconds = run.summary.seconds
     return humanize.UNKNOWN if seconds is None else humanize.duration(seconds)
+
+
+router.include_router(acts)

@@ -28,7 +28,7 @@ from runner.runs.catalogue.usage import FREED_BY, usage_of
 from runner.service.addresses import Paging, link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
-from runner.service.pages.rendering import message_of, page, render, viewer_of
+from runner.service.pages.rendering import Page, message_of, render, viewer_of
 
 router = APIRouter(include_in_schema=False)
 
@@ -134,7 +134,7 @@ async def runs(
 
 
 @router.get("/disk")
-def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
+def disk(catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
     """Show the use of the disk, and what could be freed."""
     largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
     freeable = sums.freeable(settings.recordings)
@@ -145,7 +145,7 @@ def disk(request: Request, catalogue: CatalogueOf, settings: SettingsOf, jobs: J
         "rows": [(usage.row, usage.bytes) for usage in largest],
         "others": sums.runs - len(largest),
     }
-    return page(request, "disk.html", values)
+    return Page("disk.html", values)
 
 
 def _values(

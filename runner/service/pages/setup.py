@@ -16,7 +16,7 @@ from runner.recording.code import Code
 from runner.recording.messages import log_level
 from runner.recording.reader import open_recording
 from runner.service.dependencies import FoundRun, OpenRecording, RecordedRun, SettingsOf
-from runner.service.pages.frame import run_page
+from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import message_of
 from runner.util import humanize
 from runner.util.plugins import EXPORTS, plugin_names
@@ -58,7 +58,7 @@ class LogLine(NamedTuple):
 
 
 @router.get("/config")
-def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
+def config(run: FoundRun, settings: SettingsOf) -> Response:
     """Show configuration, provenance and log."""
     steps = [humanize.number(run.summary.get(name), 0) for name in ("train_steps", "eval_steps")]
     facts = {
@@ -90,13 +90,13 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
         "log": log,
         "exports": list(plugin_names(EXPORTS)),
     }
-    return run_page(request, run, "config", "run_config.html", values)
+    return RunPage(run, "config", "run_config.html", values)
 
 
 @router.get("/code")
 def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Response:
     """Show the user's code and the installed packages."""
-    provenance, problem, recorded = recording.provenance, "", Code()
+    provenance, problem, recorded = recording.provenance, None, Code()
     try:
         recorded = recording.code
     except RecordingError as error:
@@ -126,4 +126,4 @@ def code(request: Request, run: RecordedRun, recording: OpenRecording) -> Respon
         "files_left_out": max(0, len(files) - MAX_CODE_FILES),
         "problem": problem,
     }
-    return run_page(request, run, "code", "run_code.html", values)
+    return RunPage(run, "code", "run_code.html", values)

@@ -19,7 +19,7 @@ from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS
 from runner.service.jobs.store import CheckedJob
-from runner.service.pages.rendering import Form, number_in, page, to_job, viewer_of
+from runner.service.pages.rendering import Form, Page, number_in, to_job, viewer_of
 from runner.service.problems import error_body
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
@@ -101,7 +101,7 @@ def form(
     text = SWEEP if sweep else FIRST
     if origin:
         text = write_yaml(catalogue.find(origin).file.config)
-    return page(request, TEMPLATE, _values(text))
+    return Page(TEMPLATE, _values(text))
 
 
 @router.post("")
@@ -111,12 +111,11 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     try:
         checked = await jobs.checker.check(text)
         if sent.get("action") == "check":
-            values = _values(text, sent, checked=checked)
-            return await run_in_threadpool(page, request, TEMPLATE, values)
+            return Page(TEMPLATE, _values(text, sent, checked=checked))
         job = await run_in_threadpool(jobs.add, text, checked, number_in(sent, "workers"))
     except RunnerError as error:
         values = _values(text, sent, _problems(request, text, error))
-        return await run_in_threadpool(page, request, TEMPLATE, values, HTTPStatus.UNPROCESSABLE_ENTITY)
+        return Page(TEMPLATE, values, HTTPStatus.UNPROCESSABLE_ENTITY)
     return to_job(job.number)
 
 

@@ -22,7 +22,7 @@ from runner.service.addresses import link
 from runner.service.api.jobs import job_response
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
-from runner.service.pages.rendering import message_of, page
+from runner.service.pages.rendering import Page, message_of
 from runner.service.response_cache import ALWAYS
 from runner.sweep import folder_of, sweeps_in, tag_of
 from runner.sweep.state import read_sweep
@@ -68,12 +68,11 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
                 ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
             )
     names = [name for folder in settings.recordings for name in explanations_in(folder)]
-    return page(request, "sweeps.html", {"sweeps": listed_sweeps, "explanations": names})
+    return Page("sweeps.html", {"sweeps": listed_sweeps, "explanations": names})
 
 
 @router.get("/{name}")
 async def sweep(
-    request: Request,
     name: Name,
     settings: SettingsOf,
     catalogue: CatalogueOf,
@@ -85,21 +84,20 @@ async def sweep(
     cached = {part: cache.get(_key(state, part)) for part in PARTS}
     parts = {part: None if body is None else body.decode() for part, body in cached.items()}
 
-    def show() -> Response:
+    def show() -> dict[str, object]:
         own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
         parameters = [f"config.{path}" for path in read_sweep(name, state.folder).file.parameters]
         columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
         query = {"filter": f"{json.dumps(tag_of(name))} in tags", "columns": columns}
-        values = {
+        return {
             "name": name,
             "runs": state.runs,
             "runs_address": link("/runs", query),
             "job": job_response(own[-1]) if own else None,
             "parts": parts,
         }
-        return page(request, "sweep_page.html", values)
 
-    return await run_in_threadpool(show)
+    return Page("sweep_page.html", show)
 
 
 @router.get("/{name}/{part}")

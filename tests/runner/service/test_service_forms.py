@@ -174,6 +174,25 @@ def test_a_film_that_cannot_be_made_is_refused_on_the_page(client, fields, reaso
     assert "<h1" in answer.text
 
 
+def test_a_run_is_filmed_and_archived_by_routes(client, recordings, tmp_path):
+    run = find_run("first", recordings)
+    answer = client.post("/api/v1/runs/first/film", params={"at": "3:2", "ending": ".gif"})
+    assert answer.headers["content-disposition"] == f"attachment; filename*=utf-8''{run.file_stem}.gif"
+    film = tmp_path / "film.gif"
+    film.write_bytes(answer.content)
+    assert len(list(frames_of(film))) > 1
+    answer = client.post("/api/v1/runs/first/film", params={"ending": ".exe"})
+    assert (answer.status_code, "expected one of .mp4" in answer.text) == (400, True)
+    answer = client.post("/api/v1/runs/first/archive", params={"remove": True})
+    values = answer.json()
+    assert (values["run_id"], values["content_digest"]) == (run.run_id, run.summary.content_digest)
+    assert (values["new"], values["removed"]) == (True, True)
+    assert "place" not in values
+    assert not run.recording.exists()
+    answer = client.post("/api/v1/runs/first/archive")
+    assert (answer.status_code, "is archived already" in answer.text) == (400, True)
+
+
 def test_an_archive_and_a_film_name_the_extra_that_they_lack(recordings, monkeypatch):
     run = find_run("first", recordings)
     for module in ("pyarrow", "av"):
