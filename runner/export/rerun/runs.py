@@ -41,7 +41,7 @@ class RunReader:
 
     def __init__(self, writer: Writer) -> None:
         recording, selection = writer.source.recording, writer.selection
-        self._writer, self._recording, self._is_job = writer, recording, recording.has_tables
+        self.writer, self._recording, self._is_job = writer, recording, recording.has_tables
         self._loop = None if self._is_job else LoopTracks(writer)
         scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._makers: dict[str, list[StepTracks | ValueTracks | MapTracks]] = {}
@@ -66,7 +66,7 @@ class RunReader:
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but steps, and what never changes of them."""
-        source = self._writer.source
+        source = self.writer.source
         yield from self._loop.overview() if self._loop else metric_tracks(source)
         yield from mark_tracks(source)
         if not self._makers:
@@ -88,7 +88,7 @@ class RunReader:
         """Yield the selected steps, then pictures that are drawn of them."""
         names = [f"reward {spoken(name)}" for name in self._recording.agents]
         values = ValueReader(self._recording, self._scene) if self._is_job and self._makers else None
-        for phase, spans in self._writer.selection.by_phase.items():
+        for phase, spans in self.writer.selection.by_phase.items():
             style = [series_lines(names, phase_colours(phase, len(names)))]
             makers, batches = self._makers.get(phase, ()), self._batches(phase, spans, values)
             edges: set[int] = set()
@@ -104,7 +104,7 @@ class RunReader:
                 self._edges ^= edges
                 parts = ("q", "map", "grid") if self._is_job else ("grid",)
                 # A job's last step stays in view.
-                last = self._writer.last if self._is_job else np.inf
+                last = self.writer.last if self._is_job else np.inf
                 stops = [stop for stop in sorted(edges)[1::2] if stop <= last]
                 yield from cleared([f"{phase}/{part}" for part in parts], stops)
         if self._loop:
@@ -147,7 +147,7 @@ class RunReader:
 
     def _notice(self, x: float, y: float) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""
-        last, entity = self._writer.last, "notice/text"
+        last, entity = self.writer.last, "notice/text"
         gaps = np.array([0, *sorted(self._edges), last + 1]).reshape(-1, 2)
         gaps = gaps[gaps[:, 0].clip(min=1) < gaps[:, 1]]
         if len(gaps):

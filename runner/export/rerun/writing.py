@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -31,18 +29,18 @@ def export(
     stream = new_stream("-".join(source.recording.run_id for source in sources))
     with _saved(stream, path):
         stream.send_recording_name(" and ".join(source.title for source in sources))
-        readers = []
-        for source, selection in zip(sources, selections, strict=True):
-            writer = Writer(stream, source, selection, stage)
-            readers.append((writer, RunReader(writer)))
-        for writer, reader in readers:
-            writer.send(reader.overview())
-        writers = [writer for writer, _ in readers]
+        readers = [
+            RunReader(Writer(stream, source, selection, stage))
+            for source, selection in zip(sources, selections, strict=True)
+        ]
+        writers = [reader.writer for reader in readers]
+        for reader in readers:
+            reader.writer.send(reader.overview())
         are_jobs = all(source.recording.has_tables for source in sources)
-        if are_jobs:  # before the steps; active, as a viewer has arranged the metrics by itself
+        if are_jobs:  # before the steps, so that a viewer need not arrange them itself as they load
             stream.send_blueprint(blueprint(writers))
-        for writer, reader in readers:
-            writer.send(reader.steps())
+        for reader in readers:
+            reader.writer.send(reader.steps())
         if not are_jobs:  # their views follow from steps
             stream.send_blueprint(blueprint(writers))
     return selections
@@ -56,13 +54,15 @@ def export_runs(
     stage: Callable[[str], None] = lambda _: None,
 ) -> list[Selection]:
     """Write runs and their opened recordings as `export` does; several have different colours."""
-    colours = itertools.cycle(palette.COMPARED)
     sources = []
-    for run, recording in zip(runs, recordings, strict=True):
-        source = TrackSource(recording, f"{run.title} ({run.run_id})", marks=run.marks)
-        if len(runs) > 1:
-            source = dataclasses.replace(source, root=f"/{run.run_id}", tint=next(colours))
-        sources.append(source)
+    for i, (run, recording) in enumerate(zip(runs, recordings, strict=True)):
+        root, tint = f"/{run.run_id}", palette.COMPARED[i % len(palette.COMPARED)]
+        title = f"{run.title} ({run.run_id})"
+        sources.append(
+            TrackSource(recording, title, root, tint, run.marks)
+            if len(runs) > 1
+            else TrackSource(recording, title, marks=run.marks)
+        )
     return export(sources, request, path, stage)
 
 
