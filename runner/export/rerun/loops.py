@@ -35,6 +35,8 @@ MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
 MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
+FRAMES_SENT: Final = 64
+"""Pictures of an environment that are sent at once."""
 LOG: Final = TrackView("log", "Log", rrb.TextLogView)
 OBSERVED: Final = {"observation": observed, "action": acted}
 
@@ -77,10 +79,22 @@ class LoopTracks:
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but the steps."""
+        recording = self._recording
         for phase in schema.PHASES:
             yield from self._episodes(phase)
-        yield from in_tracks(self._rows())
-        for series, rows in self._recording.scalars():
+            yield from in_tracks(self._frames(phase), FRAMES_SENT)
+        yield from in_tracks(self._named(), 1)  # they may be large
+        texts = (
+            Row(
+                "log",
+                _step(text["log_time"]),
+                rr.TextLog(f"{text['name']}: {text['message']}", level="INFO"),
+                LOG,
+            )
+            for text in recording.table(schema.LOG_TOPIC).decoded()
+        )
+        yield from in_tracks(texts)
+        for series, rows in recording.scalars():
             names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
             for name in dict.fromkeys(names.tolist()):
                 own = rows[names == name]
@@ -88,25 +102,24 @@ class LoopTracks:
                 values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
                 yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
 
-    def _rows(self) -> Iterator[Row]:
-        """Yield recorded frames, and logged pictures, texts and arrays."""
+    def _frames(self, phase: str) -> Iterator[Row]:
+        """Yield recorded frames, at the steps of their environments."""
         recording, is_each_step = self._recording, frames_every(self._recording) == 1
-        for phase in schema.PHASES:
-            for frame in recording.phase(phase).frames.decoded():
-                environment, _ = frame_place(frame)
-                later = recording.environments - 1 - environment
-                step = max(0, _step(frame["log_time"]) - later)
-                if later >= 0 and (self._is_later(phase, environment, step) or not is_each_step):
-                    yield self._frame(phase, environment, step, _picture(frame["data"]))
-        for image in recording.table(schema.IMAGE_TOPIC).decoded():
+        for frame in recording.phase(phase).frames.decoded():
+            environment, _ = frame_place(frame)
+            later = recording.environments - 1 - environment
+            step = max(0, _step(frame["log_time"]) - later)
+            if later >= 0 and (self._is_later(phase, environment, step) or not is_each_step):
+                yield self._frame(phase, environment, step, _picture(frame["data"]))
+
+    def _named(self) -> Iterator[Row]:
+        """Yield logged pictures and arrays."""
+        for image in self._recording.table(schema.IMAGE_TOPIC).decoded():
             if data := _still(image["data"]):
-                name, step = entity_name(image["frame_id"]), _step(image["log_time"])
-                view = TrackView("picture", name, rrb.Spatial2DView)
-                yield Row(f"picture/{name}", step, _picture(data), view)
-        for text in recording.table(schema.LOG_TOPIC).decoded():
-            line = rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")
-            yield Row("log", _step(text["log_time"]), line, LOG)
-        for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
+                name, view = entity_name(image["frame_id"]), rrb.Spatial2DView
+                step, shown = _step(image["log_time"]), _picture(data)
+                yield Row(f"picture/{name}", step, shown, TrackView("picture", name, view))
+        for time, array in self._recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
             name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
             yield Row(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
 

@@ -12,7 +12,7 @@ import rerun as rr
 
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import GridLabels
-from runner.export.rerun.loops import LoopTracks
+from runner.export.rerun.loops import FRAMES_SENT, LoopTracks
 from runner.export.rerun.metrics import EVENTS, mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
@@ -108,7 +108,7 @@ class RunReader:
                 stops = [stop for stop in sorted(edges)[1::2] if stop <= last]
                 yield from cleared([f"{phase}/{part}" for part in parts], stops)
         if self._loop:
-            yield from in_tracks(self._loop.drawn())
+            yield from in_tracks(self._loop.drawn(), FRAMES_SENT)
         elif self._scene and self._makers:
             yield from self._notice(self._scene.columns / 2, self._scene.rows / 2)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -23,8 +22,6 @@ from runner.util.arrays import Array, Ints, Scalar
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
 """Maximum number of rows sent at once: the web viewer drops larger columns."""
-ROWS_SENT: Final = 64
-"""Rows with an archetype each, such as pictures, that are sent at once."""
 MAX_QUEUED: Final = 40 * MAX_ROWS
 """Rows that may wait to be compressed, which takes longer than making them."""
 _POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
@@ -184,20 +181,26 @@ def scalars(values: Array) -> list[rr.ComponentColumn]:
     return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
 
 
-def in_tracks(rows: Iterable[Row]) -> Iterator[Track]:
-    """Yield rows as tracks, some at a time: an archetype has the same components in all rows of an entity."""
-    rows = iter(rows)
-    while batch := list(islice(rows, ROWS_SENT)):
-        groups: dict[tuple[str, type], list[Row]] = {}
-        for row in batch:
-            groups.setdefault((row.entity, type(row.shown)), []).append(row)
-        for (entity, _), group in groups.items():
-            shown = []
-            for batches in zip(*(row.shown.as_component_batches() for row in group), strict=True):
-                items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
-                component = Component(batches[0].component_descriptor(), items)
-                shown.append(rr.ComponentColumn(component.descriptor, component))
-            yield Track(entity, {"step": np.array([row.step for row in group])}, shown, view=group[0].view)
+def in_tracks(rows: Iterable[Row], size: int = MAX_ROWS) -> Iterator[Track]:
+    """Yield rows as tracks, at most `size` rows of an entity at once; they have the same components."""
+    waiting: dict[tuple[str, type], list[Row]] = {}
+    for row in rows:
+        key = row.entity, type(row.shown)
+        group = waiting.setdefault(key, [])
+        group.append(row)
+        if len(group) == size:
+            yield _track_of(waiting.pop(key))
+    yield from map(_track_of, waiting.values())
+
+
+def _track_of(rows: Sequence[Row]) -> Track:
+    shown = []
+    for batches in zip(*(row.shown.as_component_batches() for row in rows), strict=True):
+        items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
+        component = Component(batches[0].component_descriptor(), items)
+        shown.append(rr.ComponentColumn(component.descriptor, component))
+    steps = np.array([row.step for row in rows])
+    return Track(rows[0].entity, {"step": steps}, shown, view=rows[0].view)
 
 
 def cleared(entities: Iterable[str], steps: Array | Sequence[int]) -> Iterator[Track]:
