@@ -10,6 +10,7 @@ import numpy as np
 
 from runner.analysis.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
+from runner.drawing.svg import drawing_of
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.util.arrays import Ints
@@ -125,7 +126,7 @@ def select(recording: Recording, request: Request) -> Selection:
     selection, is_job = Selection(trust=request.trust, warnings=shortcomings(recording)), recording.has_tables
     if is_job and request.frames:
         selection.warnings.append("--frames draws loops only: the run was trained here.")
-    if is_job and (recording.mdp.scene is None or recording.mdp.scene_cells is None):
+    if is_job and drawing_of(recording.mdp) is None:
         selection.warnings.append("The environment has no scene: state and action are shown as series.")
     if is_job and not any(phase.steps for phase in recording.phases):
         if not request.is_default:
@@ -138,15 +139,13 @@ def select(recording: Recording, request: Request) -> Selection:
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     available = evaluations_with_steps(recording, train, evals)
-    asked = {"train": _asked_episodes(recording, request, train.count), "eval": np.array(request.trials, int)}
-    chosen = [
-        evaluation_after(available, after, str(recording.path)) for after in sorted(set(request.evaluations))
-    ]
+    numbers, where = _asked_episodes(recording, request, train.count), str(recording.path)
+    asked = {"train": numbers, "eval": np.array(request.trials, int)}
+    chosen = [evaluation_after(available, after, where) for after in sorted(set(request.evaluations))]
     if not request.everything:
         trials = asked["eval"] if request.trials else _trials(chosen)
-        shown = {"train": train.steps_of(asked["train"]), "eval": evals.steps_of(trials)}
+        shown = {"train": train.steps_of(numbers), "eval": evals.steps_of(trials)}
         selection.focus = _focus(recording, shown)
-    numbers = asked["train"]
     if request.is_default:
         numbers = np.union1d(numbers, _default_episodes(train.lengths))
     if is_job:

@@ -180,7 +180,7 @@ class StepTracks:
         mdp, records = self._labels.mdp, batch.records
         names = enumerate(mdp.event_names)
         masks = events & np.uint32(sum(1 << bit for bit, name in names if ".illegal" not in name))
-        endings = np.where(records["terminated"], 1, np.where(records["truncated"], 2, 0))
+        endings = np.where(records["terminated"], 1, 2 * records["truncated"])
         kind = "episode" if self._phase == "train" else "trial"
         entries: list[tuple[int, str, str]] = []
         for row in np.flatnonzero((records["t"] == 0) | (masks != 0) | (endings != 0)).tolist():
