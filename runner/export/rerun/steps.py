@@ -182,19 +182,20 @@ class StepTracks:
         masks = events & np.uint32(sum(1 << bit for bit, name in names if ".illegal" not in name))
         endings = np.where(records["terminated"], 1, 2 * records["truncated"])
         kind = "episode" if self._phase == "train" else "trial"
-        entries: list[tuple[int, str, str]] = []
-        for row in np.flatnonzero((records["t"] == 0) | (masks != 0) | (endings != 0)).tolist():
-            t, ending = int(records["t"][row]), int(endings[row])
-            if t == 0:
-                state = self._states[records["state"][row]]
-                entries.append((row, f"{kind} {batch.number[row]:,} begins: {state}", "INFO"))
-            if masks[row] or ending:
-                text, level = self._entry(int(masks[row]), ending)
-                entries.append((row, f"{text} after {t + 1} steps" if ending else text, level))
-        if entries:
-            rows, lines, levels = zip(*entries, strict=True)
-            log = columns(rr.TextLog, text=texts(lines), level=texts(levels))
-            yield Track(f"{self._phase}/events", batch.times(np.array(rows)), log)
+        begins, happened = np.flatnonzero(records["t"] == 0), np.flatnonzero((masks != 0) | (endings != 0))
+        states = zip(batch.number[begins], self._states[records["state"][begins]], strict=True)
+        lines = [f"{kind} {number:,} begins: {state}" for number, state in states]
+        levels = ["INFO"] * len(lines)
+        happenings = (part[happened].tolist() for part in (masks, endings, records["t"]))
+        for mask, ending, t in zip(*happenings, strict=True):
+            text, level = self._entry(mask, ending)
+            lines.append(f"{text} after {t + 1} steps" if ending else text)
+            levels.append(level)
+        if lines:
+            rows = np.concatenate((begins, happened))
+            order = np.argsort(rows, kind="stable")
+            log = columns(rr.TextLog, text=texts(lines)[order], level=texts(levels)[order])
+            yield Track(f"{self._phase}/events", batch.times(rows[order]), log)
 
 
 def _entry(mdp: Mdp, mask: int, ending: int) -> tuple[str, str]:
