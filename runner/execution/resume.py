@@ -135,7 +135,7 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop, trust: b
     run = run.update(status="running", owner=owner(), summary={}, proof=str(proof) if proof else None)
     try:
         with _opened(path, contents, job, run, learner, changes) as file, open_recording(path) as recording:
-            reference = Reference(recording, without_steps=job.config.recording.steps == "none")
+            reference = Reference(recording)
             is_recorded = CODE_RECORD in contents.metadata
             code = CodeCollector(run.folder.parent, job.config.recording.code and not is_recorded)
             recorder = recorder_for(job, learner, file, reference, beat=code.beat(run, file))

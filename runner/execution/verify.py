@@ -214,7 +214,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         compare_names(recording, list(learner.agents))
     except Diverged as error:
         return with_difference(verification, error)
-    reference = Reference(recording, complete, without_steps=job.config.recording.steps == "none")
+    reference = Reference(recording, complete)
     recorder = recorder_for(job, learner, None, reference)
     variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
     recorded = {topic.name: recording.table(topic).count() for topic in variable}

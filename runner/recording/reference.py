@@ -28,19 +28,16 @@ class Reference:
     Args:
         recording: the recording; None for a new run.
         complete: whether a message that the recording does not hold is a difference, not new.
-        without_steps: whether the recording leaves its steps out.
     """
 
-    def __init__(
-        self, recording: Recording | None = None, complete: bool = False, without_steps: bool = False
-    ) -> None:
+    def __init__(self, recording: Recording | None = None, complete: bool = False) -> None:
         self.complete = complete
         self._remaining: dict[Topic, int] = {}
         self._blocks: dict[Topic, Iterator[Records]] = {}
         self._block: dict[Topic, Records] = {}
         self._messages: dict[Topic, Iterator[Logged]] = {}
         self._logged: set[Logged] = set()
-        self._unrecorded = {topic for topic in BLOCK_TOPICS if without_steps and topic.message is schema.STEP}
+        self._has_steps = recording is None or not recording.leaves_out_steps
         if recording is None:
             return
         for topic in BLOCK_TOPICS:
@@ -101,7 +98,7 @@ class Reference:
         Raises:
             Diverged: the recording should be complete.
         """
-        if self.complete and topic not in self._unrecorded and len(records):
+        if self.complete and len(records) and (self._has_steps or topic.message is not schema.STEP):
             raise Diverged(topic.name, "message", "none", "one more", **_position(records[0]))
 
     def check_exhausted(self) -> None:
