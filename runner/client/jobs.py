@@ -70,7 +70,7 @@ class RunProgress:
     eval_steps: int
     bytes: int
     """Size of its recording."""
-    last_evaluation: dict[str, object] | None
+    last_evaluation: dict[str, object] | None = None
     """Its episode, and the value of each metric by name; None before the first."""
 
     @property

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
 from anyio import CapacityLimiter
-from fastapi import Depends, Request, Response
+from fastapi import Depends, Query, Request, Response
 from fastapi import Path as InPath
 from pydantic import TypeAdapter
 
@@ -112,6 +112,8 @@ def opened_recording(run: RecordedRun) -> Iterator[Recording]:
 
 
 OpenRecording = Annotated[Recording, Depends(opened_recording)]
+At = Annotated[str, Query(max_length=60)]
+"""A reference to an episode or step, in a query."""
 EpisodeNumber = Annotated[int, InPath(ge=0, lt=2**62, description="Counted from 0.")]
 After = Annotated[
     int, InPath(ge=0, lt=2**62, description="The evaluation after this number of training episodes.")

@@ -42,6 +42,7 @@ from runner.export.reports.compare import tasks_legend
 from runner.export.reports.diff import ShownDivergence, difference_view
 from runner.export.reports.maps import maps_of, situations, stages_of
 from runner.export.reports.playback import playback_of
+from runner.export.reports.player_data import Playback
 from runner.export.reports.rendering import Link, partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
@@ -105,10 +106,7 @@ def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
     with open_recording(path) as recording:
         at = replace(at, t=max(at.t, start))  # the step that an error names
         episode = playback_of(recording, at, steps, max(0, start - _STEPS_BEFORE))
-        scene = recording.environment["scene"] if episode.grid else None
-        has_pictures, note = picture_note(recording, at.phase)
-        data = {"episode": asdict(episode), "scene": scene}
-        return _compact(data | {"has_pictures": has_pictures, "picture_note": note})
+        return _compact(_part(recording, episode, *picture_note(recording, at.phase)))
 
 
 def branch_part(path: Path, at: str, action: str, start: int, steps: int) -> bytes:
@@ -156,9 +154,17 @@ def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
 
 def _branch_part(recording: Recording, at: StepLike, action: str, start: int, steps: int) -> Json:
     episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
+    return _part(recording, episode, False, "" if episode.grid else "The environment has no scene to draw.")
+
+
+def _part(recording: Recording, episode: Playback, has_pictures: bool, note: str) -> Json:
     scene = recording.environment["scene"] if episode.grid else None
-    note = "" if scene else "The environment has no scene to draw."
-    return {"episode": asdict(episode), "scene": scene, "has_pictures": False, "picture_note": note}
+    return {
+        "episode": asdict(episode),
+        "scene": scene,
+        "has_pictures": has_pictures,
+        "picture_note": note,
+    }
 
 
 def random_policy(path: Path) -> bytes:

@@ -148,27 +148,13 @@ def _verdict(found: Verification) -> str:
 
 def _as_json(found: Verification) -> dict[str, object]:
     """Return a verdict and all that belongs to it, as JSON."""
-    keys = (
-        "verdict",
-        "act",
-        "train_steps",
-        "eval_steps",
-        "episodes",
-        "unfinished",
-        "steps",
-        "left_out",
-        "cut_off",
-        "of_episodes",
-        "tolerance",
-        "assumed",
-        "notes",
-    )
+    left_out = ("composition", "is_loop", "if_rerun")
     texts = ("reason", "finding", "content_digest", "not_compared")
     plain = (str, int, float, list, dict, type(None))
     return {
+        **{name: value for name, value in vars(found).items() if name not in left_out},
+        **{name: getattr(found, name) or None for name in texts},
         "path": str(found.path.absolute()),
-        **{key: getattr(found, key) for key in keys},
-        **{key: getattr(found, key) or None for key in texts},
         "environment": None if found.composition is None else found.composition.as_json(),
         "difference": found.difference
         and {

@@ -35,7 +35,6 @@ def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
             train_steps=steps,
             eval_steps=0,
             bytes=0,
-            last_evaluation=None,
         )
         channel.send(progress)
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Annotated, Final
+from typing import Final
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Response
 from fastapi.exceptions import RequestValidationError
 from pydantic import ValidationError
 
@@ -16,7 +16,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import why_not_rerun
 from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
-from runner.service.dependencies import JobsOf, RecordedRun
+from runner.service.dependencies import At, JobsOf, RecordedRun
 from runner.service.jobs.checking import BranchQuestion
 from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Form, number_in, to_job
@@ -27,7 +27,7 @@ router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
 
 
 @router.get("")
-def form(run: RecordedRun, at: Annotated[str, Query(max_length=60)] = "") -> Response:
+def form(run: RecordedRun, at: At = "") -> Response:
     """Show the form for a step."""
     return _page(run, {"at": at})
 

@@ -24,7 +24,7 @@ from runner.service import fragments
 from runner.service.addresses import link, places_in, step_in
 from runner.service.api.comparing import MAX_SCORES, found_runs
 from runner.service.api.reading import AxisName
-from runner.service.dependencies import CatalogueOf, ComputationOf
+from runner.service.dependencies import At, CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, last_results, result_of
 from runner.service.pages.rendering import Page
@@ -46,6 +46,7 @@ MAX_LATEST: Final = 4
 MAX_RUNS: Final = 60
 """Runs that a page compares."""
 Scores = Annotated[str, Query(max_length=MAX_SCORES)]
+Names = Annotated[list[str] | None, Query(max_length=100)]
 Rows = list[tuple[str, list[str]]]
 """Rows of a table: a name, and the value of each run."""
 
@@ -89,8 +90,8 @@ class Compared:
 
 def chosen_runs(
     catalogue: CatalogueOf,
-    run: Annotated[list[str] | None, Query(max_length=100)] = None,
-    name: Annotated[list[str] | None, Query(max_length=100)] = None,
+    run: Names = None,
+    name: Names = None,
 ) -> list[Run]:
     """Return the runs to compare: single ones, and all runs of some names.
 
@@ -181,9 +182,7 @@ def code(runs: TwoRuns) -> Response:
 
 
 @router.get("/replay")
-async def replay(
-    runs: TwoRuns, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
-) -> Response:
+async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
     if at:
         step = step_in(at)

@@ -20,7 +20,7 @@ router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
 Sought = Annotated[str, Query(alias="q", max_length=200)]
 Stream = Literal["", "stdout", "stderr"]
-Status = Annotated[str, Query(max_length=20)]
+StatusName = Annotated[str, Query(max_length=20)]
 StateParts = Annotated[
     list[str] | None, Query(max_length=20, description="The parts of the name of a state.")
 ]
@@ -38,7 +38,7 @@ def _add_page(tab: str, body_of: Callable[[Path], bytes], is_live: bool = False)
     if is_live:
 
         @router.get(f"/{tab}/part")
-        async def part(run: RecordedRun, compute: ComputationOf, status: Status = "running") -> Response:
+        async def part(run: RecordedRun, compute: ComputationOf, status: StatusName = "running") -> Response:
             """Return what changes of the page; 204 if the run no longer has this status."""
             if run.status != status:
                 return Response(status_code=HTTPStatus.NO_CONTENT)
@@ -73,7 +73,7 @@ async def console_part(
     compute: ComputationOf,
     sought: Sought = "",
     stream: Stream = "",
-    status: Status = "running",
+    status: StatusName = "running",
 ) -> Response:
     """Return the lines alone; 204 if the run no longer has this status."""
     if run.status != status:

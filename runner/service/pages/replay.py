@@ -29,6 +29,7 @@ from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
     EPISODES,
+    At,
     CatalogueOf,
     Computation,
     ComputationOf,
@@ -110,13 +111,13 @@ async def chosen_replay(
     episode: str = "",
     after: str = "",
     trial: str = "",
-    at: Annotated[str, Query(max_length=60)] = "",
+    at: At = "",
 ) -> Response:
     """Redirect to the step `at`, to the episode that a form names, or to a typical one."""
     if phase == "train":
-        step = EpisodeRef(_whole(episode))
+        step = EpisodeRef.parse(f"train:{episode or 0}")
     elif phase == "eval" and after:
-        step = EpisodeRef(_whole(trial), after=_whole(after))
+        step = EpisodeRef.parse(f"eval:{after}:{trial or 0}")
     else:
         step = await step_of(run, compute, at or TYPICAL)
     address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
@@ -136,9 +137,7 @@ async def step_of(run: Run, compute: Computation, text: str) -> EpisodeRef:
 
 
 @router.get("/thumbnail")
-async def thumbnail(
-    run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = TYPICAL
-) -> Response:
+async def thumbnail(run: RecordedRun, compute: ComputationOf, at: At = TYPICAL) -> Response:
     """Return a small picture of an episode, which takes no environment."""
     picture = await compute(fragments.episode_thumbnail, run.recording, EpisodeRef.parse(at))
     return Response(picture, media_type="image/svg+xml")
@@ -283,17 +282,6 @@ def stage_of(part: JsonView, t: int) -> ReplayStage:
         note="" if drawing else part["picture_note"],
         has_pictures=part["has_pictures"] and not drawing,
     )
-
-
-def _whole(text: str) -> int:
-    """Return a whole number from a form; 0 for an empty field.
-
-    Raises:
-        RunnerError: the field contains something else.
-    """
-    if text and not (text.isdecimal() and len(text) < 16):
-        raise RunnerError(f"found {text[:40]!r}, expected a number of an episode or a trial, from 0.")
-    return int(text or 0)
 
 
 def panel_of(

@@ -12,16 +12,16 @@ import json
 from http import HTTPStatus
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-from fastapi import APIRouter, HTTPException, Query, Response
+from fastapi import APIRouter, HTTPException, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
 
 from runner.export.rerun import viewer as native_viewer
 from runner.service import fragments
 from runner.service.addresses import link
-from runner.service.dependencies import ComputationOf, RecordedRun
+from runner.service.dependencies import At, ComputationOf, RecordedRun
 from runner.service.guard import POLICY
 from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Page
@@ -43,9 +43,7 @@ _SECONDS: Final = 60
 
 
 @router.get("/runs/{run}/rerun")
-async def viewer(
-    run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
-) -> Response:
+async def viewer(run: RecordedRun, compute: ComputationOf, at: At = "") -> Response:
     """Show the Rerun viewer, opened at a step."""
     step = await step_of(run, compute, at) if at else None
     if step:  # an error is shown here rather than in the frame
@@ -58,9 +56,7 @@ async def viewer(
 
 
 @router.get("/runs/{run}/rerun/frame")
-async def frame(
-    run: RecordedRun, compute: ComputationOf, at: Annotated[str, Query(max_length=60)] = ""
-) -> Response:
+async def frame(run: RecordedRun, compute: ComputationOf, at: At = "") -> Response:
     """Show the viewer alone, opened at a step."""
     step = await step_of(run, compute, at) if at else None
     place = json.loads(await compute(fragments.viewer_place, run, step))

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final, Literal
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
@@ -45,6 +45,7 @@ from runner.service.dependencies import (
 )
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import RunPage, environment_of, last_results, result_of
+from runner.service.pages.machine import StatusName
 from runner.service.pages.rendering import Form, Page, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
@@ -153,7 +154,7 @@ def status(
     run: FoundRun,
     jobs: JobsOf,
     settings: SettingsOf,
-    status: Annotated[str, Query(max_length=20)] = "running",
+    status: StatusName = "running",
 ) -> Response:
     """Return the status of a run as a part of its page.
 
