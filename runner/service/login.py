@@ -9,7 +9,6 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.errors import RunnerError
-from runner.service.errors import Unauthorized
 from runner.service.pages.rendering import Form, Page
 from runner.service.problems import status_of
 from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
@@ -32,10 +31,7 @@ def login(request: Request, sent: Form) -> Response:
     tokens: Tokens = request.app.state.tokens
     sessions: Sessions = request.app.state.sessions
     try:
-        token = tokens.find(secret)
-        if token is None:
-            raise Unauthorized("token: found one that is unknown, or was revoked.")
-        session = sessions.begin(token)
+        session = sessions.begin(tokens.find(secret))
     except RunnerError as error:
         return Page("login.html", {"next": target, "problem": error}, status_of(error))
     response = RedirectResponse(_local(target), HTTPStatus.SEE_OTHER)

@@ -24,6 +24,7 @@ from filelock import FileLock
 from pydantic import Field, TypeAdapter
 
 from runner.errors import RunnerError, StorageError
+from runner.service.errors import Unauthorized
 from runner.util.files import read_object, storage_errors, write_object
 
 if TYPE_CHECKING:
@@ -130,11 +131,17 @@ class Tokens:
         """Return all tokens, the oldest first."""
         return self._file.all()
 
-    def find(self, secret: str) -> Token | None:
-        """Return the token of a secret; None if there is none. Takes the same time in both cases."""
+    def find(self, secret: str) -> Token:
+        """Return the token of a secret. Takes the same time if there is none.
+
+        Raises:
+            Unauthorized: there is none.
+        """
         digest = _digest(secret)
         matching = [token for token in self.all() if hmac.compare_digest(token.sha256, digest)]
-        return matching[-1] if matching else None
+        if not matching:
+            raise Unauthorized("token: found one that is unknown, or was revoked.")
+        return matching[-1]
 
     def create(self, name: str, scopes: tuple[str, ...]) -> tuple[Token, str]:
         """Return a new token and its secret, which is not stored.

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -182,14 +182,6 @@ def _text(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Ite
         yield reasons
 
 
-class _Contents(NamedTuple):
-    """What the index holds."""
-
-    statuses: Counter[str]
-    copies: int
-    problems: list[str]
-
-
 @click.group("index", cls=CommandGroup)
 def index_command() -> None:
     """Manage the index of runs, which makes listing them quick.
@@ -236,7 +228,8 @@ def rebuild(recordings: tuple[Path, ...] = folders_option) -> Reply:
     return Reply(values, [rows, *map(Remark, problems)], exit_code=code)
 
 
-def _contents(index: CatalogueIndex) -> _Contents:
+def _contents(index: CatalogueIndex) -> tuple[Counter[str], int, list[str]]:
+    """Return the number of runs of each status, the number of copies, and the problems of folders."""
     from runner.runs.catalogue.filters import Filter
 
     rows = index.rows(Filter(None), columns=("root", "entry", "status", "digest"))
@@ -245,4 +238,4 @@ def _contents(index: CatalogueIndex) -> _Contents:
     for row in with_same_as(rows, index.originals()):
         statuses[row["status"]] += 1
         copies += row["same_as"] is not None
-    return _Contents(statuses, copies, index.problems())
+    return statuses, copies, index.problems()

@@ -22,6 +22,7 @@ from runner.errors import RunnerError
 from runner.runs.resolve import find_run
 from runner.service import logs
 from runner.service.app import create_app
+from runner.service.errors import Unauthorized
 from runner.service.guard import POLICY, is_allowed_host, is_same_origin
 from runner.service.settings import ServiceLimits, tokens_file
 from runner.service.tokens import READ, WRITE, Tokens
@@ -357,7 +358,8 @@ def test_the_command_creates_lists_and_revokes_tokens(monkeypatch, tmp_path):
     assert secret not in token_command("ls").stdout
     assert token_command("revoke", "nobody").exit_code == 2
     assert token_command("revoke", "laptop").exit_code == 0
-    assert kept.find(secret) is None
+    with pytest.raises(Unauthorized, match="was revoked"):
+        kept.find(secret)
 
 
 @pytest.mark.parametrize(("target", "where"), [("/disk", "/disk"), ("//evil.example", "/"), ("", "/")])
