@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +26,7 @@ from runner.recording.spaces import Description
 from runner.replay.recorded import RecordedReset, resets_of
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
+from runner.util.processes import Tell
 from runner.util.values import Json, JsonView
 
 
@@ -133,7 +134,7 @@ class RunDetails:
         }
 
 
-def describe_run(run: Run, report: Callable[[str], None] = lambda _: None) -> RunDetails:
+def describe_run(run: Run, report: Tell = lambda _: None) -> RunDetails:
     """Return all about a run; `report` is called with a sentence if the recording cannot be read."""
     summary, config = run.summary, run.file.config
     if run.recording.is_file():

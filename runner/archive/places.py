@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,7 +19,7 @@ from runner.runs.run import RUN_FILE, Run
 from runner.runs.trust_marks import copy_mark
 from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
-from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, Report, report_progress
+from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, Report, Tell, report_progress
 
 if TYPE_CHECKING:
     from runner.archive.store import ArchiveStore
@@ -39,7 +39,7 @@ def default_target(recordings: Path) -> str:
     return os.environ.get(ARCHIVE_VARIABLE) or str(recordings.absolute().parent / "archive")
 
 
-def at_hand(run: Run, log: Callable[[str], None] = lambda _: None, report: Report = lambda _: None) -> Run:
+def at_hand(run: Run, log: Tell = lambda _: None, report: Report = lambda _: None) -> Run:
     """Return the run with a recording that can be read: an archived one is restored into the user's cache.
 
     Args:

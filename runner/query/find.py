@@ -14,7 +14,7 @@ import contextlib
 import os
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -37,6 +37,7 @@ from runner.runs.listing import listed_run
 from runner.runs.run import recordings_folder
 from runner.util.extras import require
 from runner.util.humanize import UNKNOWN, counted
+from runner.util.processes import Tell
 from runner.util.values import Json, is_whole
 
 LIMIT: Final = 20
@@ -155,7 +156,7 @@ def find(
     sort: str = "",
     limit: int | None = LIMIT,
     memory: int = MEMORY_MB,
-    report: Callable[[str], None] = lambda _: None,
+    report: Tell = lambda _: None,
 ) -> Found:
     """Return the episodes of all runs that match an expression.
 

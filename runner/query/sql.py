@@ -24,6 +24,7 @@ from runner.query.views import VIEWS, SelectedRuns
 from runner.runs.catalogue.filters import parse
 from runner.runs.run import recordings_folder
 from runner.util.extras import require
+from runner.util.processes import Tell
 from runner.util.values import finite
 
 if TYPE_CHECKING:
@@ -164,7 +165,7 @@ def sql(
     runs: str = "",
     timeout: float | None = None,
     memory: int = MEMORY_MB,
-    report: Callable[[str], None] = lambda _: None,
+    report: Tell = lambda _: None,
 ) -> QueryResult:
     """Ask the recorded runs in SQL; return the rows, which are read as they are asked for.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
 from runner.runs.listing import listed_run
 from runner.runs.run import Run
+from runner.util.processes import Tell
 from runner.util.values import flatten
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ class SelectedRuns:
         report: called with how far it has read, a few times a second.
     """
 
-    def __init__(self, roots: Sequence[Path], chosen: Filter, report: Callable[[str], None]) -> None:
+    def __init__(self, roots: Sequence[Path], chosen: Filter, report: Tell) -> None:
         self._roots, self._chosen = roots, chosen
         self.rows = look(roots, lambda index: index.select(chosen, columns=_ROW))
         self._report, self._reported = report, time.monotonic()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,6 +17,7 @@ from runner.util.values import RUN_NAME_PATTERN
 if TYPE_CHECKING:
     from runner.runs.catalogue.index import CatalogueIndex
     from runner.runs.catalogue.rows import Candidate
+    from runner.util.processes import Tell
 
 LATEST: Final = "@latest"
 """Names the newest run; after a name, the newest run of that name."""
@@ -24,14 +25,12 @@ _MAX_LISTED: Final = 20
 _MAX_SUGGESTED: Final = 1000
 """The newest runs, whose names are compared with one that was not found."""
 
-Report = Callable[[str], None]
-
 
 def find_run(
     name: str,
     recordings: str | os.PathLike[str] | None = None,
     exclude: str = "",
-    report: Report = lambda _: None,
+    report: Tell = lambda _: None,
     newest: bool = False,
 ) -> Run:
     """Return the run with an id, a unique prefix of an id, a name, a path or `@latest`.
@@ -79,7 +78,7 @@ def run_of_id(run_id: str, recordings: Path) -> Run | None:
     return next((run for run in runs if run and run.run_id == run_id), None)
 
 
-def find_runs(name: str, recordings: Path, report: Report) -> list[Run]:
+def find_runs(name: str, recordings: Path, report: Tell) -> list[Run]:
     """Return all runs of a name or a filter, the oldest first; else the run that `find_run` returns.
 
     Raises:

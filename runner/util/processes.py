@@ -36,6 +36,8 @@ _SAFE_PATH: Final = "PYTHONSAFEPATH"
 _HASH_SEED: Final = "PYTHONHASHSEED"
 Report = Callable[[int], None]
 """Takes how much was done so far, such as a number of steps."""
+Tell = Callable[[str], None]
+"""Called with a line of text for the user, or with the name of the next stage."""
 Stop = Callable[[], bool]
 """Returns whether to stop."""
 Args = ParamSpec("Args")

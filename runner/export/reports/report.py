@@ -5,7 +5,7 @@ The page needs no network: style, script, plots and data are in it. All of it is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -32,6 +32,7 @@ from runner.recording.composition import composition_of
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import RecentTraining, has_environment
+from runner.util.processes import Tell
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def require_packages() -> None:
 def render_report(
     recordings: Sequence[Path],
     chosen: Sequence[EpisodeRef] = (),
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Tell = lambda _: None,
     axis: Axis = EPISODES,
     style: CurveStyle = PLAIN,
 ) -> tuple[str, list[str]]:
@@ -129,9 +130,7 @@ def render_report(
     return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
 
 
-def _run(
-    recording: Recording, number: int, chosen: Sequence[EpisodeRef], progress: Callable[[str], None]
-) -> ReportedRun:
+def _run(recording: Recording, number: int, chosen: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
     evaluations = evaluation_records(recording)
     environment = recording.environment
     episodes = _episodes(recording, chosen)
@@ -244,7 +243,7 @@ def _maps(recording: Recording, episode: EpisodeRef | None) -> list[MapRow]:
 
 
 def _replay(
-    recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Callable[[str], None]
+    recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Tell
 ) -> ReportReplay | None:
     """Return what the page replays; None if no episode can be."""
     shown = []

@@ -10,14 +10,15 @@ import contextlib
 import os
 import sqlite3
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from runner.runs.catalogue.rows import SEED_SHIFT, STORED
 from runner.util.files import cache_folder, replacing
 
-Report = Callable[[str], None]
+if TYPE_CHECKING:
+    from runner.util.processes import Tell
 
 INDEX_FILE: Final = "catalogue.sqlite"
 _APPLICATION: Final = 0x44546178  # "DTax"
@@ -59,7 +60,7 @@ def version() -> Version | None:
         return None
 
 
-def open_index(report: Report) -> sqlite3.Connection:
+def open_index(report: Tell) -> sqlite3.Connection:
     """Open the index; create it first if it is missing, foreign or of another version."""
     path = index_path()
     if not path.exists():

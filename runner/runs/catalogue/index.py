@@ -12,13 +12,12 @@ import os
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from runner.errors import RunnerError, nearest
 from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, ColumnKind, IndexRow, field_of, with_same_as
 from runner.runs.catalogue.database import (
-    Report,
     create,
     index_path,
     open_index,
@@ -31,6 +30,9 @@ from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.catalogue.folders import Folders
 from runner.runs.catalogue.rows import SEED_SHIFT, Candidate, Sql, text
 from runner.runs.run import check_folder_name
+
+if TYPE_CHECKING:
+    from runner.util.processes import Tell
 
 Result = TypeVar("Result")
 
@@ -256,7 +258,7 @@ class CatalogueIndex:
 def look(
     roots: Sequence[Path],
     work: Callable[[CatalogueIndex], Result],
-    report: Report = lambda _: None,
+    report: Tell = lambda _: None,
     rebuild: bool = False,
     cached: bool = False,
     quick: bool = False,
