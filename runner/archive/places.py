@@ -65,7 +65,7 @@ def at_hand(run: Run, log: Tell = lambda _: None, report: Report = lambda _: Non
                     log(f"Run {run.run_id} is archived; restoring it from {run.archive.target}.")
                     remove_oldest(cached.parent, "*.mcap", keep=MAX_CACHED - 1)
                     fresh = cached.with_suffix(".restoring")
-                    with archive_of(run) as folder:
+                    with archive_store(run).reading(run.run_id) as folder:
                         restore_to(folder, fresh, digest, report)
                     fresh.replace(cached)
                 cached.touch()
@@ -87,17 +87,6 @@ def opened(run: Run | Recording) -> Iterator[Recording]:
 
     with open_recording(at_hand(run).recording) as recording:
         yield recording
-
-
-@contextlib.contextmanager
-def archive_of(run: Run) -> Iterator[Path]:
-    """Yield a local folder with the archive of a run.
-
-    Raises:
-        RecordingError: it is at none of its places.
-    """
-    with archive_store(run).reading(run.run_id) as folder:
-        yield folder
 
 
 def archive_store(run: Run) -> ArchiveStore:

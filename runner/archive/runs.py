@@ -13,7 +13,7 @@ from pathlib import Path
 
 from runner.archive.layout import CONTENTS
 from runner.archive.manifest import Manifest
-from runner.archive.places import archive_of, restore_to
+from runner.archive.places import archive_store, restore_to
 from runner.archive.restoring import restore
 from runner.archive.store import ArchiveStore, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
@@ -168,7 +168,7 @@ def restore_run(run: Run, report: Report = lambda _: None) -> Run:
         if current.status != "archived":
             raise RunnerError(f"run {run.run_id} is not archived: its recording is {current.recording}.")
         fresh = current.recording.with_suffix(".restoring")
-        with archive_of(current) as folder:
+        with archive_store(current).reading(run.run_id) as folder:
             restore_to(folder, fresh, current.archive.digest, report)
             _restore_contents(folder, current.folder)
             merge_marks(current, read_marks(folder))

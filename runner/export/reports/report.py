@@ -186,12 +186,12 @@ def _facts(recording: Recording) -> dict[str, str]:
     elif not has_environment(recording.config):
         facts = {"Recorded": f"logged values, by {config['made_by']}"}
     else:
-        spaces = {name: space["type"] for name, space in recording.spaces.items()}
+        spaces = recording.spaces
         parallel = f", {recording.environments} in parallel" if recording.environments > 1 else ""
         facts = {
             "Environment": f"{composition_of(recording)}{parallel}",
             "Recorded": f"from a loop, by {config['made_by']}",
-            "Spaces": f"observation {spaces['observation']}, action {spaces['action']}",
+            "Spaces": f"observation {spaces['observation']['type']}, action {spaces['action']['type']}",
             "Training": f"{episodes:,} episodes, {steps:,} steps",
             "Evaluation": f"{trial_steps:,} steps",
         }
