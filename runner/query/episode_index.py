@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from runner.query.chunks import Relation
 
 MAX_FILES: Final = 20_000
-_VERSION: Final = 4
+_VERSION: Final = 5
 _PACKED: Final = 64
 """The files that a pack has in the mean."""
 _LEAST: Final = 8

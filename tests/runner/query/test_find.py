@@ -16,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
+from runner.archive.batches import Batches
 from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.errors import RunnerError
@@ -122,6 +123,23 @@ def test_events_are_counted_at_their_steps(folder):
     totals = [sum(hit.events.get(name, 0) for hit in found.hits) for name in ("collision", "taxi_1_pickup")]
     assert totals[0] == steps["c"][0].as_py()
     assert totals[1] <= steps["p"][0].as_py()
+
+
+def test_indexes_and_views_have_the_same_columns_in_every_process(folder):
+    with open_recording(find_run("taxis", folder).recording) as recording:
+        names = list(Batches(recording).shape.event_masks)
+    assert names[:6] == [
+        "taxi_1_pickup",
+        "pickup",
+        "taxi_2_pickup",
+        "taxi_1_drop_off",
+        "drop_off",
+        "taxi_2_drop_off",
+    ]
+    query = runner.sql("SELECT * FROM steps", recordings=folder, runs="taxis")
+    events = [name for name in query.columns.names if name in names]
+    query.close()
+    assert events == [name for name in names if name in events]
 
 
 def test_what_the_index_decides_reads_no_recording(folder, monkeypatch):
