@@ -68,7 +68,8 @@ class EpisodeIndex:
         self._connection = connection
         with storage_errors(self.folder):
             (self.folder / "packs").mkdir(parents=True, exist_ok=True)
-            self._files = {path.stem[:-_HEX]: path for path in self.folder.glob("*-*.parquet")}
+            written = self.folder.glob("[!.]*-*.parquet")  # a hidden one is being written by another search
+            self._files = {path.stem[:-_HEX]: path for path in written}
         self.read = set[Path]()
         """The files that were asked for, their packs, and what else is packed there."""
         self._of_runs = defaultdict[str, list[Path]](list)

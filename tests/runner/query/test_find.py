@@ -347,6 +347,19 @@ def test_a_damaged_index_in_a_pack_is_made_again(folder, monkeypatch):
     assert runner.find("length > 20", folder, runs="pole") == before
 
 
+def test_a_file_that_another_search_is_writing_is_no_index(folder, monkeypatch):
+    shutil.rmtree(cache_folder() / EPISODES, ignore_errors=True)
+    before = runner.find("length > 20", folder, runs="pole")
+    (file,) = (cache_folder() / EPISODES).glob(f"{before.hits[0].run_id}-*")
+    unfinished = file.with_name(f".0a1b2c3d.other-{'1' * 32}{file.stem[-16:]}.parquet")
+    unfinished.write_bytes(b"?")
+    os.utime(unfinished, (0, 0))
+    monkeypatch.setattr(episode_index, "_LEAST", 1)
+    monkeypatch.setattr(episode_index, "_PACKED", int(file.stem[-32:-16], 16))  # it ends a pack
+    assert runner.find("length > 20", folder, runs="pole") == before
+    assert unfinished.exists()
+
+
 def test_a_return_that_is_no_number_matches_no_comparison(tmp_path):
     with runner.record(Paying(float("nan")), tmp_path) as env:
         env.reset(seed=0)
