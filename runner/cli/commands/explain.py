@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from runner.analysis.sections import Section
 from runner.cli.command import Command, argument, option
 from runner.cli.jobs import job_option
 from runner.cli.options import (
@@ -111,8 +112,8 @@ def explain_command(
     except _Planned as stopped:
         plan = stopped.plan
         times = {"seconds": plan.seconds, "most_seconds": plan.most_seconds}
-        text = {"settings": str(plan.settings), "runs": _in_words(plan)}
-        return Reply(dataclasses.asdict(plan) | times, [text])
+        facts = {"settings": str(plan.settings), "runs": _in_words(plan)}
+        return Reply(dataclasses.asdict(plan) | times, [Section("What would be trained", facts=facts)])
     except KeyboardInterrupt:
         say("Interrupted. What was trained is kept: the same command continues.")
         raise

@@ -288,6 +288,7 @@ def test_the_command_plans_answers_and_prints_json(tmp_path):
     assert (plan["mixtures"], plan["seeds"], plan["known"]) == (4, 2, 4)
     assert plan["seconds"] > 0
     assert json.loads(typed("--dry-run", "--json").stdout) == plan  # the time is known from before
+    assert typed("--dry-run", "--markdown").stdout.startswith("## What would be trained\n\n- settings: 2\n")
     whole = typed()
     assert (
         "8 runs: 4 mixtures of 2 settings, 2 seeds each, 4 of them trained already; about 10 s"
