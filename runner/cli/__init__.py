@@ -232,7 +232,9 @@ class LazyGroup(CommandGroup):
             result = super().invoke(ctx)
             sys.stdout.flush()
             return result
-        except (KeyboardInterrupt, click.Abort):
+        except (KeyboardInterrupt, click.Abort) as interrupt:
+            for note in getattr(interrupt, "__notes__", []):  # such as how far a query has read
+                click.echo(printable(note), err=True)
             raise click.exceptions.Exit(ExitCode.INTERRUPTED) from None
         except BrokenPipeError:
             with contextlib.suppress(OSError, ValueError):  # else Python complains about stdout at exit

@@ -15,7 +15,7 @@ from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
 from runner.cli.options import folders_option, force_option, limit_option, require_one, tags_option
-from runner.cli.output import Remark, Reply, csv_lines, json_list, say
+from runner.cli.output import Remark, Reply, csv_lines, json_list
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
@@ -78,7 +78,7 @@ def sql_command(
 
     if parquet is not None:
         require_new(parquet, force)
-    with _without_pandas(), _told_how_far():
+    with _without_pandas():
         with stage_line("reading") as report:
             result = sql(
                 query, recordings=recordings, runs=runs, timeout=timeout, memory=memory, report=report
@@ -118,16 +118,6 @@ def _without_pandas() -> Iterator[None]:
         yield
     finally:
         sys.meta_path.remove(_NoPandas)
-
-
-@contextlib.contextmanager
-def _told_how_far() -> Iterator[None]:
-    """On Ctrl-C, say how far the query has read."""
-    try:
-        yield
-    except KeyboardInterrupt as interrupt:
-        say("\n".join(getattr(interrupt, "__notes__", [])))
-        raise
 
 
 def _left_out(answered: QueryResult | Found) -> Iterator[str]:
@@ -198,7 +188,7 @@ def find_command(
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query.find import find
 
-    with _without_pandas(), _told_how_far(), stage_line("reading") as report:
+    with _without_pandas(), stage_line("reading") as report:
         found = find(
             expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )

@@ -228,10 +228,13 @@ def test_a_query_is_stopped_while_runs_are_opened(folder, monkeypatch):
     assert len(opened) < 3
 
 
-def test_an_interrupted_query_says_how_far_it_came(folder):
-    query = "SELECT count(*) FROM range(100000000000) WHERE hash(range) = 3"
-    words = [sys.executable, "-m", "runner", "sql", query, "--recordings", str(folder)]
-    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:
+@pytest.mark.parametrize(
+    ("select", "form"), [("count(*)", ()), ("range", ("--csv",))], ids=["before a row", "between rows"]
+)
+def test_an_interrupted_query_says_how_far_it_came(folder, select, form):
+    query = f"SELECT {select} FROM range(100000000000) WHERE range < 100000 OR hash(range) = 3"
+    words = [sys.executable, "-m", "runner", "sql", query, "--recordings", str(folder), *form]
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         time.sleep(4)
         process.send_signal(signal.SIGINT)
         assert "runs were read" in process.communicate(timeout=60)[1]
