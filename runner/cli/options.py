@@ -169,7 +169,7 @@ def require_one(*names: str) -> None:
         UsageError: more than one of them is given.
     """
     context = click.get_current_context()
-    flags = {parameter.name: parameter.opts[0] for parameter in context.command.params}
+    flags = {parameter.name: parameter.opts[-1] for parameter in context.command.params}
     values = context.params
     given = [flags[name] for name in names if values[name] is not None and values[name] is not False]
     if len(given) > 1:

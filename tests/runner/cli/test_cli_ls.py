@@ -96,6 +96,14 @@ def test_the_folder_is_the_working_directorys_by_default(recorded_run, tmp_path,
     assert os.environ.get("DUALTAXI_RECORDINGS") is None
 
 
+@pytest.mark.parametrize("words", [("-q", "--json"), ("--quiet", "--csv"), ("--csv", "--json")])
+def test_two_forms_exclude_each_other(recorded, words):
+    done = recorded("ls", *words)
+    assert done.exit_code == 2
+    names = " and ".join(words).replace("-q ", "--quiet ")
+    assert f"{names} exclude each other: choose one." in done.stderr
+
+
 def test_json_of_no_run_and_of_two_is_a_named_list(command):
     assert command.json("ls")["runs"] == []
     runs = [create_run(command.recordings, from_mapping({"name": "some", "episodes": 5}), n) for n in (1, 2)]
