@@ -1,6 +1,7 @@
 """How much memory it takes to read files in every way: `python -m tests.reliability.peak FILE ...` (Linux).
 
 Prints seconds and megabytes for each file, read in a process of its own that begins with everything imported.
+Without arguments, the files are named by lines of the standard input.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from tests.reliability.reading import read_everything
 
 def main() -> None:
     """Read each file in a forked process."""
-    for path in sys.argv[1:]:
+    for path in sys.argv[1:] or map(str.strip, sys.stdin):
         child = os.fork()
         if child == 0:
             code = 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import re
 import struct
 import subprocess
 import sys
@@ -49,6 +50,22 @@ def recordings(tmp_path_factory):
 @pytest.fixture(scope="session")
 def path(tmp_path_factory):
     return tmp_path_factory.mktemp("hostile") / "hostile.mcap"
+
+
+@pytest.fixture(scope="module")
+def peak_of():
+    """Return a function: the most memory that reading a file in every way takes at once, in MB."""
+    command = [sys.executable, "-W", "error", "-m", "tests.reliability.peak"]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    with subprocess.Popen(command, cwd=ROOT, text=True, **pipes) as reader:
+
+        def peak(path):
+            print(path, file=reader.stdin, flush=True)
+            line = reader.stdout.readline()
+            assert re.fullmatch(r"[\d.]+ [\d.]+\n", line), line + reader.stdout.read()
+            return float(line.split()[1])
+
+        yield peak
 
 
 @given(seed=st.integers(0, 2**32), name=st.integers(0, 15), data=st.data())
@@ -142,9 +159,9 @@ BOMBS = {
 @linux
 @pytest.mark.parametrize("finished", [True, False])
 @pytest.mark.parametrize("bomb", BOMBS)
-def test_recordings_made_to_exhaust_memory_do_not(bomb, finished, recordings, path):
+def test_recordings_made_to_exhaust_memory_do_not(bomb, finished, recordings, path, peak_of):
     path.write_bytes(with_chunks(recordings["tiny-0"], BOMBS[bomb](), finished))
-    assert _peak(path) < MOST_MEMORY
+    assert peak_of(path) < MOST_MEMORY
 
 
 def replaced(data: bytes, opcode: int, name: str, body: bytes) -> bytes:
@@ -198,10 +215,10 @@ def described(text: str) -> bytes:
 
 @linux
 @pytest.mark.parametrize("kind", DESCRIPTIONS)
-def test_a_description_made_to_exhaust_memory_does_not(kind, recordings, path):
+def test_a_description_made_to_exhaust_memory_does_not(kind, recordings, path, peak_of):
     opcode, name, make_body = DESCRIPTIONS[kind]
     path.write_bytes(replaced(recordings["tiny-0"], opcode, name, make_body()))
-    assert _peak(path) < MOST_MEMORY
+    assert peak_of(path) < MOST_MEMORY
 
 
 HEADERS = {
@@ -221,14 +238,6 @@ def test_an_array_whose_header_is_no_description_of_numbers_is_refused(kind, rec
     path.write_bytes(replaced(recordings["tiny-0"], ATTACHMENT, REWARDS, body))
     with open_recording(path) as recording, pytest.raises(RecordingError, match=r"found no .* of numbers"):
         _ = recording.mdp
-
-
-def _peak(path) -> float:
-    """Return the most memory that reading a file in every way takes at once, in MB."""
-    command = [sys.executable, "-W", "error", "-m", "tests.reliability.peak", str(path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 0, done.stderr
-    return float(done.stdout.split()[1])
 
 
 # --- files made to take for ever --------------------------------------------------------------------------
