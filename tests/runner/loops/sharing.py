@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import multiprocessing
+import functools
 import random
 import time
+from multiprocessing.process import BaseProcess
 
 import gymnasium
 import numpy as np
 
 import runner
+from runner.service.processes import PRELOADED
+from runner.util.processes import process_context, start_process
 
-SPAWN = multiprocessing.get_context("spawn")
+FORKED = process_context(PRELOADED)
+"""Starts processes that have nothing of this one, yet need not import what they record with."""
 
 
 def play(rec, steps: int, seed: int | None, delay: float = 0.0, log: bool = True) -> None:
@@ -46,5 +50,6 @@ def run_all(*processes) -> None:
         assert process.exitcode == 0
 
 
-def started(*arguments, **keywords):
-    return SPAWN.Process(target=work, args=arguments, kwargs=keywords)
+def started(*arguments, **keywords) -> BaseProcess:
+    """Let another process do the work; return it."""
+    return start_process(FORKED, functools.partial(work, **keywords), *arguments)

@@ -21,8 +21,9 @@ from runner.loops.fold import fold_if_over
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
+from runner.util.processes import start_process
 from tests.runner.loops.making import Rooms, dualtaxi
-from tests.runner.loops.sharing import SPAWN, play, started, work
+from tests.runner.loops.sharing import FORKED, play, started, work
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 
@@ -32,8 +33,6 @@ def together(folder: Path, delay: float) -> runner.Run:
     with runner.record(gymnasium.make("CartPole-v1"), folder, name="joined", config={"lr": 1}) as rec:
         processes = [started(rec.run.folder, f"w{k}", 200 + 70 * k, k, delay) for k in (1, 2, 10)]
         processes.append(started(rec.run.folder, "eval", 120, 7, delay, phase="eval", at=500))
-        for process in processes:
-            process.start()
         play(rec, 250, 0, delay)
         for process in processes:
             process.join(60)
@@ -218,7 +217,6 @@ def test_texts_infos_options_frames_and_checkpoints_come_along(tmp_path):
 def test_a_killed_shard_loses_its_last_second_at_most(tmp_path, after):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="killed") as rec:
         process = started(rec.run.folder, "victim", 10**7, 1)
-        process.start()
         deadline = time.monotonic() + 30
         while not shards_of(rec.run) and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -259,8 +257,7 @@ def fail(how: str) -> None:
 )
 def test_a_crashed_process_is_named_with_its_exception(tmp_path, how, ending, error):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="crashed") as rec:
-        process = SPAWN.Process(target=fail, args=(how,), name="SpawnProcess-2")
-        process.start()
+        process = start_process(FORKED, fail, how, name="SpawnProcess-2")
         process.join(60)
         play(rec, 100, 0)
     run = run_at(rec.run.folder)
@@ -309,7 +306,6 @@ def test_the_last_process_folds_when_the_owner_was_killed(tmp_path):
 def test_the_next_command_folds_when_all_were_killed(tmp_path):
     process, run = owner(tmp_path)
     worker = started(run.folder, "w", 10**7, 1)
-    worker.start()
     deadline = time.monotonic() + 30
     while not shards_of(run) and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -319,13 +315,7 @@ def test_the_next_command_folds_when_all_were_killed(tmp_path):
     process.wait()
     worker.join()
     assert [shard.status for shard in shards_of(run)] == ["interrupted"]
-    shown = subprocess.run(
-        [sys.executable, "-m", "runner", "show", run.run_id, "--recordings", str(tmp_path)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "1 shard" in shown.stderr
+    assert "1 shard" in dualtaxi(tmp_path, "show", run.run_id).stderr
     run = run_at(run.folder)
     assert not shards_of(run)
     assert run.summary.train_steps > 300
