@@ -5,9 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 import time
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +27,7 @@ from runner.runs.listing import list_runs
 from runner.runs.locking import locked
 from runner.runs.resolve import find_run
 from runner.runs.run import Run, create_run
-from tests.runner.recording.making import SAMPLED, TAXIS, make_run, stopping_after
+from tests.runner.recording.making import SAMPLED, TAXIS, copy_of, make_run, stopping_after
 
 # --- every state that a file can be in ----------------------------------------------------------------
 
@@ -38,12 +36,6 @@ from tests.runner.recording.making import SAMPLED, TAXIS, make_run, stopping_aft
 def whole(taxis):
     """A finished run, not to be changed."""
     return taxis
-
-
-def copy_of(run: Run, folder: Path, status: str = "interrupted", **facts: object) -> Run:
-    """Return a copy of a run in a recordings folder, with another status."""
-    shutil.copytree(run.folder, folder / run.run_id)
-    return Run(folder / run.run_id, run.facts).update(status=status, **facts)
 
 
 def cut(run: Run, size: int) -> None:

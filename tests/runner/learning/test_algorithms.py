@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from typing import get_args
 
 import numpy as np
@@ -20,10 +20,8 @@ from runner.recording.blocks import blank_records
 from runner.recording.layout import layout_of
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, named_tables_at, tables_at
-from runner.runs.listing import list_runs
-from tests.runner.killing import LONG, kill_when, posix, start
 from tests.runner.learning import harness
-from tests.runner.recording.making import SAMPLED, TAXIS, experiment, make_run
+from tests.runner.recording.making import SAMPLED, TAXIS, copy_of, experiment, make_run
 
 TEAM = {"mode": "cooperative"}
 TWO = {"mode": "competitive", "exploration": "independent"}
@@ -114,18 +112,12 @@ def test_it_is_verified(run):
     assert verify(run.recording).sound
 
 
-@posix
-def test_it_is_killed_resumed_and_verified(algorithm, run, tmp_path):
-    values = LONG | ALGORITHMS[algorithm] | {"algorithm": algorithm, "seed": 5, "episodes": 3000}
-    path = tmp_path / "experiment.yaml"
-    path.write_text(json.dumps(values))  # JSON is YAML
-    recordings = tmp_path / "killed"
-    kill_when(start("run", path, "--recordings", recordings), recordings, 1_000_000)
-    (killed,) = list_runs(recordings)
-    assert killed.status == "interrupted"
-    done = resume(killed)
-    whole = make_run(tmp_path / "whole", values, seed=5)
-    assert done.summary["content_digest"] == whole.summary["content_digest"]
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_it_is_resumed_where_it_was_cut_off_and_verified(run, share, tmp_path):
+    cut = copy_of(run, tmp_path, summary={})
+    os.truncate(cut.recording, int(share * cut.recording.stat().st_size))
+    done = resume(cut)
+    assert done.summary["content_digest"] == run.summary["content_digest"]
     assert verify(done.recording).sound
 
 

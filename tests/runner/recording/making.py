@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,12 @@ def make_run(folder: Path, *parts: dict[str, Any], seed: int = 0, **values: Any)
     """Return a finished run of an experiment."""
     config = experiment(*parts, **values)
     return run_job(Job(config, seed), create_run(folder, config, seed))
+
+
+def copy_of(run: Run, folder: Path, status: str = "interrupted", **facts: object) -> Run:
+    """Return a copy of a run in a recordings folder, with another status."""
+    shutil.copytree(run.folder, folder / run.run_id)
+    return Run(folder / run.run_id, run.facts).update(status=status, **facts)
 
 
 def training(run: Run, start: int = 0, stop: int | None = None) -> NDArray[np.void]:
