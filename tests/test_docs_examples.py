@@ -40,9 +40,9 @@ WITH_EXAMPLES = [page for page in PAGES if examples(page)]
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A read-only recordings folder with a run of a shipped configuration."""
+    """A read-only recordings folder with a run of a shipped configuration, with short evaluations."""
     made = tmp_path_factory.mktemp("documented") / "recordings"
-    runner.run(ROOT / "configs" / "quick.yaml", recordings=made)
+    runner.run(ROOT / "configs" / "quick.yaml", overrides=["evaluation.trials=10"], recordings=made)
     return made
 
 

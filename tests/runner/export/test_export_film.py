@@ -212,7 +212,7 @@ def test_frames_that_are_too_large_are_refused(tmp_path, ending):
 
 
 def test_best_and_worst_are_chosen_by_return(pictured, tmp_path):
-    run = pictured("taxi")
+    run = pictured("lake")
     with open_recording(run.recording) as recording:
         records = recording.eval.episodes.array()
         phase, ranked = ranked_episodes(recording)

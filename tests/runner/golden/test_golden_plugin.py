@@ -33,7 +33,7 @@ def test_loop(golden):
     golden.same_bytes(env.run)
 
 def test_job(golden):
-    changes = ["episodes=10", f"epsilon={EPSILON}"]
+    changes = ["episodes=10", "evaluation.trials=3", f"epsilon={EPSILON}"]
     golden.same_bytes(runner.run("quick", recordings=golden.recordings, overrides=changes))
 
 def test_scores(golden):

@@ -15,6 +15,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 
 import runner
+from runner.loops import generators
 from runner.recording.reader import open_recording
 from tests.runner.loops.making import Rooms, drive, parallel, play
 
@@ -28,8 +29,9 @@ pytestmark = [
 ]
 
 
-def preprocessed(**kwargs: Any) -> Any:
-    atari = wrappers.AtariPreprocessing(gymnasium.make("ALE/Pong-v5", frameskip=1, **kwargs), frame_skip=4)
+def preprocessed() -> Any:
+    pong = gymnasium.make("ALE/Pong-v5", frameskip=1, max_num_frames_per_episode=600)
+    atari = wrappers.AtariPreprocessing(pong, frame_skip=4)
     return wrappers.FrameStackObservation(atari, 4)
 
 
@@ -46,7 +48,7 @@ ENVIRONMENTS = {
     "Blackjack": partial(gymnasium.make, "Blackjack-v1"),
     "CartPole": partial(gymnasium.make, "CartPole-v1"),
     "LunarLander": partial(gymnasium.make, "LunarLander-v3", enable_wind=True),
-    "HalfCheetah": partial(gymnasium.make, "HalfCheetah-v5"),
+    "HalfCheetah": partial(gymnasium.make, "HalfCheetah-v5", max_episode_steps=150),
     "Pong": preprocessed,
     "MiniGrid": minigrid,
     "sticky": lambda: wrappers.StickyAction(gymnasium.make("FrozenLake-v1"), 0.3),
@@ -54,8 +56,14 @@ ENVIRONMENTS = {
         wrappers.RescaleAction(gymnasium.make("Pendulum-v1", g=np.float64(9.5)), -1, 1)
     ),
 }
-STEPS = 2_200
-"""More than twice as many as from one recorded state to the next."""
+BETWEEN, STEPS = 250, 600
+"""Steps from one recorded state to the next, and more than twice as many."""
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch):
+    """Record states of generators more often than usual."""
+    monkeypatch.setattr(generators, "STEPS_BETWEEN", BETWEEN)
 
 
 def same(one: Any, other: Any) -> bool:

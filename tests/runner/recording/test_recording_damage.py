@@ -80,7 +80,7 @@ def test_a_file_cut_off_at_any_byte_gives_the_messages_before_the_cut(cuttable, 
     records = list(records_of(data))
     end_of_description = next(start for opcode, start, _ in records if opcode == CHUNK)
     near = {cut + k for _, start, end in records for cut in (start, end) for k in (-1, 0, 1, 9, 40)}
-    cuts = sorted(cut for cut in near | set(range(0, len(data), 41)) if 0 <= cut < len(data))
+    cuts = sorted(cut for cut in near | set(range(0, len(data), 97)) if 0 <= cut < len(data))
     path = tmp_path / "cut.mcap"
     unusable = [cut for cut in cuts if cut < end_of_description]
     for cut in cuts:
@@ -144,7 +144,7 @@ def places_to_change(data: bytes) -> list[int]:
     """Return places all over a file, and the beginning of one record of each kind byte by byte."""
     first = {opcode: start for opcode, start, _ in reversed(list(records_of(data)))}
     places = {place for start in first.values() for place in range(start, start + 45)}
-    places |= {*range(0, len(data), 41), *range(len(data) - 40, len(data))}
+    places |= {*range(0, len(data), 97), *range(len(data) - 40, len(data))}
     return sorted(place for place in places if place < len(data))
 
 
