@@ -32,9 +32,12 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a recordings folder with two small runs that differ in their seed, `first` and `second`."""
     folder = tmp_path_factory.mktemp("recorded")
     config = yaml.safe_load((ROOT / "configs" / "quick.yaml").read_text(encoding="utf-8"))
-    config |= {"episodes": 60, "seeds": 1}
+    config |= {"episodes": 60, "seeds": 1, "evaluation": {"every": 10, "trials": 20}}
+    config["env"] = {
+        "kwargs": {"max_episode_steps": 300}
+    }  # most trials of so short a training last that long
     for seed, name in enumerate(("first", "second")):
-        runner.run(config | {"name": name}, seed=seed, overrides=["evaluation.every=10"], recordings=folder)
+        runner.run(config | {"name": name}, seed=seed, recordings=folder)
     return folder
 
 
@@ -116,6 +119,20 @@ def page(browser: webdriver.Chrome, served: str) -> Iterator[Callable[[str], web
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with Served(tmp_path_factory.mktemp("server") / "runs") as started:
         yield started
+
+
+@pytest.fixture(scope="session")
+def served_folder(recorded: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the recordings folder that `served` serves: copies of the two runs, to be marked at most."""
+    return Path(shutil.copytree(recorded, tmp_path_factory.mktemp("served") / "recordings"))
+
+
+@pytest.fixture(scope="session")
+def served(served_folder: Path) -> Iterator[str]:
+    """Return the address of a service in a process of its own."""
+    with Served(served_folder) as started:
+        yield started.url
+    assert "Traceback" not in started.log.read_text()
 
 
 @pytest.fixture

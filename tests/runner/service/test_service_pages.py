@@ -44,7 +44,7 @@ def test_runs_are_searched_sorted_and_their_columns_chosen(client):
 
 
 def test_runs_of_a_name_are_one_row_that_opens_sorts_and_is_compared(client, recordings):
-    changes = ["name=many", "episodes=60", "seeds=[1, 2, 3]", "evaluation.every=20"]
+    changes = ["name=many", "episodes=20", "seeds=[1, 2, 3]", "evaluation.trials=5"]
     runs = list(runner.run_all("quick", overrides=changes, recordings=recordings))
     page = until(lambda page: "5 runs" in page, lambda: page_of(client, "/runs"))
     assert page.count("<tr>") == 4
@@ -158,7 +158,7 @@ PAGES = (
 def test_the_page_of_a_run_shows_what_a_random_policy_achieves(client):
     (address,) = re.findall(r'data-later="(\S+/random-policy)"', page_of(client, "/runs/first"))
     assert re.search(
-        r"A random policy succeeds in [\d.]+ % of episodes within the limit of 1,500 steps",
+        r"A random policy succeeds in [\d.]+ % of episodes within the limit of 300 steps",
         client.get(address).text,
     )
 

@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 from selenium.webdriver.common.by import By
-from served import Served, wait
+from served import wait
 
 import runner
 from runner.runs.resolve import find_run
@@ -138,14 +138,8 @@ def test_only_a_writer_marks(connect, settings):
     assert client.post("/runs/first/replay/mark", data={"at": "3:1"}).status_code == 403
 
 
-@pytest.fixture
-def served(recordings):
-    with Served(recordings) as server:
-        yield server.url
-
-
-def test_a_step_is_marked_by_a_key(page, recordings):
-    run = find_run("first", recordings)
+def test_a_step_is_marked_by_a_key(page, served_folder):
+    run = find_run("first", served_folder)
     runner.mark(run, "3:2", "earlier")
     browser = page("/runs/first/replay/train/3?t=1")
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#mark-ticks option[value='2']"))
@@ -161,9 +155,9 @@ def test_a_step_is_marked_by_a_key(page, recordings):
     wait(browser, lambda: browser.find_element(By.CSS_SELECTOR, ".count").text.startswith("step 2 of"))
 
 
-def test_hits_are_played_one_after_the_other(page, recordings):
+def test_hits_are_played_one_after_the_other(page, served_folder):
     first, second, _ = (
-        hit.replay for hit in runner.find("length > 1", recordings, sort="length", limit=3).hits
+        hit.replay for hit in runner.find("length > 1", served_folder, sort="length", limit=3).hits
     )
     browser = page("/find?expression=length+>+1&sort=length&limit=3")
     link = browser.find_element(By.CSS_SELECTOR, f'a[href^="{first}?"]')

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 
 import pytest
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
-from served import Served, wait
+from served import wait
 
 import runner
 from runner.analysis.episodes import EpisodeRef
@@ -19,14 +18,6 @@ from runner.runs.resolve import find_run
 
 AT = "eval:60:1:2"
 API = f"/api/v1/runs/first/what-if/{AT}"
-
-
-@pytest.fixture(scope="module")
-def served(recorded, tmp_path_factory):
-    """Return the address of a service in a process of its own."""
-    with Served(shutil.copytree(recorded, tmp_path_factory.mktemp("served") / "recordings")) as server:
-        yield server.url
-    assert "Traceback" not in server.log.read_text()
 
 
 def test_the_api_returns_what_python_does(client, recordings):
