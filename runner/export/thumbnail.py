@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from runner.drawing import palette, svg
+from runner.recording import schema
 from runner.recording.reader import Recording
 
 WIDTH, HEIGHT = 160, 120
@@ -31,6 +32,7 @@ def thumbnail(recording: Recording, phase: str, episode: int, title: str) -> str
     for rows in () if is_empty else tables.episode(episode).rows(0):
         rewards.append(rows["rewards"].sum(axis=1))
         if drawing is not None:
+            recording.mdp.check_steps(rows, str(recording.path), schema.PHASE_NAMES[phase])
             states += [rows["state"], rows["next_state"][-1:]]
         count += len(rows)
         if count >= MAX_STEPS:

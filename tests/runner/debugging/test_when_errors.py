@@ -12,6 +12,7 @@ import runner
 from runner.cli import cli
 from runner.debugging.when import when
 from runner.errors import RecordingError, RunnerError
+from runner.export.thumbnail import thumbnail
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
@@ -259,6 +260,10 @@ def test_steps_that_the_environment_cannot_have_are_refused(cooperative, tmp_pat
     path = altered(cooperative.recording, tmp_path / "bad.mcap", schema.TRAIN_STEP, change)
     with open_recording(path) as recording, pytest.raises(RecordingError, match="found state 1000000"):
         when(recording, "max(q[0]) > 1e6")
+    with open_recording(path) as recording:
+        (steps,) = recording.train.steps.blocks(100, 101)
+        with pytest.raises(RecordingError, match="found state 1000000"):
+            thumbnail(recording, "train", int(steps["episode"][0]), "an episode")
 
 
 # --- the command --------------------------------------------------------------------------------------------
