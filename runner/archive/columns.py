@@ -166,9 +166,8 @@ class Shape:
         """The bits of events by name, such as `taxi_1_drop_off`; `drop_off` has the bits of all agents."""
         masks: dict[str, int] = {}
         for bit, (event, column) in enumerate(zip(self._events, self.event_columns, strict=True)):
-            for name in dict.fromkeys(
-                (column.removeprefix("n_"), event.rpartition(".")[2])
-            ):  # no set: in order
+            names = (column.removeprefix("n_"), event.rpartition(".")[2])
+            for name in dict.fromkeys(names):  # a set has another order in each process
                 masks[name] = masks.get(name, 0) | 1 << bit
         return masks
 
