@@ -21,7 +21,7 @@ from runner.export.painting import decoded, redrawn
 from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.selection import MAX_MEMBERS
-from runner.export.rerun.tracks import Row, Times, Track, TrackView, Writer, in_tracks, scalars, times_of
+from runner.export.rerun.tracks import Times, Track, TrackRow, TrackView, Writer, in_tracks, scalars, times_of
 from runner.export.values import FEW, acted, number_names, observed
 from runner.recording import schema
 from runner.recording.messages import decode_array, frame_place, media_type
@@ -85,7 +85,7 @@ class LoopTracks:
             yield from in_tracks(self._frames(phase), FRAMES_SENT)
         yield from in_tracks(self._named(), 1)  # they may be large
         texts = (
-            Row(
+            TrackRow(
                 "log",
                 _step(text["log_time"]),
                 rr.TextLog(f"{text['name']}: {text['message']}", level="INFO"),
@@ -102,7 +102,7 @@ class LoopTracks:
                 values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
                 yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
 
-    def _frames(self, phase: str) -> Iterator[Row]:
+    def _frames(self, phase: str) -> Iterator[TrackRow]:
         """Yield recorded frames, at the steps of their environments."""
         recording, is_each_step = self._recording, frames_every(self._recording) == 1
         for frame in recording.phase(phase).frames.decoded():
@@ -112,16 +112,16 @@ class LoopTracks:
             if later >= 0 and (self._is_later(phase, environment, step) or not is_each_step):
                 yield self._frame(phase, environment, step, _picture(frame["data"]))
 
-    def _named(self) -> Iterator[Row]:
+    def _named(self) -> Iterator[TrackRow]:
         """Yield logged pictures and arrays."""
         for image in self._recording.table(schema.IMAGE_TOPIC).decoded():
             if data := _still(image["data"]):
                 name, view = entity_name(image["frame_id"]), rrb.Spatial2DView
                 step, shown = _step(image["log_time"]), _picture(data)
-                yield Row(f"picture/{name}", step, shown, TrackView("picture", name, view))
+                yield TrackRow(f"picture/{name}", step, shown, TrackView("picture", name, view))
         for time, array in self._recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
             name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
-            yield Row(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
+            yield TrackRow(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
 
     def _episodes(self, phase: str) -> Iterator[Track]:
         """Yield returns and lengths: of a game one length, and the return of each agent."""
@@ -176,9 +176,9 @@ class LoopTracks:
         for step, value in zip(times["step"][is_given].tolist(), values.data[is_given], strict=True):
             if isinstance(value, str):
                 text = rr.TextDocument(value.encode(errors="replace").decode())
-                rows.append(Row(entity, step, text, texts))
+                rows.append(TrackRow(entity, step, text, texts))
             elif value.size:
-                rows.append(Row(entity, step, rr.BarChart(value.ravel().astype(np.float64)), bars))
+                rows.append(TrackRow(entity, step, rr.BarChart(value.ravel().astype(np.float64)), bars))
         yield from in_tracks(rows)
 
     def _line(
@@ -217,7 +217,7 @@ class LoopTracks:
         view = TrackView(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
         return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
-    def drawn(self) -> Iterator[Row]:
+    def drawn(self) -> Iterator[TrackRow]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
         recording, selection = self._recording, self._writer.selection
         trust = selection.trust
@@ -243,7 +243,7 @@ class LoopTracks:
                 notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
             for note in notes:
                 selection.warnings.append(note)
-                yield Row("log", self._writer.last, rr.TextLog(note, level="WARN"), LOG)
+                yield TrackRow("log", self._writer.last, rr.TextLog(note, level="WARN"), LOG)
 
     def _is_later(self, phase: str, environment: int, step: int) -> bool:
         """Return whether a picture is later than the one before.
@@ -254,9 +254,9 @@ class LoopTracks:
         self._pictured[phase, environment] = step
         return before < step
 
-    def _frame(self, phase: str, environment: int, step: int, shown: rr.AsComponents) -> Row:
+    def _frame(self, phase: str, environment: int, step: int, shown: rr.AsComponents) -> TrackRow:
         entity = _entity(phase, self._environment(environment), "frame")
-        return Row(entity, step, shown, TrackView(phase, entity.replace("/", " "), rrb.Spatial2DView))
+        return TrackRow(entity, step, shown, TrackView(phase, entity.replace("/", " "), rrb.Spatial2DView))
 
     def _environment(self, number: int) -> str:
         return f"env_{number}" if self._recording.environments > 1 else ""

@@ -61,7 +61,7 @@ class Track:
     view: TrackView | None = None
 
 
-class Row(NamedTuple):
+class TrackRow(NamedTuple):
     """What an entity shows from a step on."""
 
     entity: str
@@ -181,9 +181,9 @@ def scalars(values: Array) -> list[rr.ComponentColumn]:
     return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
 
 
-def in_tracks(rows: Iterable[Row], size: int = MAX_ROWS) -> Iterator[Track]:
+def in_tracks(rows: Iterable[TrackRow], size: int = MAX_ROWS) -> Iterator[Track]:
     """Yield rows as tracks, at most `size` rows of an entity at once; they have the same components."""
-    waiting: dict[tuple[str, type], list[Row]] = {}
+    waiting: dict[tuple[str, type], list[TrackRow]] = {}
     for row in rows:
         key = row.entity, type(row.shown)
         group = waiting.setdefault(key, [])
@@ -193,7 +193,7 @@ def in_tracks(rows: Iterable[Row], size: int = MAX_ROWS) -> Iterator[Track]:
     yield from map(_track_of, waiting.values())
 
 
-def _track_of(rows: Sequence[Row]) -> Track:
+def _track_of(rows: Sequence[TrackRow]) -> Track:
     shown = []
     for batches in zip(*(row.shown.as_component_batches() for row in rows), strict=True):
         items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
