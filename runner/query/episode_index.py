@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from runner.query.chunks import Relation
 
 MAX_FILES: Final = 20_000
-_VERSION: Final = 5
+_VERSION: Final = 6
 _PACKED: Final = 64
 """The files that a pack has in the mean."""
 _LEAST: Final = 8
@@ -279,8 +279,12 @@ def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
 def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, list[str]]:
     """Return the names of actions by number, by the column of steps."""
     if shape.mdp is None or (names := action_names(shape.mdp)) is None:
-        is_from_0 = recording.has_states or not recording.spaces.get("action", {}).get("start")
-        own_names = recording.train.action_names() if is_from_0 and len(recording.agents) == 1 else ()
-        return {"action": list(own_names)} if own_names else {}
+        named = {}
+        space = recording.spaces.get("action", {})
+        for agent, part in (space["spaces"] if len(recording.agents) > 1 else {"": space}).items():
+            if recording.has_states or not part.get("start"):  # names are by number from 0
+                column = f"action_{agent.replace('.', '_')}".removesuffix("_")
+                named[column] = list(recording.train.action_names(agent))
+        return named
     own = dict(zip(shape.own_actions, names, strict=False))
     return {"action": list(actions_in_words(shape.mdp))} | own

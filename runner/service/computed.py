@@ -63,6 +63,8 @@ TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
 MAX_ROWS: Final = 1000
 """The most rows of a query."""
+MAX_FILM_STEPS: Final = 5_000
+"""The most steps of a film, as one film is made at a time."""
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
 RecordKind = Literal["evaluations", "training", "optimality"]
@@ -284,6 +286,11 @@ def film(run: Run, step: EpisodeRef, ending: str) -> bytes:
         pictures = Pictures(recording, shown.phase, shown.number_in(recording))
         if shown.t > pictures.steps:
             raise shown.no_step(recording, pictures.steps, shown.t)
+        if (steps := pictures.steps - shown.t) > MAX_FILM_STEPS:
+            raise RunnerError(
+                f"found {steps:,} steps to film, expected at most {MAX_FILM_STEPS:,}: begin at a later step, "
+                "or use `dualtaxi export film`, which has no limit."
+            )
         shot = Shot(f"{run.title}: {shown.title}", pictures, shown.t)
         write_film(file, shot, usual_speed(pictures.source), None, lambda _: None)
         return file.read_bytes()

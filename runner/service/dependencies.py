@@ -105,6 +105,15 @@ def require_written(run: Run, recordings: Path, act: str) -> None:
         )
 
 
+def written_run(run: FoundRun, settings: SettingsOf) -> Run:
+    """Return the run that the path names, if it is in the folder that the service writes to."""
+    require_written(run, settings.recordings[0], "change")
+    return run
+
+
+WrittenRun = Annotated[Run, Depends(written_run)]
+
+
 def opened_recording(run: RecordedRun) -> Iterator[Recording]:
     """Yield the opened recording of the run that the path names."""
     with open_recording(run.recording) as recording:

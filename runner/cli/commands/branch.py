@@ -177,7 +177,10 @@ def _action(actions: tuple[str, ...], run: Run) -> object:
     """Return the action that the options give: of one agent or all, or of some by their names."""
     pairs = [text.partition("=") for text in actions]
     if actions and all(equals for _, equals, _ in pairs) and (run.can_train_again or len(actions) > 1):
-        return {agent: value for agent, _, value in pairs}
+        by_agent = {agent: value for agent, _, value in pairs}
+        if len(by_agent) < len(pairs):
+            raise click.UsageError("--action: found an agent twice, expected one action of each agent.")
+        return by_agent
     if len(actions) > 1:
         raise click.UsageError("--action: several are for the agents of a game: AGENT=VALUE each.")
     return actions[0] if actions else None

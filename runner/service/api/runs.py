@@ -27,8 +27,8 @@ from runner.service.dependencies import (
     CatalogueOf,
     FoundRun,
     ProcessesOf,
-    RecordedRun,
     SettingsOf,
+    WrittenRun,
     json_response,
     require_written,
 )
@@ -157,10 +157,10 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
 @router.patch(
     "/runs/{run}",
     response_model=LabelsResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Change name, tags and note.",
 )
-def label_run(run: FoundRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
+def label_run(run: WrittenRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
     """Change the labels of a run as `dualtaxi label` does, and return them."""
     return relabelled(run, labels, catalogue)
 
@@ -183,10 +183,10 @@ class MarksResponse(BaseModel):
 @router.post(
     "/runs/{run}/marks",
     response_model=MarksResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Mark a step.",
 )
-def mark_step(run: RecordedRun, sent: MarkSent) -> dict[str, object]:
+def mark_step(run: WrittenRun, sent: MarkSent) -> dict[str, object]:
     """Mark a step of a run as `dualtaxi mark` does, and return all marks of the run."""
     mark(run, sent.at, sent.text, tags=sent.tags)
     return marks_of(run)
@@ -195,10 +195,10 @@ def mark_step(run: RecordedRun, sent: MarkSent) -> dict[str, object]:
 @router.delete(
     "/runs/{run}/marks/{name}",
     response_model=MarksResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
+    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Remove a mark.",
 )
-def remove_mark(run: FoundRun, name: Annotated[str, InPath(max_length=40)]) -> dict[str, object]:
+def remove_mark(run: WrittenRun, name: Annotated[str, InPath(max_length=40)]) -> dict[str, object]:
     """Remove a mark by its id, and return the others."""
     unmark(run, name)
     return marks_of(run)

@@ -46,3 +46,4 @@ for _module in (
     static,
 ):
     router.include_router(_module.router)
+router.include_router(run.acts)

@@ -35,6 +35,7 @@ from runner.service.dependencies import (
     ComputationOf,
     PicturesOf,
     RecordedRun,
+    WrittenRun,
 )
 from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Form, Page
@@ -207,7 +208,7 @@ for _path, _episode in EPISODES.items():
 
 
 @router.post("/mark")
-def mark_step(run: RecordedRun, form: Form) -> Response:
+def mark_step(run: WrittenRun, form: Form) -> Response:
     """Mark the step of a replay, or remove a mark, and show the replay again."""
     step = EpisodeRef.parse(form.get("at", ""))
     if removed := form.get("remove"):

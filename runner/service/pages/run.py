@@ -42,6 +42,7 @@ from runner.service.dependencies import (
     ProcessesOf,
     RecordedRun,
     SettingsOf,
+    WrittenRun,
 )
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import RunPage, environment_of, last_results, result_of
@@ -99,11 +100,11 @@ class _Act(APIRoute):
         return act
 
 
-acts = APIRouter(route_class=_Act)
+acts = APIRouter(prefix="/runs/{run}", include_in_schema=False, route_class=_Act)
 
 
 @acts.post("/labels")
-def label(run: FoundRun, form: Form, catalogue: CatalogueOf) -> Response:
+def label(run: WrittenRun, form: Form, catalogue: CatalogueOf) -> Response:
     """Change the labels of a run."""
     tags = form.get("tags", "").split()
     changed = LabelChanges.model_construct(
@@ -139,7 +140,7 @@ async def archive(
     run: FoundRun, form: Form, catalogue: CatalogueOf, settings: SettingsOf, processes: ProcessesOf
 ) -> Response:
     """Archive a run, and remove its recording if the form says so."""
-    await runs.archive_run(run, catalogue, settings, processes, "remove" in form)
+    await runs.archive_run(run, catalogue, settings, processes, form.get("remove") == "yes")
     return RedirectResponse(f"/runs/{run.run_id}", HTTPStatus.SEE_OTHER)
 
 
@@ -300,6 +301,3 @@ def _duration(run: Run) -> str:
         return f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
     seconds = run.summary.seconds
     return humanize.UNKNOWN if seconds is None else humanize.duration(seconds)
-
-
-router.include_router(acts)

@@ -293,6 +293,10 @@ def test_a_game_of_several_agents(tmp_path):
     ):
         with pytest.raises(ConfigError, match=message):
             runner.branch(rec.run, at="1:4", action=action, recordings=tmp_path)
+    twice = ["--action", "agent_1=1", "--action", "agent_1=2"]
+    words = ["branch", rec.run.run_id, "--at", "1:4", *twice, "--recordings", str(tmp_path)]
+    result = CliRunner().invoke(cli, words)
+    assert (result.exit_code, "found an agent twice" in result.stderr) == (2, True)
 
 
 def test_steps_of_evaluation_names_of_actions_and_an_episode_that_was_cut(tmp_path):

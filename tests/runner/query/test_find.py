@@ -16,6 +16,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
+from dualtaxi.parallel import DualTaxiParallelEnv
 from runner.archive.batches import Batches
 from runner.archive.runs import archive_run
 from runner.cli import cli
@@ -511,6 +512,26 @@ def test_extras_of_each_environment_are_searched(tmp_path, way):
         wanted = [k for k, values in enumerate(by_episode) if holds(values)]
         assert sorted(hit.episode for hit in hits) == wanted, expression
         assert 0 < len(wanted) < len(by_episode)
+
+
+def test_actions_of_games_are_compared_with_their_names(tmp_path):
+    drawn = []
+    with runner.record_parallel(DualTaxiParallelEnv(max_steps=12), tmp_path, name="game") as rec:
+        for episode in range(12):
+            rec.reset(seed=episode)
+            drawn.append(set())
+            while rec.agents:
+                actions = {agent: rec.action_space(agent).sample() for agent in rec.agents}
+                drawn[-1].add(int(actions["taxi_2"]))
+                rec.step(actions)
+    with open_recording(rec.run.recording) as recording:
+        north = recording.train.action_names("taxi_2").index("north")
+    hits = runner.find('any(action.taxi_2 == "north")', tmp_path, limit=None).hits
+    wanted = [k for k, actions in enumerate(drawn) if north in actions]
+    assert [int(hit.at) for hit in hits] == wanted
+    assert 0 < len(wanted) < 12
+    with pytest.raises(RunnerError, match="Did you mean 'south'"):
+        runner.find('any(action.taxi_2 == "souht")', tmp_path)
 
 
 def test_hits_are_exported(tmp_path, folder):

@@ -14,7 +14,7 @@ from submitted import ICY
 import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.archive.runs import restore_run
-from runner.errors import MissingExtra
+from runner.errors import MissingExtra, RunnerError
 from runner.export.encoder import frames_of
 from runner.runs.resolve import find_run
 from runner.runs.run import label
@@ -107,7 +107,7 @@ def test_a_run_is_removed_when_its_id_is_typed(client, recordings):
     assert "1 run" in page_of(client, "/runs")
 
 
-def test_a_run_of_a_folder_that_is_only_read_is_not_removed(connect, recordings, tmp_path):
+def test_a_run_of_a_folder_that_is_only_read_is_not_changed(connect, recordings, tmp_path):
     run = find_run("first", recordings)
     client = connect(ServiceSettings((tmp_path / "written", recordings), tokens=tmp_path / "tokens.json"))
     answer = client.post("/runs/first/remove", data={"confirm": run.run_id}, headers=ACCEPT_HTML)
@@ -116,13 +116,22 @@ def test_a_run_of_a_folder_that_is_only_read_is_not_removed(connect, recordings,
     assert (answer.status_code, "archive it where it was recorded" in answer.text) == (400, True)
     assert run.recording.is_file()
     assert not (recordings.parent / "archive").exists()
+    answer = client.post("/runs/first/labels", data={"name": "x"}, headers=ACCEPT_HTML)
+    assert (answer.status_code, "change it where it was recorded" in answer.text) == (400, True)
+    for address, sent in (("/runs/first/replay/mark", {}), ("/api/v1/runs/first/marks", {"at": "0:1"})):
+        answer = client.post(address, data={"at": "0:1"}) if not sent else client.post(address, json=sent)
+        assert (answer.status_code, "change it where it was recorded" in answer.text) == (409, True)
+    assert client.patch("/api/v1/runs/first", json={"note": "x"}).status_code == 409
+    now = find_run("first", recordings)
+    assert (now.name, now.marks) == (run.name, run.marks)
 
 
 def test_a_run_is_archived_and_its_recording_removed_when_the_form_says_so(client, recordings):
     run = find_run("first", recordings)
     digest = run.summary.content_digest
-    assert client.post("/runs/first/archive", data={}, follow_redirects=False).status_code == 303
-    assert run.recording.is_file()
+    for data in ({}, {"remove": ""}, {"remove": "no"}):
+        assert client.post("/runs/first/archive", data=data, follow_redirects=False).status_code == 303
+        assert run.recording.is_file()
     assert "It has an archive" in page_of(client, "/runs/first")
     assert (
         client.post("/runs/first/archive", data={"remove": "yes"}, follow_redirects=False).status_code == 303
@@ -172,6 +181,13 @@ def test_a_film_that_cannot_be_made_is_refused_on_the_page(client, fields, reaso
     answer = client.post("/runs/first/film", data={"ending": ".gif"} | fields, headers=ACCEPT_HTML)
     assert (answer.status_code, reason in answer.text) == (400, True), answer.text
     assert "<h1" in answer.text
+
+
+def test_a_film_of_very_many_steps_is_refused(client, monkeypatch):
+    monkeypatch.setattr(computed, "MAX_FILM_STEPS", 0)  # checked before the film is begun
+    step = EpisodeRef.parse("3:0")
+    with pytest.raises(RunnerError, match=r"found \d+ steps to film, expected at most 0"):
+        computed.film(client.app.state.catalogue.find("first"), step, ".gif")
 
 
 def test_a_run_is_filmed_and_archived_by_routes(client, recordings, tmp_path):
