@@ -48,6 +48,10 @@ _RESET: Final = [("row", "<i8"), ("environment", "<i8"), ("seed", "<u8"), ("seed
 _OF_AGENTS: Final = ("acted", "agents_terminated", "agents_truncated")
 """The columns that have a bit for each agent; steps of one environment alone have none of them."""
 _TRUE: Final = b"\1"
+_TWICE: Final = (
+    'in the step after another end, which only resets its environment with autoreset_mode="NextStep" (pass '
+    '"SameStep" if the step that ends an episode does).'
+)
 _NO_STATES: Final[States] = {}
 
 
@@ -314,7 +318,12 @@ class StepBuffer:
                     'expected a reset; another autoreset_mode than "Disabled" states that there was one.'
                 )
         elif self._mode == AutoresetMode.NEXT_STEP:
-            _check_only_reset(np.vstack([self.over, ended[:-1]]) & ended)
+            if (twice := np.vstack([self.over, ended[:-1]]) & ended).any():
+                step, environment = np.argwhere(twice)[0]
+                raise RecordingError(
+                    f"step {step} of a batch in environment {environment}: found the end of an episode "
+                    f"{_TWICE}"
+                )
         elif self._mode == AutoresetMode.SAME_STEP and ended.any():
             firsts, after = seen, seen.copy()
             after[ended] = self._observation.unknown(self._dtype) if last is None else last[ended]
@@ -601,7 +610,8 @@ class StepBuffer:
         over = np.vstack([self._over, self._ends[: self.filled - 1].any(axis=1)])
         waits = over if self.is_reset_twice else over & ~was_reset
         only_reset: Flags = waits & (self._mode == AutoresetMode.NEXT_STEP)
-        _check_only_reset(only_reset & self._ends[: self.filled].any(axis=1))
+        if (only_reset & self._ends[: self.filled].any(axis=1)).any():
+            warn_user(f"An episode ended {_TWICE} The steps are recorded, and this end is not counted.")
         # They come after the resets that the user's loop called before the step.
         rows, environments = np.nonzero(only_reset)
         start = self._waiting
@@ -671,13 +681,3 @@ class StepBuffer:
                 payload = attached._replace(reset=number + offset).to_payload()
                 self._recorder.append(topic, payload, before + int(steps[offset]))
         self._attached.clear()
-
-
-def _check_only_reset(ends: Flags) -> None:
-    """Check that no episode ends in a step that only resets its environment; [rows, N]."""
-    if ends.any():
-        raise RecordingError(
-            f"environment {np.argwhere(ends)[0, 1]}: found the end of an episode in the step after another "
-            'end, expected none, as autoreset_mode="NextStep" means that this step only resets the '
-            'environment; pass "SameStep" if the step that ends an episode does.'
-        )

@@ -77,8 +77,8 @@ class EpisodeLog:
     def take(self, steps: TurnBlock) -> Episodes:
         """Take the next steps of all environments."""
         (rows, n), was_reset = steps.terminated.shape, steps.was_reset
-        ends = steps.terminated | steps.truncated | steps.is_over
         taken = np.broadcast_to(np.logical_not(steps.only_reset), (rows, n))
+        ends = (steps.terminated | steps.truncated | steps.is_over) & taken
         count = np.cumsum(taken, axis=0, dtype=np.int64)
         before = count - taken
         after_end = np.vstack([np.zeros(n, np.bool_), ends[:-1]])

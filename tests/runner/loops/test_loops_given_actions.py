@@ -14,6 +14,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.lib.recfunctions import structured_to_unstructured
 
 import runner
+from runner.execution.verify import verify
 from tests.runner.loops.making import dualtaxi
 
 GIVEN = (0.8, -0.4)
@@ -152,3 +153,31 @@ def test_actions_of_varying_size_reproduce_the_run(tmp_path):
             rec.step(tuple(array() for _ in range(n)))
     verified = dualtaxi(tmp_path, "verify", "halving", "--trust")
     assert (verified.exit_code, "reproduced" in verified.output) == (0, True), verified.output
+
+
+class EndingVector(HalvingVector):
+    """Ends an episode in its steps 2 and 3, as if it were reset in the step that ends one."""
+
+    taken = 0
+
+    def step(self, actions: Any) -> Any:
+        seen, rewards, never, _, infos = super().step(actions)
+        self.taken += 1
+        return seen, rewards, never | [self.taken in (2, 3), False], never, infos
+
+
+def test_an_end_in_a_step_that_only_resets_is_recorded_and_not_counted(tmp_path):
+    rec = runner.record_vector(EndingVector(), tmp_path)
+    rec.reset()
+    for _ in range(6):
+        rec.step(np.ones((2, 2), np.float32))
+    with pytest.warns(RuntimeWarning, match="An episode ended in the step after another end, which only"):
+        rec.close()
+    with runner.open_recording(rec.run.recording) as recording:
+        rows = np.concatenate(list(recording.train.steps.rows()))
+        own = rows[rows["environment"] == 0]
+        assert own["terminated"].tolist() == [False, True, True, False, False, False]
+        assert own["taken"].tolist() == [True, True, False, False, True, True]
+        assert recording.train.episodes.array()["length"].tolist() == [2]
+        assert len(recording.train.episode_steps(0)) == 2
+    assert verify(rec.run.recording).finding == ""
