@@ -9,9 +9,9 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Final, Literal, ParamSpec
+from typing import Any, Final, Literal, ParamSpec
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, StrictFloat, StrictInt, StrictStr
 
 from runner.analysis.episodes import EpisodeRef
 from runner.config import from_text
@@ -23,7 +23,9 @@ from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import branch_job, branch_name
 from runner.execution.estimate import estimate, step_limit
 from runner.execution.initial_tables import resolve_initial_q
-from runner.recording.reader import open_recording
+from runner.loops.actions import parsed_action
+from runner.recording.gym_spaces import restore_space
+from runner.recording.reader import Recording, open_recording
 from runner.replay.makers import why_not_rerun
 from runner.replay.trust import require_listed
 from runner.runs.run import Run
@@ -127,6 +129,9 @@ def is_path(name: str) -> bool:
     return "/" in name or "\\" in name or name.endswith((".mcap", ".yaml", ".yml"))
 
 
+Action = StrictStr | StrictInt | StrictFloat | list[StrictInt | StrictFloat]
+
+
 class BranchQuestion(BaseModel, extra="forbid", frozen=True):
     """A change of a recorded step; the fields are the arguments of `runner.branch`."""
 
@@ -134,8 +139,10 @@ class BranchQuestion(BaseModel, extra="forbid", frozen=True):
         description="The first step that may differ: `EPISODE:T`; of training also `step:N` or its number; "
         "of an evaluation of a loop `eval:N:TRIAL:T`."
     )
-    action: str | int | dict[str, str | int] | None = Field(
-        default=None, description="A joint action, or one by agent; names or numbers. Null: as recorded."
+    action: Action | dict[str, Action] | None = Field(
+        default=None,
+        description="A joint action, or one by agent; names or numbers, of a loop also a list of numbers. "
+        "Null: as recorded.",
     )
     overrides: tuple[str, ...] = Field(
         default=(), description="Of training: `KEY=VALUE` each, as for `--set`."
@@ -156,7 +163,8 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
     refuse_misfits(run, at, question.overrides, question.episodes, question.policy, question.seed, MAX_STEPS)
     with open_recording(run.recording) as recording:
         if run.can_train_again:
-            job, _ = branch_job(recording, at, question.action, question.overrides, question.episodes)
+            action: Any = question.action
+            job, _ = branch_job(recording, at, action, question.overrides, question.episodes)
             limit = recording.mdp.step_limit
             size = estimate(job.config, limit).typical_bytes if limit else 0
             name, config = branch_name(run, question.name), job.config
@@ -167,9 +175,21 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
             raise step.no_step(recording, length, step.t)
         if reason := why_not_rerun(recording):
             raise CannotRedo(reason)
+        _check_action(recording, step.phase, question.action)
         name = checked_run_name(question.name) or default_name(recording)
     values = {"run": run.run_id, **question.model_dump(mode="json"), "at": str(step)}
     return CheckedJob("episode", name, 1, 0, values, (0,))
+
+
+def _check_action(recording: Recording, phase: str, action: object) -> None:
+    """Check an action of a loop, so far as the recording describes its space.
+
+    In a game, the agents that act at a step are known when it is played.
+    """
+    with contextlib.suppress(AssertionError, LookupError, TypeError, ValueError, OverflowError):
+        space = restore_space(recording.spaces["action"])
+        if len(recording.agents) == 1:
+            parsed_action(space, action, space.sample(), recording.phase(phase).action_names())
 
 
 class JobChecker:

@@ -120,6 +120,10 @@ def test_a_resumed_job_plays_an_episode_on_only_once(connect, loop, recordings, 
         ({"at": "1:4", "overrides": ["lr=3"]}, 422, "overrides and episodes are for runs that were trained"),
         ({"at": "1:4", "policy": "agent:act"}, 422, "policy"),
         ({"at": "1:4", "name": "-"}, 422, "name"),
+        ({"at": "1:4", "action": "up"}, 422, "found 'up'"),
+        ({"at": "1:4", "action": 7}, 422, "found 7"),
+        ({"at": "1:4", "action": [0.5]}, 422, "found [0.5]"),
+        ({"at": "1:4", "action": True}, 422, "action"),
     ],
 )
 def test_what_is_wrong_for_a_loop_is_refused_before_it_is_queued(client, loop, sent, status, message):
@@ -127,14 +131,6 @@ def test_what_is_wrong_for_a_loop_is_refused_before_it_is_queued(client, loop, s
     assert answer.status_code == status, answer.text
     assert message in answer.json()["error"]["message"]
     assert client.get("/api/v1/jobs").json()["total"] == 0
-
-
-def test_an_action_that_the_space_has_not_fails_the_job(client, loop, recordings):
-    answer = client.post(f"/api/v1/runs/{loop.run_id}/branch", json={"at": "1:4", "action": "up"})
-    job = finished(client, answer.json()["number"])
-    assert (job["state"], job["begun"]) == ("failed", [])
-    assert "found 'up'" in job["error"]
-    assert not list(recordings.glob(".branch-*"))
 
 
 def test_the_replay_of_a_loop_leads_to_the_form_which_queues_the_job(client, loop):
