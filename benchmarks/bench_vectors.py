@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
 
 import runner
 from benchmarks.figures import Figure, figure, processor_seconds
@@ -27,6 +28,12 @@ def measure(quick: bool) -> list[Figure]:
         figures = [_vector(count, Path(folder), steps, repetitions) for count in (1, 4, 16)]
         figures.append(_vector(16, Path(folder), steps, repetitions, AutoresetMode.SAME_STEP, length=8))
         return figures + [_batches(count, Path(folder), steps * 200, repetitions) for count in (16, 1024)]
+
+
+def ends_of(draws: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return ends of episodes, [T, N] over and over, none of them in the step after another."""
+    ends = draws & ~np.roll(draws, 1, axis=0)
+    return ends & ~np.roll(ends, 1, axis=0)
 
 
 class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -42,7 +49,7 @@ class Prepared(gymnasium.vector.VectorEnv[Any, Any, Any]):
         draws = np.random.default_rng(0)
         self._observations = draws.normal(size=(1024, count, 4)).astype(np.float32)
         self._rewards = np.ones(count)
-        self._ends = draws.random((1024, count)) < 1 / length
+        self._ends = ends_of(draws.random((1024, count)) < 1 / length)
         last = np.empty(count, object)
         last[:] = list(self._observations[0])
         self._infos = [
@@ -102,7 +109,7 @@ def _batches(count: int, folder: Path, steps: int, repetitions: int) -> Figure:
     draws = np.random.default_rng(0)
     moves = draws.normal(scale=0.01, size=(129, count, 4)).astype(np.float32)
     observations, actions = moves.cumsum(axis=0), draws.integers(0, 2, (128, count))
-    rewards, ends = np.ones((128, count), np.float32), draws.random((128, count)) < 1 / 200
+    rewards, ends = np.ones((128, count), np.float32), ends_of(draws.random((128, count)) < 1 / 200)
     batches = max(1, steps // rewards.size)
     rates, spent, size = [], [], 0.0
     for _ in range(repetitions):

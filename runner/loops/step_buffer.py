@@ -48,10 +48,6 @@ _RESET: Final = [("row", "<i8"), ("environment", "<i8"), ("seed", "<u8"), ("seed
 _OF_AGENTS: Final = ("acted", "agents_terminated", "agents_truncated")
 """The columns that have a bit for each agent; steps of one environment alone have none of them."""
 _TRUE: Final = b"\1"
-_TWICE: Final = (
-    'in the step after another end, which only resets its environment with autoreset_mode="NextStep" (pass '
-    '"SameStep" if the step that ends an episode does).'
-)
 _NO_STATES: Final[States] = {}
 
 
@@ -316,13 +312,6 @@ class StepBuffer:
                 raise RecordingError(
                     f"found step {step} of a batch in environment {environment} after the end of an episode, "
                     'expected a reset; another autoreset_mode than "Disabled" states that there was one.'
-                )
-        elif self._mode == AutoresetMode.NEXT_STEP:
-            if (twice := np.vstack([self.over, ended[:-1]]) & ended).any():
-                step, environment = np.argwhere(twice)[0]
-                raise RecordingError(
-                    f"step {step} of a batch in environment {environment}: found the end of an episode "
-                    f"{_TWICE}"
                 )
         elif self._mode == AutoresetMode.SAME_STEP and ended.any():
             firsts, after = seen, seen.copy()
@@ -611,7 +600,11 @@ class StepBuffer:
         waits = over if self.is_reset_twice else over & ~was_reset
         only_reset: Flags = waits & (self._mode == AutoresetMode.NEXT_STEP)
         if (only_reset & self._ends[: self.filled].any(axis=1)).any():
-            warn_user(f"An episode ended {_TWICE} The steps are recorded, and this end is not counted.")
+            warn_user(
+                "An episode ended in the step after another end, which only resets its environment with "
+                'autoreset_mode="NextStep" (pass "SameStep" if the step that ends an episode does). The '
+                "steps are recorded, and this end is not counted."
+            )
         # They come after the resets that the user's loop called before the step.
         rows, environments = np.nonzero(only_reset)
         start = self._waiting

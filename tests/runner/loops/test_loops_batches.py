@@ -208,12 +208,6 @@ def test_resets_and_modes_are_checked(tmp_path):
             rec.batch(*BATCH, **final)
         with pytest.raises(ConfigError, match="extras: found shape"):
             rec.batch(*BATCH, extras={"value": np.ones((2, 5))})
-        twice = np.zeros((5, 2), bool)
-        twice[1:3, 1] = True
-        with pytest.raises(
-            RecordingError, match="environment 1: found the end of an episode in the step after"
-        ):
-            rec.batch(*BATCH[:3], twice)
         rec.batch(*BATCH)
     assert rec.run.summary["train_steps"] == 10
     ended = (*BATCH[:3], np.ones((5, 2), bool))

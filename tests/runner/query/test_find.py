@@ -515,13 +515,13 @@ def test_extras_of_each_environment_are_searched(tmp_path, way):
 
 
 def test_actions_of_games_are_compared_with_their_names(tmp_path):
-    drawn = []
-    with runner.record_parallel(DualTaxiParallelEnv(max_steps=12), tmp_path, name="game") as rec:
+    drawn, draws = [], np.random.default_rng(0)
+    with runner.record_parallel(DualTaxiParallelEnv(max_steps=6), tmp_path, name="game") as rec:
         for episode in range(12):
             rec.reset(seed=episode)
             drawn.append(set())
             while rec.agents:
-                actions = {agent: rec.action_space(agent).sample() for agent in rec.agents}
+                actions = {agent: int(draws.integers(rec.action_space(agent).n)) for agent in rec.agents}
                 drawn[-1].add(int(actions["taxi_2"]))
                 rec.step(actions)
     with open_recording(rec.run.recording) as recording:
