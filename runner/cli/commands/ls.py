@@ -169,7 +169,8 @@ class _Listing:
                 rows, total = index.page(self._filter, *order, limit=limit, offset=self._offset)
             if "same_as" in columns:
                 rows = with_same_as(rows, index.originals())
-            spool.writelines(render(self._noted(rows), columns))
+            for part in render(self._noted(rows), columns):
+                spool.write(part)  # `writelines` would hold all of it in memory
             return total
 
         with tempfile.SpooledTemporaryFile(_SPOOL_BYTES, "w+", encoding="utf-8", newline="") as spool:
