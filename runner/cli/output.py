@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -56,8 +56,8 @@ if TYPE_CHECKING:
 class Reply:
     """What a command replies. Only the form that is printed is iterated over."""
 
-    data: Mapping[str, object] | Iterable[str] = ()
-    """What --json prints: an object, or the parts of a text."""
+    data: Mapping[str, object] | Callable[[], Mapping[str, object]] | Iterable[str] = ()
+    """What --json prints: an object, a function that returns one, or the parts of a text."""
     text: Iterable[Part] = ()
     csv: Iterable[str] = ()
     """Lines of CSV, which stand for the text where there is none."""
@@ -75,7 +75,7 @@ def print_replies(replies: Reply | Iterable[Reply], form: str = "text") -> int:
         if reply.page:
             echo(reply.page, err=form != "text")
         if form == "json":
-            data = reply.data
+            data = reply.data() if callable(reply.data) else reply.data
             parts = [json.dumps(finite(data), indent=1) + "\n"] if isinstance(data, Mapping) else data
             sys.stdout.writelines(map(printable, parts))
         elif form == "markdown":

@@ -134,21 +134,32 @@ def du_command(
     from runner.runs.catalogue.usage import usage_of
 
     chosen = parse(" ".join(words))
-    largest, sums = usage_of(lambda work: look(recordings, work, say), chosen, limit or None)
-    freeable = sums.freeable(recordings)
-    runs = (
-        {
-            "run_id": usage.row["id"],
-            **{key: usage.row[key] for key in ("name", "status", "same_as")},
-            "path": str(Path(usage.row["root"], usage.row["entry"])),
-            **usage.bytes,
-        }
-        for usage in largest
-    )
-    nothing = f"No run in {', '.join(map(str, recordings))} matches." if words else "No runs yet."
-    shown = largest[:_LARGEST] if limit is None else largest
-    text = _text(shown, sums, freeable) if sums.runs else [Remark(nothing)]
-    return Reply({"runs": [*runs], "total": sums.bytes, "freeable": freeable}, text)
+
+    def measured(count: int | None) -> tuple[list[Usage], Sums]:
+        return usage_of(lambda work: look(recordings, work, say), chosen, count or None)
+
+    def data() -> dict[str, object]:
+        largest, sums = measured(limit)
+        runs = [
+            {
+                "run_id": usage.row["id"],
+                **{key: usage.row[key] for key in ("name", "status", "same_as")},
+                "path": str(Path(usage.row["root"], usage.row["entry"])),
+                **usage.bytes,
+            }
+            for usage in largest
+        ]
+        return {"runs": runs, "total": sums.bytes, "freeable": sums.freeable(recordings)}
+
+    def text() -> Iterator[Part]:
+        largest, sums = measured(_LARGEST if limit is None else limit)
+        if sums.runs:
+            yield from _text(largest, sums, sums.freeable(recordings))
+        else:
+            folders = ", ".join(map(str, recordings))
+            yield Remark(f"No run in {folders} matches." if words else "No runs yet.")
+
+    return Reply(data, text())
 
 
 def _text(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Iterator[Part]:
