@@ -283,7 +283,7 @@ def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, list[str]
         space = recording.spaces.get("action", {})
         for agent, part in (space["spaces"] if len(recording.agents) > 1 else {"": space}).items():
             if recording.has_states or not part.get("start"):  # names are by number from 0
-                column = f"action_{agent.replace('.', '_')}".removesuffix("_")
+                column = "_".join(filter(None, ("action", agent.replace(".", "_"))))
                 named[column] = list(recording.train.action_names(agent))
         return named
     own = dict(zip(shape.own_actions, names, strict=False))

@@ -334,29 +334,28 @@ def test_a_damaged_index_is_made_again(folder):
     assert runner.find("length > 20", folder) == before
 
 
-def test_a_damaged_index_in_a_pack_is_made_again(folder, monkeypatch):
-    shutil.rmtree(cache_folder() / EPISODES)
+def place_damaged_file(folder, monkeypatch, name):
+    """Place a damaged file where a pack has it and a run's index; return the hits before, and the file."""
+    shutil.rmtree(cache_folder() / EPISODES, ignore_errors=True)
     before = runner.find("length > 20", folder, runs="pole")
     (file,) = (cache_folder() / EPISODES).glob(f"{before.hits[0].run_id}-*")
-    other = file.with_name(f"other-{'1' * 32}{file.stem[-16:]}.parquet")
-    other.write_bytes(b"?")
-    os.utime(other, (0, 0))
+    damaged = file.with_name(f"{name}-{'1' * 32}{file.stem[-16:]}.parquet")
+    damaged.write_bytes(b"?")
+    os.utime(damaged, (0, 0))
     monkeypatch.setattr(episode_index, "_LEAST", 1)
     monkeypatch.setattr(episode_index, "_PACKED", int(file.stem[-32:-16], 16))  # it ends a pack of both
+    return before, damaged
+
+
+def test_a_damaged_index_in_a_pack_is_made_again(folder, monkeypatch):
+    before, _ = place_damaged_file(folder, monkeypatch, "other")
     with pytest.raises(RunnerError, match="the next search makes it again"):
         runner.find("length > 20", folder, runs="pole")
     assert runner.find("length > 20", folder, runs="pole") == before
 
 
 def test_a_file_that_another_search_is_writing_is_no_index(folder, monkeypatch):
-    shutil.rmtree(cache_folder() / EPISODES, ignore_errors=True)
-    before = runner.find("length > 20", folder, runs="pole")
-    (file,) = (cache_folder() / EPISODES).glob(f"{before.hits[0].run_id}-*")
-    unfinished = file.with_name(f".0a1b2c3d.other-{'1' * 32}{file.stem[-16:]}.parquet")
-    unfinished.write_bytes(b"?")
-    os.utime(unfinished, (0, 0))
-    monkeypatch.setattr(episode_index, "_LEAST", 1)
-    monkeypatch.setattr(episode_index, "_PACKED", int(file.stem[-32:-16], 16))  # it ends a pack
+    before, unfinished = place_damaged_file(folder, monkeypatch, ".0a1b2c3d.other")
     assert runner.find("length > 20", folder, runs="pole") == before
     assert unfinished.exists()
 
