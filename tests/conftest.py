@@ -24,6 +24,11 @@ process_context(PRELOADED)  # as the service does it; else each of its children 
 os.environ["DUALTAXI_CODE"] = "off"  # thousands of runs need not ask git; tests of the user's code turn it on
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the long tests: the last ones to begin are short, so that no worker waits for another."""
+    items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
 def pytest_collection_finish() -> None:
     """Leave what the collected tests consist of, millions of objects, out of every search for garbage."""
     gc.collect()

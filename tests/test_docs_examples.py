@@ -19,6 +19,8 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("docs/**/*.md"), *ROOT.glob("README.md")])
 _EXAMPLE = re.compile(r"^```(python|sh example)[ \t]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)

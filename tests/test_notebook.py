@@ -78,6 +78,7 @@ def test_without_rerun_notebook_the_error_names_the_extra(run, monkeypatch):
         rerun_view(run)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.filterwarnings("ignore::ResourceWarning")

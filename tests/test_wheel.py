@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[1]
 SHORT = ["--set", "episodes=40", "--set", "evaluation.trials=5", "--set", "evaluation.every=20"]
 

@@ -17,6 +17,7 @@ from tests.doors import commands, routes
 from tests.inventory.forms import ADDRESSES, COMMANDS, PARTS, ROUTES, UNTYPED
 
 
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_every_form_is_as_inventoried():
     chromium_programs()

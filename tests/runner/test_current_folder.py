@@ -18,6 +18,8 @@ import pytest
 
 import runner
 
+pytestmark = pytest.mark.long
+
 DEPENDENCIES = """
     PIL av blake3 click cloudpickle dualtaxi fastapi filelock google gymnasium isal jinja2 llvmlite lz4
     matplotlib mcap msgspec numba numpy optuna platformdirs psutil pyarrow pydantic pygame rich runner scipy

@@ -13,6 +13,8 @@ import pytest
 import runner
 from tests.runner.service.served import Served
 
+pytestmark = pytest.mark.long
+
 DOCS = Path(__file__).parents[2] / "docs" / "plugins.md"
 
 

@@ -38,6 +38,8 @@ from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from tests.doors import commands, routes
 
+pytestmark = pytest.mark.long
+
 TRAP = """\
 from pathlib import Path
 Path(__file__).with_name("IMPORTED").touch()

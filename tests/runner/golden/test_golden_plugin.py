@@ -14,6 +14,8 @@ import pytest
 from runner.service.processes import PRELOADED
 from runner.util.processes import process_context, start_process
 
+pytestmark = pytest.mark.long
+
 TESTS = """
 import gymnasium
 import runner

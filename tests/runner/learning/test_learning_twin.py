@@ -145,6 +145,7 @@ settings_of_learners = st.fixed_dictionaries(
 )
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=30)
 @given(random_mdps(), settings_of_learners, st.integers(0, 2**64 - 1), st.integers(1, 40))
 def test_any_game_by_any_rule_is_learned_as_the_twin_does(mdp, values, seed, block):

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from runner.learning import kernel, schedules
 from runner.learning.numba_cache import stamp
 
@@ -59,6 +61,7 @@ def test_scipy_is_left_to_functions_that_need_it():
     assert _printed(program) == ["False", "1.0"]
 
 
+@pytest.mark.long
 def test_a_function_of_the_user_gives_the_same_with_and_without_kernels():
     program = (
         "import numba, numpy as np\n"

@@ -19,6 +19,8 @@ from schemathesis.specs.openapi.checks import (
 )
 from served import Served
 
+pytestmark = pytest.mark.long
+
 CHECKS = [
     not_a_server_error,
     status_code_conformance,

@@ -26,6 +26,8 @@ from runner.sweep.running import run_sweep
 from runner.sweep.task import run_task
 from runner.sweep.trials import Trials, recorded_trials
 
+pytestmark = pytest.mark.long
+
 CONFIG = {
     "name": "quick",
     "episodes": 1200,

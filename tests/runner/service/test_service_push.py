@@ -216,6 +216,7 @@ def test_tokens_and_addresses_are_checked(tmp_path, monkeypatch):
 # --- faults -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_server_killed_during_twenty_uploads_loses_none(own_server, run, tmp_path, monkeypatch):
     monkeypatch.setattr(client_module, "PIECE", 8 << 10)
     sources = copies(run, tmp_path, 20)

@@ -24,6 +24,7 @@ def file(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_a_file_is_submitted_and_watched(file, tmp_path):
     with Served(tmp_path / "recordings") as server:
         words = ["remote", "submit", str(file), "--server", server.url]

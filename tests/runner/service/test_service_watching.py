@@ -18,6 +18,8 @@ from runner.client.jobs import BestTrial, JobEvent, LogEvent, RemoteJob, SweepPr
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
 
+pytestmark = pytest.mark.long
+
 CONFIG = {"name": "quick", "episodes": 600, "mode": "cooperative", "evaluation": {"every": 50, "trials": 400}}
 
 

@@ -13,7 +13,10 @@ from runner.sweep import local
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future defaults and open files
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.filterwarnings("ignore"),  # Ray's own, about its future defaults and open files
+]
 
 
 class OnOwnDisk(LocalWorkers):
