@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 from tests.browsing import chromium
-from tests.inventory.comparing import ADVICE, differences, gone_patterns, read, write
+from tests.inventory.comparing import ADVICE, differences, gone_pattern, read, write
 from tests.inventory.taking import FILES, Shop, screenshots
 
 
@@ -23,7 +23,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write the inventory")
     parser.add_argument("--screenshots", type=Path, metavar="FOLDER", help="write pictures of every page")
     options = parser.parse_args()
-    problems = []
+    problems, gone = [], gone_pattern()
     with tempfile.TemporaryDirectory() as folder, Shop(Path(folder)) as shop, chromium() as browser:
         if options.screenshots:
             screenshots(shop, browser, options.screenshots)
@@ -31,8 +31,8 @@ def main() -> int:
         for name, take in FILES.items():
             found = take(shop, browser)
             if options.write:
-                write(name, found, gone_patterns())
-            problems += differences(read(name), found, gone_patterns())
+                write(name, found, gone)
+            problems += differences(read(name), found, gone)
     print("\n".join([*problems, ADVICE] if problems else ["Nothing is missing, and nothing is new."]))
     return 1 if problems else 0
 
