@@ -18,12 +18,11 @@ from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.actions import packed
 from runner.recording.blocks import lone_message
-from runner.recording.chunks import encode_chunk
 from runner.recording.messages import encode
 from runner.recording.pipeline import MessageBatches
 from runner.recording.reader import open_recording
 from runner.recording.recorder import BLOCK_BYTES
-from runner.recording.records import ReadChunk, Record
+from runner.recording.records import ReadChunk, Record, encode_chunk
 from runner.recording.rewriting import copy
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile

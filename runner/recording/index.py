@@ -33,14 +33,15 @@ from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import CutOff, RecordingError
 from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.chunks import CHUNK_HEAD, ChunkEntry
 from runner.recording.layout import Layout
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import (
+    CHUNK_HEAD,
     LARGE,
     MAX_NAME_BYTES,
     MAX_NAMED,
     MAX_UNPACKED_RATIO,
+    ChunkEntry,
     Place,
     RawRecord,
     bytes_of,

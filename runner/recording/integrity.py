@@ -19,18 +19,19 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import CutOff, OtherVersion, RecordingError
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import ChunkEntry, message_index
 from runner.recording.extras import ExtraNames
 from runner.recording.index import Index, beginning_of, check_beginning, checksum
 from runner.recording.layout import Layout
 from runner.recording.metadata import layout_of_run
 from runner.recording.records import (
+    ChunkEntry,
     MetadataRecord,
     RawRecord,
     ReadChunk,
     Report,
     asks_for_indexes,
     check_constants,
+    message_index,
     read_record,
     walk,
 )

@@ -19,15 +19,17 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import ChunkEntry, first_channel, unpack_chunk
 from runner.recording.index import read_index
 from runner.recording.records import (
     MAX_METADATA_BYTES,
     AttachmentRecord,
+    ChunkEntry,
     MetadataRecord,
     Place,
     RawRecord,
+    first_channel,
     read_record,
+    unpack_chunk,
 )
 from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import open_regular

@@ -22,7 +22,6 @@ from mcap.writer import MCAP0_MAGIC
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype
-from runner.recording.chunks import chunk_head
 from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
@@ -34,6 +33,7 @@ from runner.recording.records import (
     ReadChunk,
     Record,
     Report,
+    chunk_head,
     read_record,
 )
 from runner.recording.run_file import Summary, parse_result

@@ -11,8 +11,8 @@ from typing import Self
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.chunks import ChunkEntry, chunk_head, decompress
 from runner.recording.reader import Recording
+from runner.recording.records import ChunkEntry, chunk_head, decompress
 from runner.recording.schema import Topic
 from runner.recording.topic_chunks import ChunkSpan
 

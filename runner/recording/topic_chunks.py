@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype, row_dtype, rows_of
-from runner.recording.chunks import ChunkEntry
 from runner.recording.messages import Logged, Message, decode, decode_rows
 from runner.recording.record_store import RecordStore
-from runner.recording.records import checked_messages
+from runner.recording.records import ChunkEntry, checked_messages
 from runner.recording.schema import TOPIC_OF, MessageType, Topic
 from runner.util.arrays import Ints, RecordDType, Records
 from runner.util.codecs import MAX_CHUNK_BYTES

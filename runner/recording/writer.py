@@ -18,11 +18,11 @@ from mcap.records import Attachment, Header
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
-from runner.recording.chunks import Chunk
 from runner.recording.index import Beginning, Index, beginning_of, checksum
 from runner.recording.layout import Layout
 from runner.recording.records import (
     AttachmentRecord,
+    Chunk,
     MetadataRecord,
     Place,
     Record,

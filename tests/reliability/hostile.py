@@ -20,8 +20,7 @@ import zstandard
 from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RunnerError
-from runner.recording.chunks import unpack_chunk
-from runner.recording.records import UNREADABLE, attachment_of, metadata_of
+from runner.recording.records import UNREADABLE, attachment_of, metadata_of, unpack_chunk
 
 HEADER, SCHEMA, CHANNEL, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 3, 4, 6, 7, 8
 ATTACHMENT, ATTACHMENT_INDEX, METADATA, METADATA_INDEX, DATA_END, FOOTER = 9, 10, 12, 13, 15, 2

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from runner.recording.blocks import HEADER, HEADER_BYTES, blank_records
-from runner.recording.chunks import encode_chunk
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
+from runner.recording.records import encode_chunk
 from runner.recording.repair import repair
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile

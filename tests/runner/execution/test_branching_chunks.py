@@ -13,9 +13,8 @@ from runner.execution.branching import branch_training
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.blocks import RECORD_HEAD
-from runner.recording.chunks import CHUNK_HEAD, encode_chunk
 from runner.recording.reader import open_recording
-from runner.recording.records import ReadChunk, walk
+from runner.recording.records import CHUNK_HEAD, ReadChunk, encode_chunk, walk
 from runner.recording.repair import repair
 from runner.recording.rewriting import whole_records
 from runner.recording.writer import RecordingFile

@@ -8,10 +8,9 @@ import pytest
 
 from runner.execution import verify as verifying
 from runner.execution.verify import verify
-from runner.recording.chunks import encode_chunk
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
-from runner.recording.records import RawRecord, read_record
+from runner.recording.records import RawRecord, encode_chunk, read_record
 from runner.recording.writer import RecordingFile
 from runner.runs import provenance
 from runner.util.packing import Packing

@@ -24,11 +24,10 @@ from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record
-from runner.recording.chunks import encode_chunk
 from runner.recording.extras import ExtraNames
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
-from runner.recording.records import ReadChunk
+from runner.recording.records import ReadChunk, encode_chunk
 from runner.recording.rewriting import whole_records
 from runner.recording.writer import RecordingFile
 from runner.util.packing import Packing
