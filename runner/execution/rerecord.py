@@ -31,8 +31,7 @@ from runner.recording.rewriting import rewrite
 from runner.recording.turns import is_taken
 from runner.recording.writer import RecordingFile
 from runner.replay.engine import Replay
-from runner.replay.environment import stream_from_child
-from runner.replay.makers import why_not_rerun
+from runner.replay.makers import stream_from_child, why_not_rerun
 from runner.replay.recorded import Piece, pieces
 from runner.replay.steps import blank_steps, first_of, last_step, put_states, whole_records
 from runner.replay.tables import tables_at

@@ -1,18 +1,26 @@
-"""Verify that a recording is what its job gives: every byte, step, metric and table.
+"""Verify a recording: its bytes, and what its job or its environment gives when it is made again.
 
 A job determines its content, so the strongest check is also the simplest: run the job again, in memory, and
 compare. With the environment data in the recording this checks the recording against itself (each step among
 the outcomes, each draw as the seed gives it, each metric, episode and table as the steps make them); with the
 installed environment, whether the run can be reproduced here and now.
+
+Of a loop, the tables are compared with one another, and its environment takes the recorded actions: this
+shows that the recorded returns were really obtained, whatever chose the actions.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -26,39 +34,118 @@ from runner.errors import (
     CutOff,
     Diverged,
     EnvironmentNotUsable,
+    NotInRecording,
     OtherVersion,
     RecordingError,
     RunnerError,
 )
-from runner.execution.initial_tables import recorded_tables
-from runner.execution.session import Report, Session, recorder_for
-from runner.execution.verification import (
-    CIRCUMSTANCES,
-    LOOP_NOT_COMPARED,
-    NAMES_NOT_COMPARED,
-    Verdict,
-    Verification,
-    compare_names,
-    compare_result,
-    compare_values,
-    with_difference,
-)
-from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.composition import composition_of
+from runner.recording.composition import Composition, composition_of
 from runner.recording.consistency import Findings, Inconsistent, check_extras, check_phase
 from runner.recording.digest import combined_digest
 from runner.recording.integrity import check_integrity, refuse_foreign, survey
+from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import Report as BytesReport
 from runner.recording.reference import Reference
 from runner.recording.rewriting import content_hash
 from runner.recording.run_file import has_environment
+from runner.replay.makers import stream_from_child, why_not_rerun, why_uncertain
 from runner.replay.trust import require_may_train
 from runner.runs.checkpoints import read_checkpoints
 from runner.runs.listing import run_at
 from runner.runs.provenance import Differences, differing_provenance
 from runner.util.humanize import counted
+from runner.util.processes import Report as StepsReport
+from runner.util.processes import report_progress
+from runner.util.values import Json
+
+if TYPE_CHECKING:  # they load Numba and Gymnasium, of which a verification needs one at most
+    from runner.execution.session import Report
+    from runner.replay.engine import Difference
+
+_LOOP_NOT_COMPARED: Final = (
+    "how its environment is described: scene, names of actions, agents, events and landmarks, step limit"
+)
+_NAMES_NOT_COMPARED: Final = f"{_LOOP_NOT_COMPARED}; --rerun compares them with the installed environment"
+"""What a verification leaves out: the messages do not depend on it."""
+_CIRCUMSTANCES: Final = ("command", "directory", "host", "user")  # they cannot explain a difference
+
+Verdict = Literal["reproduced", "consistent", "interrupted", "differs", "damaged"]
+"""The verdict on a recording:
+
+- `reproduced`: its job was retrained, or its environment rerun, and everything compared is equal;
+- `consistent`: only the file was checked, and agrees with itself; `Verification.reason` is why;
+- `interrupted`: the run did not end, and all up to its end is reproduced, or consistent;
+- `differs`: the job or the environment gives something else, each time the same;
+- `damaged`: the bytes of the file are wrong, or its parts contradict each other.
+"""
+
+OUTSIDE: Final = (
+    "The environment gives other results each time for the same seed and actions: it depends on more than "
+    "its seed, such as the global random generators, the clock, the order of a set, or threads."
+)
+_HASH_SEEDS: Final = (1, 2, 3, 4)
+"""A difference is looked for again with each: two texts in a set may have the same order with one."""
+_AHEAD_SECONDS: Final = 3_244_643
+"""37 days and some hours, minutes and seconds: an odd number of each."""
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The result of a verification."""
+
+    path: Path
+    verdict: Verdict = "consistent"
+    act: Literal["checked", "retrained", "rerun"] = "checked"
+    """What was done: only the file was checked, a job was retrained, or a loop's environment was rerun."""
+    environment: Literal["", "recorded", "installed"] = ""
+    """The environment with which it was retrained or rerun."""
+    composition: Composition | None = None
+    """What the environment consists of; None if there is none, or nothing can be read."""
+    reason: str = ""
+    """Why the environment cannot be rerun, as a sentence; empty if it was, or was not to be."""
+    finding: str = ""
+    """The first thing that differs or is damaged; empty if nothing is."""
+    difference: Diverged | Difference | None = None
+    """The first difference with attributes; that of a loop which cannot be rerun shows why."""
+    train_steps: int = 0
+    """Training steps that were compared, with one another or with the retrained ones."""
+    eval_steps: int = 0
+    """Evaluation steps that were compared."""
+    episodes: int = 0
+    """Episodes that were retrained, or rerun; of a job, training episodes."""
+    unfinished: int = 0
+    """Rerun episodes that were in progress when the recording ended."""
+    steps: int = 0
+    """Steps that were retrained or rerun; of a loop, all before the first difference were equal."""
+    left_out: int = 0
+    """Steps that could not be rerun: the random generators' state at their beginning was not recorded."""
+    cut_off: int = 0
+    """Steps at the end that could not be rerun: their resets were lost when the loop was killed."""
+    of_episodes: int | None = None
+    """The number of episodes that a rerun sample is of; None if all were to be rerun."""
+    tolerance: float = 0.0
+    """Absolute and relative, for floating-point values that were rerun; 0 if bytes were compared."""
+    assumed: tuple[str, ...] = ()
+    """What was rerun with default arguments, as its own were not recorded."""
+    content_digest: str = ""
+    """The digest of all that was compared; empty if the recording has none, or is not complete."""
+    notes: tuple[str, ...] = ()
+    """What a reader should know though it is not wrong."""
+    changes: Differences = field(default_factory=dict)
+    """What is not as recorded here and may explain a difference: packages, platform, code, environment."""
+    not_compared: str = ""
+    """What of the recording was not compared."""
+    is_loop: bool = False
+    """Whether its steps can be compared by a rerun of its environment only."""
+    if_rerun: Verification | None = None
+    """What holds instead if a rerun gives the recorded steps, though their order is unlikely."""
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing differs, and nothing is damaged."""
+        return self.verdict not in ("differs", "damaged")
 
 
 def verify(
@@ -88,8 +175,6 @@ def verify(
     found = check(path, damage_of(path), bool(rerun), report, trust)
     if rerun is False or not found.is_loop:
         return found
-    from runner.execution.rerun import rerun_loop  # slow to import
-
     return rerun_loop(found, sample, tolerance, trust)
 
 
@@ -188,13 +273,20 @@ def _check_content(recording: Recording, installed: bool, report: Report, trust:
         return _check_loop(recording)
     job = Job(from_mapping(recording.config), recording.seed or 0)
     if recording.run["job"] != job.identity:
-        return with_difference(
+        return _with_difference(
             verification, Diverged("metadata run", "job", recording.run["job"], job.identity)
         )
     return _retrain(recording, job, installed, report, trust)
 
 
+# --- a job, retrained -------------------------------------------------------------------------------
+
+
 def _retrain(recording: Recording, job: Job, installed: bool, report: Report, trust: bool) -> Verification:
+    from runner.execution.initial_tables import recorded_tables  # they load Numba
+    from runner.execution.session import Session, recorder_for
+    from runner.learning.learner import Learner
+
     env, complete = job.config.env, recording.status == "finished"
     verification = Verification(
         recording.path,
@@ -211,9 +303,9 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         return Verification(recording.path, verdict, reason=str(error))
     learner = Learner(job.config, mdp, job.seed, recorded_tables(recording))
     try:
-        compare_names(recording, list(learner.agents))
+        _compare_names(recording, list(learner.agents))
     except Diverged as error:
-        return with_difference(verification, error)
+        return _with_difference(verification, error)
     reference = Reference(recording, complete)
     recorder = recorder_for(job, learner, None, reference)
     variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
@@ -225,10 +317,10 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
     session = Session(job, learner, recorder, report, stop=lambda: not complete and all_compared())
     if installed:  # what may explain a difference
         changes = differing_provenance(recording.provenance) | differing_environment(recording, mdp)
-        changes = {key: values for key, values in changes.items() if key not in CIRCUMSTANCES}
+        changes = {key: values for key, values in changes.items() if key not in _CIRCUMSTANCES}
         verification = replace(verification, changes=changes)
     else:
-        verification = replace(verification, not_compared=NAMES_NOT_COMPARED)
+        verification = replace(verification, not_compared=_NAMES_NOT_COMPARED)
     try:
         ended = session.run()
         topics = recorder.drain()
@@ -237,9 +329,9 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         if installed:
             description = json.loads(json.dumps(mdp.description()))
             for key in sorted(description):
-                compare_values(key, recording.environment.get(key), description[key])
+                _compare_values(key, recording.environment.get(key), description[key])
     except Diverged as error:
-        return with_difference(verification, error, "differs")
+        return _with_difference(verification, error, "differs")
     finally:
         recorder.abandon()
     result = recording.result
@@ -255,7 +347,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         steps=steps["train"] + steps["eval"],
         episodes=recording.train.episodes.count(),
     )
-    return compare_result(verification, recording, session.summary(topics)) if whole else verification
+    return _compare_result(verification, recording, session.summary(topics)) if whole else verification
 
 
 def differing_environment(recording: Recording, mdp: Mdp) -> Differences:
@@ -268,8 +360,11 @@ def differing_environment(recording: Recording, mdp: Mdp) -> Differences:
     }
 
 
+# --- a loop's file ----------------------------------------------------------------------------------
+
+
 def _check_loop(recording: Recording) -> Verification:
-    """Check the file of a user's own loop; `runner.execution.rerun` reruns its environment.
+    """Check the file of a user's own loop; `rerun_loop` reruns its environment.
 
     Compared are the numbers of its messages, its steps with the environment's outcomes where it is tabular,
     steps, resets and episodes with one another, and its digest with its messages.
@@ -284,11 +379,11 @@ def _check_loop(recording: Recording) -> Verification:
         verdict="consistent" if is_over else "interrupted",
         train_steps=recording.train.steps.total(),
         eval_steps=recording.eval.steps.total(),
-        not_compared=LOOP_NOT_COMPARED if has_environment(recording.config) else "",
+        not_compared=_LOOP_NOT_COMPARED if has_environment(recording.config) else "",
         is_loop=True,
     )
     try:
-        compare_names(recording)
+        _compare_names(recording)
         phases = {phase: check_phase(recording, phase, finished) for phase in schema.PHASES}
         for phase in phases:
             check_extras(recording, phase, finished)
@@ -307,7 +402,7 @@ def _check_loop(recording: Recording) -> Verification:
         finding = f"{recording.path}: {error}"
         return replace(verification, verdict="damaged", notes=tuple(notes), finding=finding)
     except Diverged as error:
-        return with_difference(replace(verification, notes=tuple(notes)), error)
+        return _with_difference(replace(verification, notes=tuple(notes)), error)
     verification = replace(verification, notes=tuple(notes))
     off_table = sum(findings.rewards_off_table for findings in phases.values())
     found = _compare_totals(recording, verification, off_table, finished)
@@ -347,7 +442,7 @@ def _compare_totals(
     }
     if recording.result.rewards_off_table is not None and not recording.leaves_out_steps:
         expected["rewards_off_table"] = off_table
-    return compare_result(verification, recording, expected)
+    return _compare_result(verification, recording, expected)
 
 
 def _check_checkpoints(recording: Recording) -> list[str]:
@@ -398,3 +493,227 @@ def _unlikely(recording: Recording, phases: Mapping[str, Findings]) -> str:
             where = f"{recording.phase(phase).steps.topic.name}, step {findings.first_without}"
             return f"{where}: found an episode without a reset before it, as others have"
     return ""
+
+
+# --- a loop, rerun ----------------------------------------------------------------------------------
+
+
+def rerun_loop(
+    checked: Verification,
+    sample: int | None = None,
+    tolerance: float = 0.0,
+    trust: bool = False,
+    report: StepsReport = lambda _: None,
+) -> Verification:
+    """Rerun a loop's environment in a child process with limits, and compare every step.
+
+    A difference counts if it comes out again in other processes, with other hash seeds and a later clock.
+
+    Args:
+        checked: the result of checking the file, which is returned if it is not sound, or of a loop that was
+            interrupted before its first step.
+        sample: how many episodes to rerun, at even distances; None for all that happened.
+        tolerance: absolute and relative, for floating-point observations and rewards; 0 compares bytes.
+    """
+    start = (checked.if_rerun if sample is None else None) or checked
+    is_doubted = start is not checked
+    is_empty = checked.verdict == "interrupted" and not checked.train_steps + checked.eval_steps
+    if is_empty or not start.sound:
+        return checked
+    with open_recording(checked.path) as recording:
+        if reason := why_not_rerun(recording, trust):
+            return replace(checked, reason=reason)
+        if recording.maker is not None:
+            start = replace(start, changes=_other_versions(recording.maker))
+        assumed = recording.maker.assumed if recording.maker else ()
+    found = replace(start, act="rerun", environment="installed", tolerance=tolerance, assumed=assumed)
+    try:
+        for message in stream_from_child(_rerun, checked.path, found, sample, trust):
+            if isinstance(message, int):
+                report(message)
+            else:
+                found = message
+        reason, is_different = found.reason, found.difference is not None
+        if is_different and not reason and not all(_differs_again(found, trust, k) for k in _HASH_SEEDS):
+            reason = OUTSIDE
+    except CannotRedo as error:
+        return replace(checked, changes=start.changes, reason=str(error))
+    if reason or (is_doubted and (found.left_out or not found.sound)):  # it did not decide
+        return replace(checked, changes=start.changes, reason=reason, difference=found.difference)
+    return found
+
+
+def _differs_again(found: Verification, trust: bool, hash_seed: int) -> bool:
+    """Return whether another process finds the same difference."""
+    messages = stream_from_child(_first_again, found.path, found, trust, hash_seed=hash_seed)
+    return [message for message in messages if not isinstance(message, int)] == [found.difference]
+
+
+def _rerun(path: Path, found: Verification, sample: int | None, trust: bool) -> None:
+    """Report the number of steps taken, and at last the result; runs in a child process."""
+    with open_recording(path) as recording:
+        if sample is None:
+            found = _rerun_all(recording, found, trust)
+        else:
+            found = _rerun_sample(recording, found, sample, trust)
+        if found.difference is not None:
+            finding, reason = str(found.difference), why_uncertain(recording, trust)
+            found = replace(found, verdict="differs", finding=finding, reason=reason)
+    if found.verdict == "consistent":
+        found = replace(found, verdict="reproduced")
+    report_progress(found)
+
+
+def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verification:
+    from runner.replay.engine import Replay  # loads Gymnasium
+
+    total = {phase: recording.phase(phase).steps.total() for phase in schema.PHASES}
+    left = total.copy()
+    with closing(Replay(recording, trust, found.tolerance, report_progress)) as replay:
+        for steps in replay.all():
+            if len(steps):
+                after = total[steps.phase] - 1 - int(steps.recorded["step"][-1])
+                left[steps.phase] = min(left[steps.phase], after)
+            found = replace(
+                found,
+                episodes=found.episodes + int(np.count_nonzero(steps.recorded["t"] == 0)),
+                steps=found.steps + len(steps),
+                difference=steps.difference,
+            )
+        ended = sum(recording.phase(phase).episodes.count() for phase in schema.PHASES)
+        found = replace(found, left_out=replay.skipped, unfinished=max(0, found.episodes - ended))
+    if found.difference is None and "content_digest" not in recording.result:
+        found = replace(found, cut_off=sum(left.values()))
+    if found.difference is None and not found.steps:
+        raise CannotRedo("No reset had a seed, and the state of the random generators was not recorded.")
+    return found
+
+
+def _rerun_sample(recording: Recording, found: Verification, sample: int, trust: bool) -> Verification:
+    """Rerun some episodes, at even distances, of training and evaluation together."""
+    from runner.replay.environment import rerun  # loads Gymnasium
+
+    ended = [
+        (phase, number)
+        for phase in schema.PHASES
+        for number in range(recording.phase(phase).episodes.count())
+    ]
+    places = np.unique(np.linspace(0, len(ended) - 1, min(sample, len(ended))).round().astype(int))
+    found = replace(found, of_episodes=len(ended))
+    reason = "No episode ended."
+    for phase, number in (ended[place] for place in places):
+        taken = found.steps
+
+        def report(steps: int, taken: int = taken) -> None:
+            report_progress(taken + steps)
+
+        try:
+            episode = rerun(recording, phase, [number], trust=trust, tolerance=found.tolerance, report=report)
+            for steps in episode:
+                found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
+        except CannotRedo as error:
+            reason = str(error)
+            steps_left_out = len(recording.phase(phase).episode(number))
+            found = replace(found, left_out=found.left_out + steps_left_out)
+            continue
+        found = replace(found, episodes=found.episodes + 1)
+        if found.difference is not None:
+            return found
+    if not found.episodes:
+        raise CannotRedo(reason)
+    return found
+
+
+def _first_again(path: Path, found: Verification, trust: bool) -> None:
+    """Report the first difference of the episode that differs, if it differs again; runs in a child process.
+
+    The clock is months ahead, so that an environment that depends on it, however coarsely, is found out.
+    """
+    from runner.replay.environment import rerun  # loads Gymnasium
+
+    _advance_clocks()
+    first = found.difference
+    assert first is not None
+    assert not isinstance(first, Diverged)
+    episodes = None if first.episode is None else [first.episode]
+    with open_recording(path) as recording, contextlib.suppress(NotInRecording):  # an episode without steps
+        for steps in rerun(
+            recording,
+            first.phase,
+            episodes,
+            trust=trust,
+            tolerance=found.tolerance,
+            report=report_progress,
+        ):
+            if steps.difference is not None:
+                report_progress(steps.difference)
+
+
+def _advance_clocks() -> None:
+    """Set the functions of `time` that return a number ahead, before an environment's module takes them."""
+    for name in ("time", "monotonic", "perf_counter"):
+        for unit, function in ((1, name), (10**9, f"{name}_ns")):
+            now: Callable[[], float] = getattr(time, function)
+            setattr(time, function, lambda now=now, ahead=_AHEAD_SECONDS * unit: now() + ahead)
+
+
+def _other_versions(maker: EnvironmentMaker) -> Differences:
+    """Return the packages that determine what the environment does, where they are others than recorded."""
+    here = {name: _version(name) for name in maker.packages}
+    here |= {"platform": platform.platform(), "machine": platform.machine()}
+    recorded = {**maker.packages, "platform": maker.platform, "machine": maker.machine}
+    return {name: (recorded[name], here[name]) for name in recorded if recorded[name] != here[name]}
+
+
+def _version(distribution: str) -> str:
+    try:
+        return importlib.metadata.version(distribution)
+    except (importlib.metadata.PackageNotFoundError, ValueError):
+        return "not installed"
+
+
+# --- comparisons ------------------------------------------------------------------------------------
+
+
+def _with_difference(found: Verification, error: Diverged, verdict: Verdict = "damaged") -> Verification:
+    """Return a verification with a difference as its finding."""
+    return replace(found, verdict=verdict, finding=str(error), difference=error)
+
+
+def _compare_names(recording: Recording, learners: list[str] | None = None) -> None:
+    """Compare the names that are in a recording more than once.
+
+    Raises:
+        Diverged: two of them differ.
+    """
+    described, config = recording.environment, recording.config.get("env")
+    for key, name in (("env_id", "id"), ("kwargs", "kwargs")):
+        expected = config.get(name) if isinstance(config, Mapping) else None
+        if described.get(key) != expected:
+            raise Diverged("environment.json", key, described.get(key), expected)
+    if learners is not None and list(recording.agents) != learners:
+        raise Diverged("metadata run", "agents", list(recording.agents), learners)
+
+
+def _compare_values(path: str, found: object, expected: object) -> None:
+    """Compare two values of the environment's description.
+
+    Raises:
+        Diverged: they differ; the error has the path of the first value that does.
+    """
+    if isinstance(found, dict) and isinstance(expected, dict) and found.keys() == expected.keys():
+        for key in sorted(expected):
+            _compare_values(f"{path}.{key}", found[key], expected[key])
+    elif isinstance(found, list) and isinstance(expected, list) and len(found) == len(expected):
+        for k, pair in enumerate(zip(found, expected, strict=True)):
+            _compare_values(f"{path}[{k}]", *pair)
+    elif found != expected:
+        raise Diverged("environment.json", path, found, expected)
+
+
+def _compare_result(found: Verification, recording: Recording, expected: Json) -> Verification:
+    """Compare the result in a recording with the computed one."""
+    for key, value in expected.items():
+        if recording.result.get(key) != value:
+            return _with_difference(found, Diverged("metadata result", key, recording.result.get(key), value))
+    return replace(found, content_digest=expected["content_digest"])

@@ -14,9 +14,7 @@ limits on memory and time. `runner.replay.makers` says whether a recording can b
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
@@ -30,15 +28,10 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
 from runner.replay.engine import ALL, Replay, RerunSteps, environments_of
-from runner.replay.makers import why_not_rerun
+from runner.replay.makers import silence, stream_from_child, why_not_rerun
 from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
 from runner.replay.stepping import Stepper
-from runner.util.processes import CallFailed, ChildProcess, Report, TimedOut, report_progress
-
-MEMORY_BYTES: Final = 4 * 10**9
-"""How much a child process may allocate; importing RLlib, which wraps many games, takes 2.1 GB of it."""
-SECONDS: Final = 60.0
-"""How long a child process may take for a block of steps, which is meant to take 0.2 s, or to begin."""
+from runner.util.processes import Report, report_progress
 
 
 def rerun(
@@ -117,53 +110,13 @@ def rerun_in_child(
     """
     options: Any = {"render": render, "trust": trust, "draw_from": draw_from}
     if multiprocessing.current_process().daemon:
-        _silence()
+        silence()
         with open_recording(path) as recording:
             yield from rerun(recording, phase, episodes, **options)
         return
     for message in stream_from_child(_rerun_path, path, phase, episodes, **options):
         if isinstance(message, RerunSteps):  # else steps taken, which show that it does not hang
             yield message
-
-
-def stream_from_child(
-    function: Callable[..., None],
-    path: Path,
-    *arguments: object,
-    hash_seed: int | None = None,
-    **keywords: object,
-) -> Iterator[Any]:
-    """Yield what a function that runs foreign code passes to `report_progress` in a child process.
-
-    Args:
-        function: of a module; called with the path and the other arguments.
-        hash_seed: runs in a fresh interpreter with this hash seed.
-
-    Raises:
-        CannotRedo: the process hangs, crashes or needs more memory.
-    """
-    with ChildProcess(MEMORY_BYTES, hash_seed=hash_seed) as child:
-        try:
-            yield from child.stream(_quietly, SECONDS, function, path, *arguments, **keywords)
-        except TimedOut:
-            raise CannotRedo(
-                f"The environment took longer than {SECONDS:g} s to be made or stepped, and was stopped."
-            ) from None
-        except CallFailed as error:
-            raise CannotRedo(f"The environment ended its process: {error}") from error
-
-
-def _quietly(function: Callable[..., None], *arguments: object, **keywords: object) -> None:
-    """Call a function in a child process, without what environments print: it would be mixed with results."""
-    _silence()
-    function(*arguments, **keywords)
-
-
-def _silence() -> None:
-    warnings.simplefilter("ignore")
-    with open(os.devnull, "wb") as nothing:  # noqa: PTH123 - a device
-        for stream in (1, 2):
-            os.dup2(nothing.fileno(), stream)
 
 
 def _rerun_path(path: Path, phase: str | None, episodes: Sequence[int] | None, **arguments: Any) -> None:

@@ -11,7 +11,9 @@ import inspect
 import itertools
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from runner.environments.games import as_parallel
@@ -40,7 +42,7 @@ from runner.replay.trust import (
     why_not_imported,
 )
 from runner.runs.trust_marks import own_mark
-from runner.util.processes import raise_if_out_of_memory
+from runner.util.processes import CallFailed, ChildProcess, TimedOut, raise_if_out_of_memory
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -50,6 +52,10 @@ if TYPE_CHECKING:
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
 
+MEMORY_BYTES: Final = 4 * 10**9
+"""How much a child process may allocate; importing RLlib, which wraps many games, takes 2.1 GB of it."""
+SECONDS: Final = 60.0
+"""How long a child process may take for a block of steps, which is meant to take 0.2 s, or to begin."""
 _MAX_OPTIONS: Final = 300
 """The most characters of the options of a reset in a reason."""
 
@@ -293,6 +299,50 @@ def _wrapper(spec: Wrapper, base: type, trust: bool) -> Any:
     if not (isinstance(wrapper, type) and issubclass(wrapper, base)):
         raise CannotRedo(f"{spec.entry_point} is not a wrapper of Gymnasium.")
     return wrapper
+
+
+# --- in a child process -------------------------------------------------------------------------------
+
+
+def stream_from_child(
+    function: Callable[..., None],
+    path: Path,
+    *arguments: object,
+    hash_seed: int | None = None,
+    **keywords: object,
+) -> Iterator[Any]:
+    """Yield what a function that runs foreign code passes to `report_progress` in a child process.
+
+    Args:
+        function: of a module; called with the path and the other arguments.
+        hash_seed: runs in a fresh interpreter with this hash seed.
+
+    Raises:
+        CannotRedo: the process hangs, crashes or needs more memory.
+    """
+    with ChildProcess(MEMORY_BYTES, hash_seed=hash_seed) as child:
+        try:
+            yield from child.stream(_quietly, SECONDS, function, path, *arguments, **keywords)
+        except TimedOut:
+            raise CannotRedo(
+                f"The environment took longer than {SECONDS:g} s to be made or stepped, and was stopped."
+            ) from None
+        except CallFailed as error:
+            raise CannotRedo(f"The environment ended its process: {error}") from error
+
+
+def _quietly(function: Callable[..., None], *arguments: object, **keywords: object) -> None:
+    """Call a function in a child process, without what environments print: it would be mixed with results."""
+    silence()
+    function(*arguments, **keywords)
+
+
+def silence() -> None:
+    """Leave out what environments print, in a child process."""
+    warnings.simplefilter("ignore")
+    with open(os.devnull, "wb") as nothing:  # noqa: PTH123 - a device
+        for stream in (1, 2):
+            os.dup2(nothing.fileno(), stream)
 
 
 # --- help ---------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from runner.runs.shards import shards_in_words, shards_of
 from runner.util.humanize import UNKNOWN, counted, size
 
 if TYPE_CHECKING:
-    from runner.execution.verification import Verification
+    from runner.execution.verify import Verification
     from runner.recording.repair import Repair
 
 
@@ -70,7 +70,7 @@ def verify_command(
       dualtaxi verify k3v9m2xq --sample 20 --tolerance 1e-6
       dualtaxi verify backup/recording.mcap --json
     """
-    from runner.execution.verify import check, damage_of
+    from runner.execution.verify import check, damage_of, rerun_loop
 
     path, run = named
     require_over(run)
@@ -82,8 +82,6 @@ def verify_command(
     with job_progress("verifying", episodes) as (report, _):
         found = check(path, damage, bool(rerun), report, trust)
     if found.is_loop and rerun is not False:
-        from runner.execution.rerun import rerun_loop  # slow to import
-
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)
     code = ExitCode.DIFFERENT if not found.sound or (rerun and found.reason) else ExitCode.OK

@@ -262,8 +262,8 @@ def test_another_space_is_named(tmp_path):
     ],
 )
 def test_an_environment_of_bad_habits_ends_with_the_reason(make, seconds, reason, tmp_path, monkeypatch):
-    monkeypatch.setattr("runner.replay.environment.SECONDS", seconds)
-    monkeypatch.setattr("runner.replay.environment.MEMORY_BYTES", 1 << 29)
+    monkeypatch.setattr("runner.replay.makers.SECONDS", seconds)
+    monkeypatch.setattr("runner.replay.makers.MEMORY_BYTES", 1 << 29)
     path = record(make(), tmp_path, 60, make=make)
     with pytest.raises(CannotRedo, match=reason):
         list(rerun_in_child(path, trust=True))

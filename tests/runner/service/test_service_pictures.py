@@ -62,7 +62,7 @@ def test_pictures_after_the_end_are_none(loops_client):
 
 
 def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_client, monkeypatch):
-    monkeypatch.setattr("runner.replay.environment.SECONDS", 1e-3)
+    monkeypatch.setattr("runner.replay.makers.SECONDS", 1e-3)
     found, problem = pictures(loops_client, "pole/replay/train/2")
     assert found == []
     assert "took longer than 0.001 s" in problem
@@ -71,7 +71,7 @@ def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_clie
 def test_where_an_environment_cannot_draw_the_recorded_frames_are_shown_with_the_reason(
     loops_client, monkeypatch
 ):
-    monkeypatch.setattr("runner.replay.environment.SECONDS", 1e-3)
+    monkeypatch.setattr("runner.replay.makers.SECONDS", 1e-3)
     notes = []
     found, problem = pictures(loops_client, "framed/replay/train/2", notes, steps=1000)
     assert found[0].startswith(b"\x89PNG")
