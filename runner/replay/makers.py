@@ -12,7 +12,7 @@ import itertools
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -20,6 +20,7 @@ from runner.environments.games import as_parallel
 from runner.environments.layers import class_name, creator_of, layers_of, name_of
 from runner.errors import CannotRedo, shortened
 from runner.recording import schema
+from runner.recording.description import environment_count
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.replay.scripts import MAIN, definition
@@ -49,6 +50,8 @@ if TYPE_CHECKING:
 
     from runner.environments.gym_types import Env
 
+ALL: Final = -1
+"""The number that stands for all environments of a vector."""
 _OF_VECTORS: Final = frozenset({"num_envs", "vectorization_mode", "vector_kwargs", "max_episode_steps"})
 """Arguments of `make_vec` in the specification of a vector, which its environments do not take."""
 
@@ -125,6 +128,14 @@ def is_whole_vector(maker: EnvironmentMaker) -> bool:
     if vector is None or vector.is_vec_env:
         return False
     return vector.mode == "custom" or bool(maker.make) or bool(vector_wrappers(vector))
+
+
+def environments_of(recording: Recording) -> Sequence[int]:
+    """Return the environments that can be stepped alone; `ALL` where only the whole vector can be."""
+    makers = (recording.phase(phase).maker_of() for phase in schema.PHASES)
+    if not recording.shards and any(maker is not None and is_whole_vector(maker) for maker in makers):
+        return [ALL]
+    return range(environment_count(recording))
 
 
 def why_not_alone(maker: EnvironmentMaker) -> str:

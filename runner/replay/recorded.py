@@ -16,7 +16,7 @@ from runner.recording.description import environment_count
 from runner.recording.reader import Recording
 from runner.recording.reset_options import ResetOptions
 from runner.recording.reset_states import ResetState
-from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.schema import PHASES, STEP_NANOSECONDS
 from runner.recording.spaces import Value, decode
 from runner.recording.steps import aligned
 from runner.recording.topic_chunks import FOREVER
@@ -24,6 +24,8 @@ from runner.util.arrays import Records
 from runner.util.jsonable import as_json
 from runner.util.values import Json
 
+_PHASE_CHANGES: Final = 100
+"""How many changes of the phase are looked at to find out whether both are of one environment."""
 _BLOCK_BYTES: Final = 16 << 20
 _NOTHING_GIVEN: Final = ResetOptions()
 _MAX_WORDS: Final = 200
@@ -278,3 +280,31 @@ def ended_episode(recording: Recording, phase: str, environment: int, step: int)
         if is_later.any():
             return int(block["episode"][np.argmax(is_later)])
     return None
+
+
+def last_step_time(recording: Recording) -> int:
+    """Return the `log_time` of the last step in a recording that was cut: later resets lost their steps."""
+    tables = [phase.steps for phase in recording.phases]
+    if "content_digest" in recording.result or any(steps.are_actions for steps in tables):
+        return FOREVER
+    return max((steps.entry(len(steps) - 1).end_time for steps in tables if steps), default=0)
+
+
+def are_separate(recording: Recording) -> bool:
+    """Return whether training and evaluation have environments of their own.
+
+    One that was cut off does not state it: then they have if one continues an episode after the other.
+    """
+    have_own_makers = any(phase.own_maker is not None for phase in recording.phases)
+    if have_own_makers or "content_digest" in recording.result:
+        return have_own_makers
+    if not all(phase.steps.are_known for phase in recording.phases):
+        return False
+    phase, changes = "", 0
+    for piece in pieces(recording, PHASES):
+        if len(piece.rows) and piece.phase != phase:
+            is_continued = piece.rows["t"][0] > 0 and not any(r.step == piece.first for r in piece.resets)
+            if (phase and is_continued) or changes == _PHASE_CHANGES:
+                return bool(is_continued)
+            phase, changes = piece.phase, changes + 1
+    return False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.util.arrays import Array, Flags, Records
+from runner.util.jsonable import as_json
 from runner.util.values import flatten
 
 _COMPARED_BYTES: Final = 1 << 16
@@ -67,6 +68,44 @@ def _bits(values: Array) -> Array:
     if kind not in "bfV":
         return values
     return np.ascontiguousarray(values).view(f"u{size}" if kind == "f" and size in (2, 4, 8) else "u1")
+
+
+def differing_part(
+    recorded: object, got: object, tolerance: float | None = None
+) -> tuple[str, object, object]:
+    """Return where in two values of a space the first difference is, such as `[2]`, and both values there.
+
+    Args:
+        recorded: an array, a record, or a mapping or tuple of such values.
+        got: another value with the same parts.
+        tolerance: as for `first_difference`.
+    """
+    for path, left, right in _leaves("", recorded, got):
+        if left.shape != right.shape or left.dtype != right.dtype:
+            return path, _plain(left), _plain(right)
+        first = first_differing_row(left.reshape(-1), right.reshape(-1), tolerance)
+        if first is not None:
+            at = np.unravel_index(first, left.shape)
+            index = f"[{', '.join(map(str, at))}]" if at else ""
+            return path + index, _plain(left[at]), _plain(right[at])
+    return "", _plain(recorded), _plain(got)
+
+
+def _leaves(path: str, recorded: Any, got: Any) -> Iterator[tuple[str, Array, Array]]:
+    """Yield the arrays in two values of a space, with their paths."""
+    names: Any = getattr(getattr(recorded, "dtype", None), "names", None)
+    if names or isinstance(recorded, dict):
+        for name in names or recorded:
+            yield from _leaves(f"{path}[{name!r}]", recorded[name], got[name])
+    elif isinstance(recorded, tuple):
+        for i, (left, right) in enumerate(zip(recorded, got, strict=True)):
+            yield from _leaves(f"{path}[{i}]", left, right)
+    else:
+        yield path, np.asarray(recorded), np.asarray(got)
+
+
+def _plain(value: object) -> object:
+    return as_json(value.item() if isinstance(value, np.ndarray | np.generic) and not value.shape else value)
 
 
 @dataclass(frozen=True)
