@@ -45,8 +45,13 @@ FILES = {
 }
 
 
-def imported(file: Path) -> Iterator[tuple[str, ...]]:
-    """Yield the names that a file imports, anywhere in it, as their parts."""
+@functools.cache
+def imported(file: Path) -> list[tuple[str, ...]]:
+    """Return the names that a file imports, anywhere in it, as their parts."""
+    return [*_imported(file)]
+
+
+def _imported(file: Path) -> Iterator[tuple[str, ...]]:
     for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (tuple(alias.name.split(".")) for alias in node.names)

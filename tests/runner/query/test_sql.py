@@ -12,6 +12,7 @@ import time
 
 import gymnasium
 import numpy as np
+import psutil
 import pytest
 from click.testing import CliRunner
 
@@ -27,6 +28,7 @@ from runner.recording.record_store import RecordStore
 from runner.runs.resolve import find_run
 from tests.runner.loops.making import make, play
 from tests.runner.recording.making import LAKE, TAXIS, make_run
+from tests.waiting import until
 
 
 @pytest.fixture(scope="module")
@@ -228,6 +230,13 @@ def test_a_query_is_stopped_while_runs_are_opened(folder, monkeypatch):
     assert len(opened) < 3
 
 
+def waits_for_rows(process):
+    """Return whether other threads of a process compute, and its main thread waits for what they find."""
+    busy = sum(thread.user_time for thread in process.threads() if thread.id != process.pid)
+    return busy > 0.3 and process.status() == psutil.STATUS_SLEEPING
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the state of a main thread is read from /proc")
 @pytest.mark.parametrize(
     ("select", "form"), [("count(*)", ()), ("range", ("--csv",))], ids=["before a row", "between rows"]
 )
@@ -235,7 +244,7 @@ def test_an_interrupted_query_says_how_far_it_came(folder, select, form):
     query = f"SELECT {select} FROM range(100000000000) WHERE range < 100000 OR hash(range) = 3"
     words = [sys.executable, "-m", "runner", "sql", query, "--recordings", str(folder), *form]
     with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
-        time.sleep(4)
+        until(waits_for_rows, lambda: psutil.Process(process.pid))
         process.send_signal(signal.SIGINT)
         assert "runs were read" in process.communicate(timeout=60)[1]
     assert process.returncode == 130
