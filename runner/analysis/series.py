@@ -74,6 +74,9 @@ class RunSeries:
     """Whether no training episode of a loop ended, so that length and return are of unfinished ones."""
     averaged: str = ""
     """What its values are means over, a sentence; empty if each recorded value is there."""
+    aligned: Collection[float] = ()
+    """The positions of the evaluations at which training is reported too: they are the same in every run of a
+    configuration. Empty for loops, and on other axes than episodes."""
     names: Sequence[str] = ()
     """All names under which values were logged, also those that are not read."""
 
@@ -154,8 +157,7 @@ def points_of(run: RunSeries, metric: str, line: str, aligned: bool) -> dict[flo
     evaluation, or on another axis.
     """
     source = run.training if metric.startswith("training.") else run.evaluation
-    is_aligned = aligned and run.axis is EPISODES and run.can_train_again
-    at_evaluations = {at for at, _ in run.evaluation} if is_aligned else set()
+    at_evaluations = set(run.aligned) if aligned else set()
     missing = 0.0 if metric == SHARES else np.nan
     points = {
         at: readings[metric].get(line, missing)
@@ -207,12 +209,15 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     not_finite: Counter[str] = Counter()
     moments = positions(recording, axis)
     evaluations = evaluation_records(recording)
+    evaluated = [moments.of_moment(record.episode, record.step) for record in evaluations]
     readings = [evaluation_readings(record) for record in evaluations]
     averaged = ""
     names: dict[str, None] = {}
     recent: Readings = {}
     recent_episodes, is_unended = 0, False
+    aligned: Sequence[float] = ()
     if recording.eval.has_metrics:
+        aligned = evaluated if axis is EPISODES else ()
         exact = {
             measures["evaluation"]: exact_readings(measures, recording.agents)
             for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
@@ -246,10 +251,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         seed=recording.seed,
         status=recording.status,
         config=_config(recording),
-        evaluation=[
-            (moments.of_moment(record.episode, record.step), values)
-            for record, values in zip(evaluations, readings, strict=True)
-        ],
+        evaluation=list(zip(evaluated, readings, strict=True)),
         training=sorted(training, key=lambda entry: entry[0]),
         content_digest=recording.result.content_digest or "",
         not_finite=dict(not_finite),
@@ -259,6 +261,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         recent_episodes=recent_episodes,
         is_unended=is_unended,
         averaged=averaged,
+        aligned=aligned,
         names=list(names),
     )
 

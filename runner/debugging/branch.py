@@ -157,8 +157,7 @@ def branch(
         StorageError: the folder of the new run cannot be written.
     """
     at = EpisodeRef.parse(at)
-    refuse_misfits(run, at, overrides, episodes, policy, seed, max_steps)
-    if run.can_train_again:
+    if branches_training(run, at, overrides, episodes, policy, seed, max_steps):
         return branch_training(
             run,
             at=at,
@@ -174,7 +173,7 @@ def branch(
     return branch_episode(run, task, recordings_folder(recordings), report)
 
 
-def refuse_misfits(
+def branches_training(
     run: Run,
     at: EpisodeRef,
     overrides: Sequence[str],
@@ -182,11 +181,11 @@ def refuse_misfits(
     policy: str,
     seed: int,
     max_steps: int,
-) -> None:
-    """Refuse arguments of `branch` that do not fit the run.
+) -> bool:
+    """Return whether a branch of the run is trained, as the run was; else an episode of it is branched.
 
     Raises:
-        ConfigError: one does not.
+        ConfigError: an argument of `branch` does not fit that.
     """
     if run.can_train_again:
         if (policy, seed, max_steps) != ("recorded", 0, MAX_STEPS):
@@ -194,7 +193,7 @@ def refuse_misfits(
                 f"run {run.run_id} was trained here, and a branch of it is trained as its "
                 "configuration says: policy, seed and max_steps are for loops."
             )
-        return
+        return True
     if at.word == STEP:
         raise ConfigError(
             f"at: found the number {at.t:,} of a step, expected EPISODE:T: the steps of a loop are "
@@ -213,6 +212,7 @@ def refuse_misfits(
         raise ConfigError(f"seed: found {seed}, expected 0 or more")
     if max_steps < 1:
         raise ConfigError(f"max_steps: found {max_steps}, expected 1 or more")
+    return False
 
 
 def branch_episode(

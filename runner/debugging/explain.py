@@ -246,7 +246,7 @@ def _resolved(source: Source, recordings: Path, trust: bool) -> tuple[Side, Expe
                 raise RunNotFound(f"{error} There is no configuration of this name either.{hint}") from error
     if isinstance(source, ExperimentConfig):
         return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
-    if "made_by" in source.file.config:
+    if not source.can_train_again:
         raise RunnerError(
             f"run {source.run_id} was recorded from a training loop of your own, which cannot be trained "
             f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "

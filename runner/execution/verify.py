@@ -137,8 +137,8 @@ class Verification:
     """What is not as recorded here and may explain a difference: packages, platform, code, environment."""
     not_compared: str = ""
     """What of the recording was not compared."""
-    is_loop: bool = False
-    """Whether its steps can be compared by a rerun of its environment only."""
+    can_be_rerun: bool = False
+    """Whether its steps are compared by a rerun of its environment, as those of a loop are."""
     if_rerun: Verification | None = None
     """What holds instead if a rerun gives the recorded steps, though their order is unlikely."""
 
@@ -173,7 +173,7 @@ def verify(
         RecordingError: there is no such file, or it is not a dualtaxi recording.
     """
     found = check(path, damage_of(path), bool(rerun), report, trust)
-    if rerun is False or not found.is_loop:
+    if rerun is False or not found.can_be_rerun:
         return found
     return rerun_loop(found, sample, tolerance, trust)
 
@@ -380,7 +380,7 @@ def _check_loop(recording: Recording) -> Verification:
         train_steps=recording.train.steps.total(),
         eval_steps=recording.eval.steps.total(),
         not_compared=_LOOP_NOT_COMPARED if has_environment(recording.config) else "",
-        is_loop=True,
+        can_be_rerun=True,
     )
     try:
         _compare_names(recording)

@@ -89,9 +89,8 @@ class Layout:
             if not self.has_states:
                 after = space_field(3, "next_observation", spaces["observation"])
                 types["step"] = _with_values(schema.STEP, space_field(2, "action", spaces["action"]), after)
-                if self.kind == "game":
-                    more = types["step"].fields + schema.AGENT_FIELDS
-                    types["step"] = replace(types["step"], fields=more)
+                more = schema.MORE_FIELDS.get(self.kind, ())
+                types["step"] = replace(types["step"], fields=types["step"].fields + more)
         if self.has_turns:
             turns = schema.ENVIRONMENT_OF_STEP, *types["step"].fields, schema.TAKEN
             episodes = *types["episode"].fields, schema.ENVIRONMENT_OF_EPISODE

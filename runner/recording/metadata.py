@@ -185,7 +185,7 @@ def layout_of_run(run: Mapping[str, str], path: str) -> Layout:
         RecordingError: it is of another version, or its metadata record `run` is damaged.
     """
     check_run(run, path)
-    if kind_of(run) != "job":
+    if schema.TRAIN_RESET in schema.KINDS[kind_of(run)]:  # it observes a value of a space
         spaces_of(run, path)
     learners, events = int(run["learners"]), int(run["events"])
     return layout_of(kind_of(run), learners, events, run.get("spaces", ""), "environments" in run)

@@ -226,6 +226,15 @@ class Run:
         """Whether its configuration determines all of it, as the runner trained it; a loop's does not."""
         return "made_by" not in self.file.config
 
+    def require_loop(self, refusal: str) -> None:
+        """Refuse the run of a job.
+
+        Raises:
+            RunnerError: it is one; the message is `refusal`.
+        """
+        if self.can_train_again:
+            raise RunnerError(refusal)
+
     @property
     def is_stop_requested(self) -> bool:
         """Whether the loop that records it was requested to stop."""
@@ -240,8 +249,7 @@ class Run:
             RunnerError: no loop records it now.
             StorageError: its folder cannot be written.
         """
-        if self.can_train_again:
-            raise RunnerError(f"run {self.run_id} is made by a job; cancel the job, or press Ctrl-C there.")
+        self.require_loop(f"run {self.run_id} is made by a job; cancel the job, or press Ctrl-C there.")
         if self.status != "running":
             raise RunnerError(
                 f"run {self.run_id} is {self.status}; only a run that is running can be stopped."

@@ -59,10 +59,9 @@ def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
 
 
 def _require_open(run: Run) -> None:
-    if run.can_train_again:
-        raise RunnerError(
-            f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
-        )
+    run.require_loop(
+        f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
+    )
     if (steps := run.file.config.get("recording", {}).get("steps", "all")) != "all":
         raise RunnerError(f"join: run {run.run_id} is recorded with steps {steps!r}, expected all.")
     if is_ended(run):

@@ -81,7 +81,7 @@ def verify_command(
         damage = damage_of(path, reading)
     with job_progress("verifying", episodes) as (report, _):
         found = check(path, damage, bool(rerun), report, trust)
-    if found.is_loop and rerun is not False:
+    if found.can_be_rerun and rerun is not False:
         with count_line("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as count:
             found = rerun_loop(found, sample, tolerance, trust, count)
     code = ExitCode.DIFFERENT if not found.sound or (rerun and found.reason) else ExitCode.OK
@@ -97,7 +97,7 @@ def _rows(found: Verification, run: Run | None) -> dict[str, str]:
     if found.reason:
         rows["reason"] = f"cannot be rerun: {found.reason}"
         rows["for example"] = str(found.difference or "")
-    elif found.act == "checked" and found.is_loop and found.sound:
+    elif found.act == "checked" and found.can_be_rerun and found.sound:
         rows["reason"] = "not rerun, as --no-rerun demands"
     notes = [f"{name}: its arguments were assumed, as they could not be recorded" for name in found.assumed]
     if found.left_out:
@@ -146,7 +146,7 @@ def _verdict(found: Verification) -> str:
 
 def _as_json(found: Verification) -> dict[str, object]:
     """Return a verdict and all that belongs to it, as JSON."""
-    left_out = ("composition", "is_loop", "if_rerun")
+    left_out = ("composition", "can_be_rerun", "if_rerun")
     texts = ("reason", "finding", "content_digest", "not_compared")
     plain = (str, int, float, list, dict, type(None))
     return {

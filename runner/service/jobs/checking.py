@@ -158,12 +158,13 @@ class BranchQuestion(BaseModel, extra="forbid", frozen=True):
 
 def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
     """Return the job of a branch of a run; the environment of a loop is not made."""
-    from runner.debugging.branch import MAX_STEPS, default_name, refuse_misfits  # slow to import
+    from runner.debugging.branch import MAX_STEPS, branches_training, default_name  # slow to import
 
     at = EpisodeRef.parse(question.at)
-    refuse_misfits(run, at, question.overrides, question.episodes, question.policy, question.seed, MAX_STEPS)
+    chosen = question.overrides, question.episodes, question.policy, question.seed
+    is_trained = branches_training(run, at, *chosen, MAX_STEPS)
     with open_recording(run.recording) as recording:
-        if run.can_train_again:
+        if is_trained:
             action: Any = question.action
             job, _ = branch_job(recording, at, action, question.overrides, question.episodes)
             limit = recording.mdp.step_limit
