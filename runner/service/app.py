@@ -23,7 +23,7 @@ from runner.errors import RunnerError
 from runner.service import login, pages, queries, views
 from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
-from runner.service.dependencies import CatalogueOf, Computation, SettingsOf
+from runner.service.dependencies import CatalogueOf, SettingsOf
 from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
@@ -152,7 +152,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.processes = stack.enter_context(
             ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
         )
-        app.state.computation = Computation(app.state.cache, app.state.processes)
+        app.state.spooling = anyio.CapacityLimiter(1)
         app.state.sweep_processes = stack.enter_context(
             ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=math.inf)
         )

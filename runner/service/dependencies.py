@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from http import HTTPStatus
 from pathlib import Path
@@ -11,6 +12,7 @@ from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request, Response
 from fastapi import Path as InPath
 from pydantic import TypeAdapter
+from starlette.requests import ClientDisconnect
 
 from runner.analysis.episodes import EpisodeRef
 from runner.archive.places import at_hand
@@ -59,6 +61,8 @@ async def owner_of(request: Request) -> str:
 OwnerOf = Annotated[str, Depends(owner_of)]
 MAX_WAITING: Final = 16
 """Calls with large temporary files that may wait for the one that runs."""
+_LOOK_SECONDS: Final = 0.5
+"""How often a request that waits for such a call looks whether its client is still there."""
 RunName = Annotated[
     str,
     InPath(
@@ -172,16 +176,21 @@ def _state_of(argument: object) -> object:
 
 
 class Computation:
-    """Functions of runs and recordings, called in a child process, their results cached."""
+    """Functions of runs and recordings, called in a child process for a request, their results cached."""
 
-    def __init__(self, cache: ResponseCache, processes: ProcessPool) -> None:
-        self._cache, self._processes, self._spooling = cache, processes, CapacityLimiter(1)
+    def __init__(
+        self, cache: ResponseCache, processes: ProcessPool, spooling: CapacityLimiter, request: Request
+    ) -> None:
+        self._cache, self._processes, self._spooling, self._request = cache, processes, spooling, request
 
     async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
         """Return the result of a function.
 
-        With `alone` it writes large temporary files: one such call runs at a time, and of those that wait
-        for it, all beyond `MAX_WAITING` are refused as `Busy`.
+        With `alone` it writes large temporary files: one such call runs at a time, of those that wait for it
+        all beyond `MAX_WAITING` are refused as `Busy`, and it ends when nobody waits for it any more.
+
+        Raises:
+            ClientDisconnect: the client of an `alone` call has gone.
         """
 
         async def call() -> bytes:
@@ -192,7 +201,18 @@ class Computation:
             async with self._spooling:
                 return await self._processes(function, *args)
 
-        return await self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
+        response = self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
+        return await (self._unless_gone(response) if alone else response)
+
+    async def _unless_gone(self, response: Awaitable[bytes]) -> bytes:
+        waiting = asyncio.ensure_future(response)
+        try:
+            while not (await asyncio.wait({waiting}, timeout=_LOOK_SECONDS))[0]:
+                if await self._request.is_disconnected():
+                    raise ClientDisconnect
+            return waiting.result()
+        finally:
+            waiting.cancel()
 
     async def shown(self, kind: type[Shown], function: Callable[..., bytes], *args: object) -> Shown:
         """Return the dataclass whose fields a function returns as JSON."""
@@ -203,7 +223,13 @@ class Computation:
         return json_response(await self(function, *args, alone=alone))
 
 
-ComputationOf = Annotated[Computation, _state("computation")]
+async def computation_for(request: Request) -> Computation:
+    """Return what computes for a request."""
+    state = request.app.state
+    return Computation(state.cache, state.processes, state.spooling, request)
+
+
+ComputationOf = Annotated[Computation, Depends(computation_for)]
 
 
 def json_response(body: bytes) -> Response:

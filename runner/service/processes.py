@@ -54,10 +54,39 @@ loads `numpy.ma` only when a process needs it, as nearly all of these do.
 """
 
 
+_STOP_SECONDS: Final = 5.0
+"""How long a process may take to end when nobody waits for its call any more."""
+
+
 def lower_priority() -> None:
     """Let this process, which trains or verifies, yield to the server, whose users are waiting."""
     with contextlib.suppress(OSError, AttributeError):  # not on Windows
         os.nice(5)
+
+
+class _Doing:
+    """A call that may be stopped, from when its process begins it."""
+
+    _child: ChildProcess | None = None
+    _is_stopped = False
+
+    def by(self, child: ChildProcess) -> ChildProcess:
+        """Note which process does it; return the process."""
+        self._child = child
+        if self._is_stopped:
+            child.stop()
+        return child
+
+    def stop(self) -> None:
+        """Have its process remove its temporary files and end."""
+        self._is_stopped = True
+        if self._child is not None:
+            self._child.stop()
+
+    def kill(self) -> None:
+        """Kill its process, if that has not ended."""
+        if self._child is not None:
+            self._child.kill()
 
 
 class ProcessPool:
@@ -113,8 +142,19 @@ class ProcessPool:
     async def __call__(
         self, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
     ) -> Result:
-        """Return what a function returns in a child process; arguments and errors as for `submit`."""
-        return await asyncio.wrap_future(self.submit(self._seconds, function, *args, **keywords))
+        """Return what a function returns in a child process, which ends if the caller is cancelled.
+
+        Arguments and errors are those of `submit`.
+        """
+        doing = _Doing()
+        future = self._submit(lambda child: doing.by(child).call(function, self._seconds, *args, **keywords))
+        try:
+            return await asyncio.wrap_future(future)
+        except asyncio.CancelledError:
+            if not future.done():
+                doing.stop()
+                asyncio.get_running_loop().call_later(_STOP_SECONDS, doing.kill)
+            raise
 
     def submit(
         self, seconds: float, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
@@ -125,12 +165,13 @@ class ProcessPool:
         `RunnerError` or `OSError`, or `TimedOut`, `OutOfMemory`, `ProcessDied`, or `Busy` when the pool is
         closed; `Busy` is raised if too many calls are waiting.
         """
+        return self._submit(lambda child: child.call(function, seconds, *args, **keywords))
+
+    def _submit(self, call: Callable[[ChildProcess], Result]) -> Future[Result]:
         if not self._places.acquire(blocking=False):
             raise Busy
         try:
-            future = self._threads.submit(
-                self._call, lambda child: child.call(function, seconds, *args, **keywords)
-            )
+            future = self._threads.submit(self._call, call)
         except BaseException:
             self._places.release()
             raise

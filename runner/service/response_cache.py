@@ -6,6 +6,7 @@ import asyncio
 import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Hashable
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from starlette.concurrency import run_in_threadpool
@@ -21,13 +22,22 @@ class _Response(NamedTuple):
     created: float
 
 
+@dataclass
+class _Pending:
+    """A response that is being made."""
+
+    task: asyncio.Future[bytes]
+    waiting: int = 0
+    """How many requests wait for it."""
+
+
 class ResponseCache:
     """Response bodies by key; the least recently used ones are dropped beyond a number of bytes."""
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes, self._bytes = max_bytes, 0
         self._responses: OrderedDict[Hashable, _Response] = OrderedDict()
-        self._pending: dict[Hashable, asyncio.Future[bytes]] = {}
+        self._pending: dict[Hashable, _Pending] = {}
 
     def get(self, key: Hashable, max_seconds: float = ALWAYS) -> bytes | None:
         """Return the cached response of a key; None if there is none, or an older one only."""
@@ -46,18 +56,27 @@ class ResponseCache:
     ) -> bytes:
         """Return the response of a key: cached, not older than `max_seconds`, being made, or made now.
 
-        The key has everything that the response depends on, as far as that is known.
+        The key has everything that the response depends on, as far as that is known. Once all who wait for
+        it were cancelled, making it is, too.
         """
         if (body := self.get(key, max_seconds)) is not None:
             return body
-        if key not in self._pending:
-            task = asyncio.ensure_future(make())
-            self._pending[key] = task
-            task.add_done_callback(lambda done: self._store(key, done))
-        return await asyncio.shield(self._pending[key])
+        pending = self._pending.get(key)
+        if pending is None:
+            pending = self._pending[key] = _Pending(asyncio.ensure_future(make()))
+            pending.task.add_done_callback(lambda done: self._store(key, done))
+        pending.waiting += 1
+        try:
+            return await asyncio.shield(pending.task)
+        finally:
+            pending.waiting -= 1
+            if not pending.waiting and not pending.task.done():
+                del self._pending[key]
+                pending.task.cancel()
 
     def _store(self, key: Hashable, done: asyncio.Future[bytes]) -> None:
-        del self._pending[key]
+        if key in self._pending and self._pending[key].task is done:
+            del self._pending[key]
         if not done.cancelled() and done.exception() is None:
             self.keep(key, done.result())
 

@@ -293,6 +293,11 @@ class ChildProcess:
         """Return whether the process is running."""
         return bool(self._process.is_alive())
 
+    def stop(self) -> None:
+        """Have the process end as by `sys.exit`, while another thread may be waiting for it."""
+        with contextlib.suppress(ValueError):  # closed meanwhile
+            self._process.terminate()
+
     def kill(self) -> None:
         """Kill the process, while another thread may be waiting for it."""
         with contextlib.suppress(ValueError):  # closed meanwhile
@@ -319,6 +324,7 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str]) -> None:
     global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
     _pipe_to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to act on
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # temporary files are removed
     _limit_memory(memory_bytes)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

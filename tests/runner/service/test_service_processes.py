@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import os
+import tempfile
 import threading
 import time
+from pathlib import Path
 
 import pytest
+from anyio import CapacityLimiter
+from starlette.requests import ClientDisconnect
 
 from runner.errors import RecordingError
+from runner.service.dependencies import Computation
 from runner.service.errors import Busy
 from runner.service.processes import ProcessPool
+from runner.service.response_cache import ResponseCache
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
 MEMORY = 256 << 20
@@ -72,3 +78,57 @@ def test_calls_of_a_reused_process_leak_no_threads():
         for _ in range(20):
             pool.submit(60, os.getpid).result()
         assert threading.active_count() <= before + 2  # a cancelled timer may still be ending
+
+
+def fill_a_folder(noted):
+    with tempfile.TemporaryDirectory() as folder:
+        Path(noted).write_text(folder)
+        time.sleep(600)
+
+
+def test_a_film_of_clients_that_have_gone_ends_and_leaves_no_files(pool, tmp_path):
+    noted = tmp_path / "noted"
+
+    class Client:
+        async def is_disconnected(self):
+            return noted.exists()
+
+    async def abandon():
+        cache, spooling = ResponseCache(1000), CapacityLimiter(1)
+        clients = [Computation(cache, pool, spooling, Client()) for _ in range(2)]
+        calls = [compute(fill_a_folder, str(noted), alone=True) for compute in clients]
+        left = await asyncio.gather(*calls, return_exceptions=True)
+        assert all(isinstance(error, ClientDisconnect) for error in left)
+        folder = Path(noted.read_text())
+        while folder.exists():
+            await asyncio.sleep(0.05)
+        assert await clients[0](bytes, 3, alone=True) == b"\0\0\0"  # nothing waits for it
+
+    asyncio.run(asyncio.wait_for(abandon(), 60))
+
+
+def test_a_response_is_made_until_nobody_waits_for_it():
+    cache, ended = ResponseCache(1000), []
+
+    async def make():
+        try:
+            await asyncio.sleep(600)
+        finally:
+            ended.append(True)
+
+    async def abandon():
+        first, second = (asyncio.ensure_future(cache.get_or_await("key", make)) for _ in range(2))
+        await asyncio.sleep(0)
+        first.cancel()
+        await asyncio.sleep(0.05)
+        assert not ended
+        second.cancel()
+        await asyncio.sleep(0.05)
+        assert ended
+
+        async def quickly():
+            return b"made"
+
+        assert await cache.get_or_await("key", quickly) == b"made"
+
+    asyncio.run(abandon())
