@@ -65,7 +65,7 @@ class RunProgress:
     runs: int
     episode: int
     episodes: int
-    """Training episodes of the run."""
+    """Training episodes of the run; 0 of an episode that is played on, whose steps are counted."""
     train_steps: int
     eval_steps: int
     bytes: int
@@ -82,6 +82,10 @@ class RunProgress:
     def text(self) -> str:
         """The work that is done, as `job.js` writes it."""
         run = f", run {self.run} of {self.runs}" if self.runs > 1 else ""
+        if not self.train_steps + self.eval_steps:
+            return f"preparing{run}"
+        if not self.episodes:
+            return f"{self.train_steps:,} steps"
         return f"{self.episode:,} of {self.episodes:,} episodes{run}"
 
 

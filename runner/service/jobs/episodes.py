@@ -31,7 +31,7 @@ def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
             run=1,
             runs=1,
             episode=0,
-            episodes=1,
+            episodes=0,
             train_steps=steps,
             eval_steps=0,
             bytes=0,
@@ -47,7 +47,10 @@ def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
             name=question.name,
             run_id=run_id,
         )
+        report(0)  # the environment is made, and brought to the step
         branch = branch_episode(parent, task, spec.recordings, report)
+        if branch.is_recorded_action:
+            channel.send(LogEvent(f"the action is the one that was recorded at {task.at}"))
         channel.send(LogEvent(f"recorded: {branch.parent}; with the change: {branch.outcome}"))
     channel.send(RunEvent(run_id, seed))
 

@@ -100,6 +100,7 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
         parent = parent_in(spec, job.config.branches[-1].run) if spec.job.kind == "branch" else None
         run = create_run(spec.recordings, config, seed, spec.job.name, spec.job.run_ids[seed], parent)
         reporter = Reporter(channel, run.run_id, config, seed)
+        reporter.report(Progress(config.episodes))  # the next one follows when training begins
         if parent is None:
             run = run_job(job, run, reporter.report, channel.stop)
         else:

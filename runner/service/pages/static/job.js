@@ -27,10 +27,10 @@ function linked(id) {
 function progressOf(data) {
   if ("done" in data) return [data.done / Math.max(1, data.runs), `${count(data.done)} of ${count(data.runs)} runs`];
   const run = data.runs > 1 ? `, run ${data.run} of ${data.runs}` : "";
-  return [
-    (data.run - 1 + data.episode / Math.max(1, data.episodes)) / data.runs,
-    `${count(data.episode)} of ${count(data.episodes)} episodes${run}`,
-  ];
+  const share = (data.run - 1 + data.episode / Math.max(1, data.episodes)) / data.runs;
+  if (data.train_steps + data.eval_steps === 0) return [share, `preparing${run}`];
+  if (data.episodes === 0) return [share, `${count(data.train_steps)} steps`];
+  return [share, `${count(data.episode)} of ${count(data.episodes)} episodes${run}`];
 }
 
 function watch() {
