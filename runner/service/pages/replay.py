@@ -39,6 +39,7 @@ from runner.service.dependencies import (
 )
 from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Form, Page
+from runner.service.problems import status_of
 from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
@@ -199,7 +200,7 @@ def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None
                 return _values(run, at, branches, None) | {"problem": part}
             return _values(run, at, branches, stage_of(json.loads(part), t)) | {"problem": ""}
 
-        status = HTTPStatus.NOT_FOUND if isinstance(part, RunnerError) else None
+        status = status_of(part) if isinstance(part, RunnerError) else None
         return RunPage(run, "replay", "run_replay.html", show, status)
 
 

@@ -7,6 +7,7 @@ import shutil
 
 import pytest
 from click.testing import CliRunner
+from mcap.reader import make_reader
 
 from runner.cli import cli
 from runner.errors import RecordingError
@@ -132,6 +133,20 @@ def test_a_damaged_run_has_a_message(recordings, client):
         run for run in json.loads(shown(recordings, "ls", "--json").stdout)["runs"] if run["name"] == "first"
     )
     assert (row["status"], row["train_steps"]) == ("damaged", None)
+
+
+def test_the_replay_of_a_damaged_recording_has_the_status_of_damage(recordings, client):
+    first, _ = reversed(list_runs(recordings))
+    with first.recording.open("r+b") as file:
+        summary = make_reader(file).get_summary()
+        (steps,) = (each.id for each in summary.channels.values() if each.topic == "/train/step")
+        for chunk in (each for each in summary.chunk_indexes if steps in each.message_index_offsets):
+            file.seek(chunk.chunk_start_offset + chunk.chunk_length // 2)
+            file.write(b"\0\xff\0\xff")
+    page = client.get("/runs/first/replay/train/0")
+    assert page.status_code == client.get("/api/v1/runs/first/replay/train/0").status_code == 409
+    assert 'role="alert"' in page.text
+    assert client.get("/runs/second/replay/train/999").status_code == 404
 
 
 @pytest.mark.parametrize(
