@@ -58,10 +58,11 @@ _DEFAULT_COLUMNS: Final = (
     "age",
     "same_as",
     "parent",
+    "change",
     "folder",
 )
 """Columns of the table, unless they hold nothing of interest."""
-_OPTIONAL: Final = ("config", "logged", "bytes", "episodes", "seed", "folder", "age")
+_OPTIONAL: Final = ("change", "config", "logged", "bytes", "episodes", "seed", "folder", "age")
 """Columns left out where a terminal is narrow, in this order."""
 _SHRINKING: Final = (
     "name",
@@ -69,6 +70,7 @@ _SHRINKING: Final = (
     "tags",
     "note",
     "logged",
+    "change",
     "environment",
     "host",
     "archive",
@@ -108,9 +110,9 @@ def ls_command(
 
     The table shows the training episodes done (and to do, if some are missing), the percentage of the last
     evaluation's trials that succeeded, the size of the recording, how long ago the run began, which run
-    recorded the same content before, and which run it is a branch of. For a loop it also shows the mean
-    return in its last evaluation (in its last 100 training episodes, if it has none) and the last values that
-    it logged. A narrow terminal has fewer columns.
+    recorded the same content before, which run it is a branch of, and what was changed. For a loop it also
+    shows the mean return in its last evaluation (in its last 100 training episodes, if it has none) and the
+    last values that it logged. A narrow terminal has fewer columns.
 
     Examples:
       dualtaxi ls

@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from runner.errors import RunnerError, nearest
+from runner.errors import RunnerError, nearest, shortened
 from runner.recording.metrics import METRICS
+from runner.runs.branches import parse_origin
 from runner.runs.run import RECORDING_FILE
 from runner.util.humanize import UNKNOWN, age, duration, measure, number, setting, size
 from runner.util.values import Json
@@ -78,6 +79,12 @@ def moment(row: IndexRow) -> datetime:
     return datetime.fromtimestamp(row["created"] / 1000, UTC)
 
 
+def _change(origin: str | None) -> str | None:
+    """Return the change of a branch in words."""
+    parsed = None if origin is None else parse_origin(json.loads(origin))
+    return None if parsed is None else shortened(str(parsed), _MAX_CHANGE)
+
+
 def _logged_text(values: Mapping[str, float | None]) -> str:
     """Return logged values on one line: `loss 0.0123, entropy 1.5, 3 more`."""
     texts = [f"{name} {measure(value)}" for name, value in values.items()]
@@ -85,6 +92,8 @@ def _logged_text(values: Mapping[str, float | None]) -> str:
     return ", ".join(texts if more <= 0 else [*texts[:_MAX_LOGGED], f"{more} more"])
 
 
+_MAX_CHANGE: Final = 100
+"""The most characters of the change of a branch."""
 _MAX_LOGGED: Final = 4
 """Logged values in a line of a listing."""
 _METRIC_HEADINGS: Final = {"success_percent": "success %", "mean_return": "return"}
@@ -181,6 +190,16 @@ COLUMNS: Final = {
         ),
         Column(
             "parent", ColumnKind.START, "the run that it is a branch of", heading="branch of", if_empty=""
+        ),
+        Column(
+            "change",
+            None,
+            "what was changed, of a branch",
+            None,
+            needs=("origin",),
+            in_json=False,
+            read=lambda row: _change(row["origin"]),
+            if_empty="",
         ),
         Column("mode", ColumnKind.TEXT, "cooperative or competitive"),
         Column("environment", ColumnKind.TEXT, "the environment's id", aliases=("env",)),

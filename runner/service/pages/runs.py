@@ -71,6 +71,8 @@ class RunCell(NamedTuple):
     kind: str
     address: str
     is_status: bool
+    note: str
+    """What was changed, beside the name of a branch."""
 
 
 class RunRow(NamedTuple):
@@ -231,12 +233,13 @@ def _classes(left: bool, folded: bool) -> str:
 
 def _cell(row: IndexRow, column: str, folded: bool, runs: int) -> RunCell:
     """Return a cell of a run; where it stands for several, their name leads to them."""
-    text, address = as_text(row, column), ""
+    text, address, note = as_text(row, column), "", ""
     if column == "name" and runs > 1:
         text, address = f"{text} ({runs:,} runs)", link("/runs", {"filter": f"name == {row['name']!r}"})
     elif column in ("id", "name"):
         address = f"/runs/{row['id']}"
+        note = as_text(row, "change") if column == "name" else ""
     elif column == "same_as" and row["same_as"]:
         address = f"/runs/{row['same_as']}"
     kind = _classes(column in FIELDS and field_of(column).kind in LEFT_KINDS, folded)
-    return RunCell(text[:16] if column == "digest" else text, kind, address, column == "status")
+    return RunCell(text[:16] if column == "digest" else text, kind, address, column == "status", note)
