@@ -40,6 +40,18 @@ def test_every_name_exists(tmp_path):
         assert not name or name.removeprefix("runner.") in runner.__all__
 
 
+@pytest.mark.parametrize("option", ["--csv", "--markdown"])
+def test_the_commands_with_an_option_are_named(option):
+    (sentence,) = re.findall(rf"[.;]([^.;]* have `{option}`)", TEXT.replace("\n", " "))
+    named = re.findall("`([a-z ]+)`", sentence)
+    having = {" ".join(path) for path, command in commands().items() if option in options_of(command)}
+    assert named == sorted(having)
+
+
+def options_of(command):
+    return {name for parameter in command.params for name in parameter.opts}
+
+
 @pytest.mark.parametrize("view", VIEWS)
 def test_every_view_has_a_row(view):
     address = f"/runs/RUN/{view}"
