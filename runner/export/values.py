@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.contents import Step
+from runner.analysis.episodes import EpisodeRef
 from runner.drawing.raster import Pixels
-from runner.environments.naming import spoken
+from runner.environments.naming import agent_actions, numbered_actions, spoken
 from runner.recording import schema
 from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
@@ -156,6 +157,21 @@ def step_actions_in_words(recording: Recording, phase: str) -> Callable[[Step], 
         }
 
     return in_words
+
+
+def actions_at(recording: Recording, at: EpisodeRef) -> dict[str, str]:
+    """Return the recorded actions at a step in words, by agent; a single agent of a loop has no name.
+
+    Raises:
+        RecordingError: there is no such step, or it was not recorded.
+    """
+    step = recording.phase(at.phase).episode(at.number_in(recording)).one(at.t)
+    if not recording.can_train_again:
+        return step_actions_in_words(recording, at.phase)(step)
+    mdp = recording.mdp
+    mdp.check_steps(np.asarray(step).reshape(1), str(recording.path), schema.PHASE_NAMES[at.phase])
+    chosen = zip(mdp.agents, numbered_actions(mdp), agent_actions(mdp, int(step["action"])), strict=True)
+    return {agent: names[own] for agent, names, own in chosen}
 
 
 def _action_in_words(recording: Recording, phase: str, agent: str) -> Callable[[Value], str]:

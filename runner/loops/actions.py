@@ -20,6 +20,8 @@ from runner.recording.spaces import Value
 from runner.util.values import is_text
 
 _MAX_TEXT: Final = 200
+_MAX_BOUNDS: Final = 8
+"""The most numbers of an action that are listed with their bounds."""
 Names = Sequence[str] | Mapping[str, Sequence[str]]
 """Names of discrete actions, the least action's first; of a game by agent."""
 _KNOWN: Final = {
@@ -110,6 +112,20 @@ def parsed_action(space: Space, given: object, recorded: Value, names: Names) ->
     }
 
 
+def space_in_words(space: Space) -> str:
+    """Return what may be typed for an action: `0 to 5`, `2 numbers separated by commas, each -1 to 1`."""
+    if isinstance(space, spaces.Discrete):
+        return f"{space.start} to {space.start + space.n - 1}"
+    if not isinstance(space, spaces.Box):
+        kind = "JSON for" if recorded_space(space).comes_from_text else "numbers separated by commas, of"
+        return f"{kind} {space}"
+    bounds = [f"{low:g} to {high:g}" for low, high in zip(space.low.flat, space.high.flat, strict=True)]
+    count = "" if len(bounds) == 1 else f"{len(bounds):,} numbers separated by commas"
+    if len(set(bounds)) == 1:
+        return f"{count}, each {bounds[0]}" if count else bounds[0]
+    return f"{count}: {', '.join(bounds)}" if len(bounds) <= _MAX_BOUNDS else count
+
+
 def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], where: str) -> object:
     if isinstance(space, spaces.Dict | spaces.Tuple):
         return _parsed_parts(space, given, recorded, where)
@@ -125,8 +141,7 @@ def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], 
         values = given.split(",") if isinstance(given, str) else given
         array = np.asarray(values, np.asarray(recorded).dtype).reshape(np.shape(recorded))
     except (TypeError, ValueError, OverflowError) as error:
-        expected = f"numbers separated by commas, of {space}"
-        raise ConfigError(f"{where}: found {_short(given)}, expected {expected}") from error
+        raise ConfigError(f"{where}: found {_short(given)}, expected {space_in_words(space)}") from error
     if isinstance(space, spaces.Box):
         outside = ~((array >= space.low) & (array <= space.high))
         if outside.any():
@@ -188,7 +203,7 @@ def _discrete(space: spaces.Discrete, given: Value, names: Sequence[str], where:
     if not is_whole or not start <= number < start + space.n:
         named = f", or a name: {', '.join(names)}" if names else ""
         raise ConfigError(
-            f"{where}: found {_short(given)}, expected {start} to {start + int(space.n) - 1}{named}."
+            f"{where}: found {_short(given)}, expected {space_in_words(space)}{named}."
             f"{nearest(str(given), names)}"
         )
     return number

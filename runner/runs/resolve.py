@@ -12,6 +12,7 @@ from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
 from runner.runs.listing import run_at, run_in
 from runner.runs.run import UNLISTED, Run, recordings_folder
+from runner.util.humanize import counted
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
@@ -163,7 +164,8 @@ def not_found(name: str, index: CatalogueIndex, recordings: Path) -> RunNotFound
         names = {LATEST} | {f"{each}{LATEST}" for each in names}
     hint = nearest(name, names | {run.run_id for run in runs})
     return RunNotFound(
-        f"no run {name!r} in {recordings}.{hint} `dualtaxi ls` lists the {index.count():,} there are."
+        f"no run {name!r} in {recordings}, which has {counted(index.count(), 'run')}.{hint} `dualtaxi ls` "
+        "lists all runs."
     )
 
 

@@ -3,8 +3,30 @@
 from __future__ import annotations
 
 from http import HTTPStatus
+from typing import Final
+
+from pydantic import ValidationError, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic_core import PydanticCustomError
 
 from runner.errors import RunnerError
+
+EXPECTED: Final = "expected"
+"""The type of the errors of `expecting`."""
+
+
+def expecting(text: str) -> WrapValidator:
+    """Return the annotation of a value: if it is wrong, the message says only that this was expected.
+
+    Without it, the message has what Pydantic expects: of a union every type, of a text its pattern.
+    """
+
+    def check(value: object, handler: ValidatorFunctionWrapHandler) -> object:
+        try:
+            return handler(value)
+        except ValidationError:
+            raise PydanticCustomError(EXPECTED, "{expected}", {"expected": text}) from None
+
+    return WrapValidator(check)
 
 
 class RequestError(RunnerError):

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Final
+from typing import Final, TypeVar
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -20,6 +21,7 @@ from starlette.requests import ClientDisconnect
 from runner.config.problems import found
 from runner.errors import (
     ConfigError,
+    ConfigProblem,
     Diverged,
     EnvironmentNotUsable,
     MissingExtra,
@@ -30,10 +32,12 @@ from runner.errors import (
     StorageError,
     full_message,
 )
-from runner.service.errors import RequestError
+from runner.service.errors import EXPECTED, RequestError
 from runner.service.logs import LOG
 from runner.service.settings import ServiceSettings
 from runner.util.processes import CallFailed
+
+Question = TypeVar("Question", bound=BaseModel)
 
 _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     CallFailed: HTTPStatus.SERVICE_UNAVAILABLE,
@@ -54,15 +58,15 @@ _EXPECTED: Final = {
     **dict.fromkeys(("bool_parsing", "bool_type"), "true or false"),
     "dict_type": "a mapping",
     "enum": "{expected}",
+    EXPECTED: "{expected}",
     "greater_than": "more than {gt}",
     "greater_than_equal": "{ge} or more",
     "json_invalid": "JSON ({error})",
-    "less_than": "less than {lt}",
-    "less_than_equal": "{le} or less",
+    "less_than": "less than {lt:,}",
+    "less_than_equal": "{le:,} or less",
     "list_type": "a list",
     "literal_error": "{expected}",
     "model_attributes_type": "a mapping",
-    "string_pattern_mismatch": "text that matches {pattern}",
     "string_too_long": "{max_length:,} characters at most",
     "string_too_short": "{min_length} characters at least",
     "string_type": "text",
@@ -172,14 +176,31 @@ async def _http_error(request: Request, error: Exception) -> Response:
     return json_error(status, ErrorBody(message=message), dict(error.headers or {}))
 
 
-async def _invalid(request: Request, error: Exception) -> Response:  # noqa: ARG001
+async def _invalid(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
+    return error_response(request, _as_config_error(error))
+
+
+def filled(kind: type[Question], fields: Mapping[str, object]) -> Question:
+    """Return what the fields of a form ask that are not empty.
+
+    Raises:
+        ConfigError: one is wrong, or is missing.
+    """
+    try:
+        return kind.model_validate({name: value for name, value in fields.items() if value})
+    except ValidationError as error:
+        raise _as_config_error(error) from error
+
+
+def _as_config_error(error: ValidationError | RequestValidationError) -> ConfigError:
+    """Return the error with what is wrong in a request, each with the parameter or field."""
     problems = [
-        HttpProblem(path=".".join(map(str, detail["loc"])), message=_in_words(detail))
-        for detail in error.errors()
+        ConfigProblem(".".join(map(str, detail["loc"])), 0, 0, _in_words(detail)) for detail in error.errors()
     ]
-    message = "; ".join(f"{problem.path}: {problem.message}" for problem in problems)
-    return json_error(HTTPStatus.UNPROCESSABLE_ENTITY, ErrorBody(message=message, problems=problems))
+    return ConfigError(
+        "; ".join(f"{problem.path}: {problem.message}" for problem in problems), tuple(problems)
+    )
 
 
 def _in_words(detail: ErrorDetails) -> str:

@@ -24,7 +24,7 @@ from filelock import FileLock
 from pydantic import Field, TypeAdapter
 
 from runner.errors import RunnerError, StorageError
-from runner.service.errors import Unauthorized
+from runner.service.errors import Unauthorized, expecting
 from runner.util.files import read_object, storage_errors, write_object
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ _MAX_FILE_BYTES: Final = 1 << 20
 _LOCK_SECONDS: Final = 10
 
 
-Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$"), expecting("64 hexadecimal digits")]
 
 
 @dataclass(frozen=True)

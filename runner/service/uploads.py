@@ -34,7 +34,7 @@ from runner.runs.importing import import_recording, merge_marks
 from runner.runs.resolve import run_of_id
 from runner.runs.run import Run
 from runner.runs.store import Store
-from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge
+from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge, expecting
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
 from runner.service.previews import Previews
@@ -56,6 +56,7 @@ VERIFY_MEMORY: Final = 2 << 30
 
 Text = Annotated[str, Field(max_length=100)]
 Fact = str | float | None
+Facts = dict[str, Fact | dict[str, Fact | list[str] | list[dict[str, int | Fact | list[str]]]]]
 
 
 class UploadSource(BaseModel):
@@ -71,7 +72,7 @@ class UploadSource(BaseModel):
     content_digest: Digest | None = None
     checkpoint_of: Text = ""
     """The run with a checkpoint of these bytes, if they are not a recording."""
-    run: dict[str, Fact | dict[str, Fact | list[str] | list[dict[str, int | Fact | list[str]]]]] = {}
+    run: Annotated[Facts, expecting("facts of a run, as `dualtaxi export mcap` stores them")] = {}
     """What is known of the run besides its recording, as `import_record` returns it."""
 
 

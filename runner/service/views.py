@@ -7,8 +7,7 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
-from pydantic import BaseModel, Field, ValidationError, create_model
+from pydantic import BaseModel, Field, create_model
 
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
@@ -17,7 +16,7 @@ from runner.service import computed, fragments
 from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
 from runner.service.pages.frame import RunPage, installed_names
-from runner.service.problems import RUN_ERRORS, error_docs, media_docs
+from runner.service.problems import RUN_ERRORS, error_docs, filled, media_docs
 from runner.views import VIEWS, installed_view
 from runner.views.view import Given, Input, View
 
@@ -62,10 +61,8 @@ def _add_routes(view: View) -> None:
         body, problem = b"", None
         try:
             if view.has_default or any(form.values()):
-                given = given_type.model_validate({name: text for name, text in form.items() if text})
+                given = filled(given_type, form)
                 body = await _computed(compute, fragments.answer, run, view, given, view.page_values)
-        except ValidationError as error:
-            raise RequestValidationError(error.errors()) from error
         except RunnerError as error:
             problem = error
         shown = {"view": view, "form": form, "body": body.decode(), "problem": problem}

@@ -62,6 +62,7 @@ def mistake_in_words(error: Exception, value: object) -> str:
         elif isinstance(value, list | tuple) and key.isdecimal():
             value = value[int(key)]
     problem = problem.replace("Object missing required field", "found none, expected the key")
+    problem = re.sub(" matching regex .*", " of another form", problem)
     words = " ".join(
         _WORDS.get(word, word) for word in problem.partition(", got ")[0].replace("`", "").split()
     )

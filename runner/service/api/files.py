@@ -32,6 +32,7 @@ from runner.service.dependencies import (
 )
 from runner.service.errors import Refused
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
+from runner.service.tokens import Digest
 from runner.util.plugins import EXPORTS, plugin_names
 from runner.util.processes import CallFailed
 from runner.util.values import Ranges, ranges_in
@@ -103,7 +104,7 @@ def checkpoints(run: RecordedRun) -> CheckpointsResponse:
 )
 def checkpoint(
     run: RecordedRun,
-    digest: Annotated[str, Path(pattern="^[0-9a-f]{64}$", description="Its BLAKE3.")],
+    digest: Annotated[Digest, Path(description="Its BLAKE3.")],
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """Return the bytes of a checkpoint of this run."""

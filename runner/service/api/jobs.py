@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field
 
 from runner.client.jobs import JobEvent, JobProgress
 from runner.service.dependencies import JobsOf
-from runner.service.errors import JobNotFound, Refused
+from runner.service.errors import JobNotFound, Refused, expecting
 from runner.service.jobs.checking import DEFAULT_SOURCE
 from runner.service.jobs.queue import JobQueue, QueueStatus
 from runner.service.jobs.store import CheckedJob, Kind, QueuedJob, State
@@ -79,11 +79,9 @@ class CheckResponse(BaseModel):
 Number = Annotated[int, Path(ge=1, lt=2**31, description="The number of a job.")]
 Source = Annotated[
     str,
-    Query(
-        max_length=200,
-        pattern=r"^[^/\\\x00-\x1f]+$",
-        description="The file's name, for messages; the default name of the job.",
-    ),
+    Field(max_length=200, pattern=r"^[^/\\\x00-\x1f]+$"),
+    expecting("the name of a file, without its folder, of 200 characters at most"),
+    Query(description="The file's name, for messages; the default name of the job."),
 ]
 Workers = Annotated[
     int | None,

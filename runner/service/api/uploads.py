@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from runner.client.uploads import UploadState, UploadStatus
 from runner.service.dependencies import OwnerOf, UploadsOf
 from runner.service.problems import error_docs
+from runner.service.tokens import Digest
 from runner.service.uploads import UploadSource
 
 WRITE_BYTES: Final = 1 << 20
@@ -23,7 +24,7 @@ WRITERS: Final = 4
 _BYTES: Final = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
 _BODY: Final = {"requestBody": {"required": True, "content": _BYTES}}
 _ID_IS: Final = "64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing."
-UploadId = Annotated[str, Path(pattern="^[0-9a-f]{64}$", description=_ID_IS)]
+UploadId = Annotated[Digest, Path(description=_ID_IS)]
 
 router = APIRouter(
     prefix="/uploads", tags=["uploads"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)

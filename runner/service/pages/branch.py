@@ -2,34 +2,52 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from http import HTTPStatus
-from typing import Final
+from pathlib import Path
+from typing import Final, NamedTuple
 
 from fastapi import APIRouter, Response
-from fastapi.exceptions import RequestValidationError
-from pydantic import ValidationError
 
+from runner.analysis.episodes import EpisodeRef
 from runner.environments.naming import numbered_actions
 from runner.errors import RunnerError
+from runner.export.values import actions_at
+from runner.loops.actions import space_in_words
 from runner.recording.reader import Recording, open_recording
+from runner.recording.spaces import Description
 from runner.replay.makers import why_not_rerun
 from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
-from runner.service.dependencies import At, JobsOf, RecordedRun
-from runner.service.jobs.checking import BranchQuestion
+from runner.service.dependencies import At, JobsOf, RecordedRun, require_written
+from runner.service.jobs.checking import BranchQuestion, known_space
 from runner.service.pages.frame import RunPage
-from runner.service.pages.rendering import Form, number_in, to_job
+from runner.service.pages.rendering import Form, to_job
+from runner.service.problems import filled
 
 MAX_CHOICES: Final = 200
 """More actions are typed, not listed."""
 router = APIRouter(prefix="/runs/{run}/branch", include_in_schema=False)
 
 
+class ActionField(NamedTuple):
+    """The field of an agent's action."""
+
+    agent: str
+    """Empty for the only agent of a loop."""
+    recorded: str
+    """The recorded action; empty if it is not known."""
+    names: list[str]
+    """The actions to choose from; without any, the action is typed."""
+    space: str
+    """What may be typed."""
+
+
 @router.get("")
-def form(run: RecordedRun, at: At = "") -> Response:
+def form(run: RecordedRun, jobs: JobsOf, at: At = "") -> Response:
     """Show the form for a step."""
-    return _page(run, {"at": at})
+    return _page(run, jobs.recordings, {"at": at})
 
 
 @router.post("")
@@ -39,59 +57,69 @@ async def branch(run: RecordedRun, sent: Form, jobs: JobsOf) -> Response:
     try:
         job = await queue_branch(run, jobs, _question(given))
     except RunnerError as error:
-        return _page(run, given, error)
+        return _page(run, jobs.recordings, given, error)
     return to_job(job.number)
 
 
 def _question(given: Mapping[str, str]) -> BranchQuestion:
     """Return the branch that the fields of the form describe."""
     prefix = "action."
-    actions: dict[str, str | int] = {
+    actions = {
         name.removeprefix(prefix): text for name, text in given.items() if name.startswith(prefix) and text
     }
-    fields = {
-        "at": given.get("at", ""),
-        "action": actions.get("", actions or None),
-        "overrides": tuple(filter(None, map(str.strip, given.get("overrides", "").splitlines()))),
-        "episodes": number_in(given, "episodes"),
-        "policy": given.get("policy") or "recorded",
-        "seed": number_in(given, "seed") or 0,
-        "name": given.get("name") or None,
-    }
-    try:
-        return BranchQuestion.model_validate(fields)
-    except ValidationError as error:  # the form itself offers nothing else
-        raise RequestValidationError(error.errors()) from error
+    others = {name: text for name, text in given.items() if not name.startswith(prefix)}
+    lines = tuple(filter(None, map(str.strip, given.get("overrides", "").splitlines())))
+    return filled(BranchQuestion, {**others, "action": actions.get("", actions), "overrides": lines})
 
 
-def _page(run: Run, fields: Mapping[str, str], problem: RunnerError | None = None) -> Response:
-    """Return the form with the fields as they were sent, or why an episode of a loop cannot be played on."""
+def _page(
+    run: Run, recordings: Path, given: Mapping[str, str], problem: RunnerError | None = None
+) -> Response:
+    """Return the form with the fields as they were sent, or why the run cannot be branched here."""
 
     def values() -> dict[str, object]:
-        phase = "eval" if fields.get("at", "").startswith("eval:") else "train"
         with open_recording(run.recording) as recording:
             return {
-                "form": fields,
+                "form": given,
                 "problem": problem,
-                "actions": _choices(recording, phase),
-                "max_choices": MAX_CHOICES,
+                "actions": _action_fields(recording, given.get("at", "")),
                 "is_trained": recording.can_train_again,
-                "refusal": "" if recording.can_train_again else why_not_rerun(recording),
+                "refusal": _refusal(run, recordings, recording),
             }
 
     status = HTTPStatus.UNPROCESSABLE_ENTITY if problem else None
     return RunPage(run, "replay", "run_branch.html", values, status)
 
 
-def _choices(recording: Recording, phase: str) -> dict[str, list[str]]:
-    """Return the actions of each agent, in a space that is not discrete none; of one agent alone by ""."""
+def _refusal(run: Run, recordings: Path, recording: Recording) -> str:
+    """Return why no step of the run can be branched here; empty if it can be tried."""
+    try:
+        require_written(run, recordings, "branch")
+    except RunnerError as error:
+        return str(error)
+    return "" if recording.can_train_again else why_not_rerun(recording)
+
+
+def _action_fields(recording: Recording, at: str) -> list[ActionField]:
+    """Return the field of each agent's action at a step."""
+    step, recorded = EpisodeRef(0), dict[str, str]()
+    with contextlib.suppress(RunnerError):  # there is no such step, or it was not recorded
+        step = EpisodeRef.parse(at).resolved(recording)
+        recorded = actions_at(recording, step)
     if recording.can_train_again:
-        return dict(zip(recording.mdp.agents, numbered_actions(recording.mdp), strict=True))
-    space, steps = recording.spaces["action"], recording.phase(phase)
+        named = zip(recording.mdp.agents, numbered_actions(recording.mdp), strict=True)
+        return [ActionField(agent, recorded.get(agent, ""), names, "") for agent, names in named]
+    space, steps = recording.spaces["action"], recording.phase(step.phase)
     is_of_agents = "acted" in (steps.steps.row_dtype.names or ())
-    choices = {}
-    for agent, part in (space["spaces"] if is_of_agents else {"": space}).items():
-        first, count = part.get("start", 0), part["n"] if part["type"] == "Discrete" else 0
-        numbers = map(str, range(first, first + count)) if count <= MAX_CHOICES else ()
-        choices[agent] = list(steps.action_names(agent) or numbers)
-    return choices
+    return [
+        ActionField(agent, recorded.get(agent, ""), *_choices(part, steps.action_names(agent)))
+        for agent, part in (space["spaces"] if is_of_agents else {"": space}).items()
+    ]
+
+
+def _choices(description: Description, names: tuple[str, ...]) -> tuple[list[str], str]:
+    """Return the actions to choose from, if they are discrete and not many, and what may be typed."""
+    first, count = description.get("start", 0), description["n"] if description["type"] == "Discrete" else 0
+    choices = list(names or map(str, range(first, first + count))) if count <= MAX_CHOICES else []
+    space = known_space(description)
+    return choices, "" if space is None else space_in_words(space)

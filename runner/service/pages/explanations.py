@@ -8,7 +8,6 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Response
 
 from runner.analysis.episodes import EpisodeRef
-from runner.debugging.explain import DEFAULT_SEEDS
 from runner.debugging.explanation import Explanation, plots, sections
 from runner.errors import RunnerError
 from runner.export.reports.rendering import Link
@@ -16,7 +15,8 @@ from runner.service.api.comparing import Part, found_explanation
 from runner.service.api.questions import queue_explanation
 from runner.service.dependencies import JobsOf, SettingsOf
 from runner.service.jobs.explanations import ExplainQuestion
-from runner.service.pages.rendering import Form, Page, number_in, to_job
+from runner.service.pages.rendering import Form, Page, to_job
+from runner.service.problems import filled
 
 router = APIRouter(include_in_schema=False)
 Name = Annotated[str, Query(max_length=200)]
@@ -33,15 +33,7 @@ async def explain(sent: Form, jobs: JobsOf) -> Response:
     """Queue the explanation, or show what is wrong."""
     given = {name: text.strip() for name, text in sent.items()}
     try:
-        numbers = {name: number_in(given, name) for name in ("at", "seeds")}
-        question = ExplainQuestion(
-            a=given.get("a", ""),
-            b=given.get("b", ""),
-            metric=given.get("metric") or None,
-            at=numbers["at"],
-            seeds=numbers["seeds"] or DEFAULT_SEEDS,
-        )
-        job = await queue_explanation(jobs, question)
+        job = await queue_explanation(jobs, filled(ExplainQuestion, given))
     except RunnerError as error:
         values = {"form": given, "problem": error}
         return Page("explain.html", values, HTTPStatus.UNPROCESSABLE_ENTITY)

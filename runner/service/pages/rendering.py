@@ -149,14 +149,6 @@ async def form_of(request: Request) -> dict[str, str]:
 Form = Annotated[dict[str, str], Depends(form_of)]
 
 
-def number_in(form: Mapping[str, str], name: str) -> int | None:
-    """Return a whole number of a form; None for an empty field."""
-    text = form.get(name, "")
-    if text and not (text.isdecimal() and len(text) < 16):
-        raise RunnerError(f"{name}: found {text[:40]!r}, expected a whole number.")
-    return int(text) if text else None
-
-
 def message_of(error: RunnerError, request: Request) -> str:
     """Return the message of an error for a page, the same as that of the API."""
     return problems.error_body(error, request.app.state.settings).message

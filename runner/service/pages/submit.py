@@ -10,17 +10,19 @@ from types import MappingProxyType
 from typing import Annotated, Final, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
 from runner.config.schema import json_schema, without_references
 from runner.errors import RunnerError
+from runner.service.api.jobs import Workers
 from runner.service.dependencies import CatalogueOf, JobsOf
 from runner.service.errors import Refused
 from runner.service.jobs.checking import SWEEP_KEYS
 from runner.service.jobs.store import CheckedJob
-from runner.service.pages.rendering import Form, Page, number_in, to_job, viewer_of
-from runner.service.problems import error_body
+from runner.service.pages.rendering import Form, Page, to_job, viewer_of
+from runner.service.problems import error_body, filled
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
 
@@ -64,6 +66,12 @@ parameters:
 strategy: grid
 seeds: [0, 1]
 """
+
+
+class _Options(BaseModel):
+    """The fields of the form besides the text."""
+
+    workers: Workers = None
 
 
 class FormProblem(NamedTuple):
@@ -112,7 +120,8 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
         checked = await jobs.checker.check(text)
         if sent.get("action") == "check":
             return Page(TEMPLATE, _values(text, sent, checked=checked))
-        job = await run_in_threadpool(jobs.add, text, checked, number_in(sent, "workers"))
+        options = filled(_Options, {"workers": sent.get("workers")})
+        job = await run_in_threadpool(jobs.add, text, checked, options.workers)
     except RunnerError as error:
         values = _values(text, sent, _problems(request, text, error))
         return Page(TEMPLATE, values, HTTPStatus.UNPROCESSABLE_ENTITY)

@@ -152,7 +152,7 @@ def test_no_runs_at_all(folder, name):
 
 def test_a_wrong_name_gets_a_suggestion(folder):
     create_run(folder, CONFIG, 1)
-    with pytest.raises(RunNotFound, match=r"Did you mean 'some'\?.*lists the 1 there are"):
+    with pytest.raises(RunNotFound, match=r"Did you mean 'some'\?.*`dualtaxi ls` lists all runs"):
         find_run("soem", folder)
     with pytest.raises(RunNotFound, match="no run 'other@latest'"):
         find_run("other@latest", folder)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import html
 import re
 import shutil
 import time
 from contextlib import closing
 
 import gymnasium
+import numpy
 import pytest
 
 import runner
+from runner.client.jobs import RunProgress
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
@@ -18,6 +21,7 @@ from runner.service.jobs.channel import JobChannel, JobSpec
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.episodes import run_episode_job
 from runner.service.jobs.store import JobStore
+from runner.service.jobs.worker import do_job
 from runner.service.settings import ServiceSettings
 
 BRANCH = "/api/v1/runs/first/branch"
@@ -61,7 +65,21 @@ def test_a_branch_is_queued_and_is_what_the_command_records(client, recordings, 
         ({"at": "20:1", "episodes": 0}, 422, "episodes"),
         ({"at": "x"}, 400, "EPISODE:T"),
         ({"at": "20:1", "policy": "random"}, 422, "policy, seed and max_steps are for loops"),
+        ({"at": "20:1"}, 422, "nothing is changed: found the recorded actions at 20:1"),
+        ({"at": "20:1", "episodes": 60, "overrides": ["discount=0.99"]}, 422, "nothing is changed"),
         ({}, 422, "at"),
+        ({"at": [1]}, 422, "body.at: found a list of 1, expected a step such as 120:5"),
+        (
+            {"at": "20:1", "overrides": {"epsilon": 0.5}},
+            422,
+            'epsilon, expected a list of KEY=VALUE, such as ["',
+        ),
+        (
+            {"at": "20:1", "action": {"taxi_1": None}},
+            422,
+            "expected a number or a name, numbers in a list, or a",
+        ),
+        ({"at": "20:1", "seed": 10**30}, 422, "expected less than 4,294,967,296"),
     ],
 )
 def test_what_is_wrong_is_refused_before_it_is_queued(client, sent, status, message):
@@ -124,6 +142,8 @@ def test_a_resumed_job_plays_an_episode_on_only_once(connect, loop, recordings, 
         ({"at": "1:4", "action": 7}, 422, "found 7"),
         ({"at": "1:4", "action": [0.5]}, 422, "found [0.5]"),
         ({"at": "1:4", "action": True}, 422, "action"),
+        ({"at": "1:4"}, 422, "nothing is changed: found the recorded action at 1:4"),
+        ({"at": "1:4", "action": "left", "seed": 3}, 422, "policy: random or constant"),
     ],
 )
 def test_what_is_wrong_for_a_loop_is_refused_before_it_is_queued(client, loop, sent, status, message):
@@ -138,13 +158,19 @@ def test_the_replay_of_a_loop_leads_to_the_form_which_queues_the_job(client, loo
     (address,) = re.findall(r'data-to-branch href="([^"]+)"', replay.text)
     assert address.endswith("?at=1:4")
     form = client.get(address)
+    assert ">as recorded: left</option>" in form.text
     assert ">right</option>" in form.text
+    unchanged = client.post(f"/runs/{loop.run_id}/branch", data={"at": "1:4", "policy": "recorded"})
+    assert "Nothing is changed: found the recorded action at 1:4" in unchanged.text
     sent = {"at": "1:4", "action.": "right", "policy": "constant", "seed": "x"}
     refused = client.post(f"/runs/{loop.run_id}/branch", data=sent)
     assert refused.status_code == 422
     assert "<option selected>right</option>" in refused.text
     crafted = client.post(f"/runs/{loop.run_id}/branch", data=sent | {"seed": "", "policy": "agent:act"})
     assert crafted.status_code == 422
+    huge = client.post(f"/runs/{loop.run_id}/branch", data=sent | {"seed": "9" * 30})
+    assert "expected less than 4,294,967,296" in huge.text
+    assert "<option selected>right</option>" in huge.text
     queued = client.post(f"/runs/{loop.run_id}/branch", data=sent | {"seed": ""}, follow_redirects=False)
     assert queued.status_code == 303, queued.text
     assert finished(client, queued.headers["location"].rpartition("/")[2])["state"] == "finished"
@@ -166,6 +192,7 @@ def test_the_replay_leads_to_the_form_which_queues_the_branch(client):
     assert address.endswith("?at=20:1")
     form = client.get(address)
     assert 'value="20:1"' in form.text
+    assert len(re.findall(r">as recorded: [a-z-]+</option>", form.text)) == 2
     assert ">north</option>" in form.text
     wrong = {"at": "20:1", "action.taxi_1": "north", "overrides": "epsilon=<b>"}
     refused = client.post("/runs/first/branch", data=wrong)
@@ -198,3 +225,43 @@ def test_a_branch_whose_parent_was_removed_fails_and_leaves_no_run(connect, reco
         assert f"{parent.run_id}, the parent of this branch, is no longer there" in ended["error"]
         assert {run.run_id for run in list_runs(recordings)} == before
         client.post(f"/api/v1/jobs/{job.number}/resume")
+
+
+def test_the_form_shows_the_numbers_of_an_action(client, recordings):
+    with runner.record(gymnasium.make("Pendulum-v1"), recordings, name="pendulum") as rec:
+        rec.reset(seed=1)
+        rec.step(numpy.array([0.25], numpy.float32))
+    form = client.get(f"/runs/{rec.run.run_id}/branch?at=0:0")
+    assert 'placeholder="as recorded: [0.25]"' in form.text
+    assert ">-2 to 2</span>" in form.text
+    wrong = client.post(f"/runs/{rec.run.run_id}/branch", data={"at": "0:0", "action.": "left"})
+    assert "action: found 'left', expected -2 to 2." in html.unescape(wrong.text)
+
+
+def test_a_run_in_a_folder_that_is_only_read_has_no_form(connect, loop, recordings, tmp_path):
+    client = connect(
+        ServiceSettings(recordings=(tmp_path / "own", recordings), tokens=tmp_path / "tokens.json")
+    )
+    for run in (loop.run_id, "first"):
+        page = client.get(f"/runs/{run}/branch?at=0:1")
+        assert "is in a folder that this service only reads; branch it where it was recorded" in page.text
+        assert "<form class" not in page.text
+        assert client.post(f"/api/v1/runs/{run}/branch", json={"at": "0:1"}).status_code == 409
+
+
+def test_a_branch_reports_that_it_prepares(loop, recordings):
+    questions = [
+        (find_run("first", recordings), BranchQuestion(at="20:1", overrides=("epsilon=0.5",))),
+        (loop, BranchQuestion(at="1:4", action="right")),
+    ]
+    said = []
+    for run, question in questions:
+        with closing(JobStore(recordings)) as store:
+            job = store.add(check_branch(run, question), "")
+        events = []
+        do_job(JobSpec(recordings / ".jobs" / str(job.number), job), JobChannel(events.append, lambda: False))
+        said.append([event.text for event in events if isinstance(event, RunProgress)])
+    (trained, *_, whole), (played, *_) = said
+    assert trained == played == "preparing"
+    assert whole == "60 of 60 episodes"
+    assert all(text.endswith(" steps") for text in said[1][1:])

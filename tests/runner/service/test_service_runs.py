@@ -66,7 +66,7 @@ def test_a_wrong_filter_is_refused_with_a_suggestion(client):
             "POST",
             "jobs?source=a/b",
             {"content": "x"},
-            "query.source: found 'a/b', expected text that matches",
+            "query.source: found 'a/b', expected the name of a file, without its folder",
         ),
         ("POST", "explanations", {"content": "{"}, "body: found a body without the type application/json"),
         ("POST", "explanations", {"json": [1]}, "body: found a list of 1, expected a mapping"),
