@@ -3,15 +3,27 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from typing import Final
+from typing import Final, NamedTuple
 
 _NUMBERS: Final = re.compile(
     r"(?<![\w.])[-+]?[\d,]*\.?\d+(e[-+]?\d+)?(?![\w.])|\b(to|never|inf|nan)\b|[][() %,/:;–]"
 )
 """What cells of numbers consist of, such as `1,500`, `12 %`, `[0.5, 1]` and `2 to 3`."""
+
+
+NOT_DRAWN: Final = "The charts are on the page of the run: `dualtaxi serve`."
+
+
+class Plot(NamedTuple):
+    """A chart in a page."""
+
+    title: str
+    svg: str
+    wide: bool
+    """Whether it takes a whole row."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +36,8 @@ class Grid:
     """Its title in a page, if that is not the section's."""
     links: Sequence[str] = ()
     """The address of what each row is about, below the address of the run."""
+    streams: Sequence[str] = ()
+    """The stream of each row, if the rows are lines of output: `stdout`, `stderr` or `note`."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:
@@ -49,6 +63,8 @@ class Section:
     figure: str = ""
     """A picture as SVG, and its caption."""
     caption: str = ""
+    charts: Iterable[Plot] = ()
+    """Charts, which are drawn on a page; `NOT_DRAWN` stands for them in text."""
     replay: str = ""
     """The address of the replay of a step to look at, below the address of the run."""
 
@@ -64,7 +80,7 @@ def markdown(sections: Sequence[Section]) -> Iterator[str]:
         yield from (f"## {section.title}", "")
         yield from (f"- {name}: {text}" for name, text in section.facts.items())
         yield from [""] * bool(section.facts)
-        for sentence in section.sentences:
+        for sentence in [*section.sentences, *([NOT_DRAWN] if section.charts else [])]:
             yield from (sentence, "")
         for grid in section.grids:
             yield _row(grid.headings)

@@ -42,6 +42,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "find": ("query", "Find the episodes of all runs that match an expression."),
         "sql": ("query", "Ask the recorded runs, and every step of them, in SQL."),
         "show": ("show", "Show a run: evaluations, tables, configuration."),
+        "console": ("views", "Show what the process that recorded a run printed."),
+        "system": ("views", "Show how fast a run went, and what it used of its machine."),
         "play": ("play", "Replay a recorded episode in the terminal."),
         "view": ("view", "Open runs in the Rerun viewer."),
         "plot": ("report", "Draw every metric of one or several runs over episodes."),

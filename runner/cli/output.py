@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
-from runner.analysis.sections import Grid, Section, markdown
+from runner.analysis.sections import NOT_DRAWN, Grid, Section, markdown
 from runner.errors import ExitCode
 from runner.export.places import require_new
 from runner.util.humanize import printable
@@ -185,7 +185,7 @@ def draw(*parts: Part) -> None:
             echo(part)
         elif isinstance(part, Section):
             _render(facts(part.facts) if part.facts else title(part.title), *part.sentences)
-            draw(*part.grids, *map(patch_text, part.diffs))
+            draw(*part.grids, *map(patch_text, part.diffs), *([NOT_DRAWN] if part.charts else []))
         elif isinstance(part, Mapping):
             _render(facts(part))
         elif isinstance(part, Grid):

@@ -10,8 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from runner.analysis.compare.statistics import Estimate, bootstrap_ratio
-from runner.analysis.sections import Grid, Section, html
-from runner.export.plots.curves import Plot
+from runner.analysis.sections import Grid, Plot, Section, html
 from runner.export.plots.mixtures import BarColumn, bars_chart, mixtures_chart
 from runner.util.humanize import counted, duration
 from runner.util.values import Json

@@ -142,6 +142,15 @@ class HostMetrics:
         """The number of GPUs."""
         return int(self.values[GPU_FIELDS[0]].shape[1])
 
+    @property
+    def largest(self) -> dict[str, float]:
+        """The largest use of memory, in bytes, and `disk_free_bytes` at the end; only what is known."""
+        names = ("memory_bytes", "host_memory_total", "gpu_memory_bytes")
+        values = {name: self.values[name] for name in names}
+        values["disk_free_bytes"] = self.values["disk_free_bytes"][-1:]
+        finite = {name: column[np.isfinite(column)] for name, column in values.items()}
+        return {name: float(column.max()) for name, column in finite.items() if column.size}
+
     def rate(self, name: str) -> Floats:
         """Return the bytes a second of a counter, [samples]; NaN for the first sample of a session."""
         counts = self.values[name]

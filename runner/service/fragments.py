@@ -26,7 +26,7 @@ from runner.analysis.episodes import (
     ranked_trials,
 )
 from runner.analysis.histograms import histograms
-from runner.analysis.sections import Grid
+from runner.analysis.sections import Grid, Plot
 from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if
@@ -34,9 +34,7 @@ from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
 from runner.errors import ConfigError, RecordingError, RunnerError, shortened
 from runner.export.encoded import picture_note
-from runner.export.plots.curves import Plot
 from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
-from runner.export.plots.machine import machine_facts, machine_plots
 from runner.export.plots.tasks import task_charts
 from runner.export.reports.compare import tasks_legend
 from runner.export.reports.diff import ShownDivergence, difference_view
@@ -48,9 +46,6 @@ from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
 from runner.export.thumbnail import thumbnail
 from runner.recording import schema
-from runner.recording.clock import read_clock
-from runner.recording.console import read_console
-from runner.recording.host import read_host
 from runner.recording.messages import media_type
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
@@ -59,8 +54,6 @@ from runner.service.computed import TABLE_NAME, as_json
 from runner.util.values import Json
 from runner.views.view import Answer, Given
 
-MAX_OUTPUT_LINES: Final = 1000
-"""Lines of output that a page shows."""
 MAX_PICTURES: Final = 48
 """Logged pictures that a page shows, of `MAX_PICTURE_BYTES` together."""
 MAX_PICTURE_BYTES: Final = 16 << 20
@@ -256,22 +249,6 @@ def _typical_start(recording: Recording) -> int:
     return int(recording.mdp.start.argmax())
 
 
-def system(path: Path) -> bytes:
-    """Return how a run went on its machine: facts, and charts over time, as HTML."""
-    with open_recording(path) as recording:
-        clock = read_clock(recording)
-        host = read_host(recording, clock)
-    shown = partials()
-    if clock is None:
-        return str(shown.paragraphs(["Its recording has no clock."])).encode()
-    facts = machine_facts(clock, host)
-    text = ""
-    if host is None:
-        text = "No use of the machine was recorded: it is measured once a second, unless `system` is off."
-    html = shown.pairs("Time and machine", facts)
-    return str(html + shown.charts("machine", "Over time", text, machine_plots(clock, host))).encode()
-
-
 def pictures(path: Path) -> bytes:
     """Return the last pictures and films that were logged under a name, the newest first, as HTML."""
     last: deque[tuple[str, int, bytes]] = deque()
@@ -296,21 +273,6 @@ def pictures(path: Path) -> bytes:
     return str(
         partials().paragraphs(texts) + Markup('<div class="logged">{}</div>').format(Markup().join(figures))
     ).encode()
-
-
-def console(path: Path, sought: str, stream: str) -> bytes:
-    """Return the last lines of the output that have the text that is sought, in any case, as HTML.
-
-    `stream` is `stdout`, `stderr`, or empty for both.
-    """
-    with open_recording(path) as recording:
-        clock = read_clock(recording)
-        every = read_console(recording, clock)
-    matching = [
-        line for line in every if sought.casefold() in line.text.casefold() and stream in ("", line.stream)
-    ]
-    lines = [(line.seconds, line.position, line.stream, line.text) for line in matching[-MAX_OUTPUT_LINES:]]
-    return str(partials().output(lines, len(matching), len(every))).encode()
 
 
 def difference(a: Run, b: Run) -> bytes:

@@ -7,15 +7,17 @@ from http import HTTPStatus
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field, create_model
 
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed, fragments
+from runner.service.addresses import link
 from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
-from runner.service.pages.frame import RunPage, installed_names
+from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import RUN_ERRORS, error_docs, filled, media_docs
 from runner.views import VIEWS, installed_view
 from runner.views.view import Given, Input, View
@@ -53,6 +55,21 @@ def _add_routes(view: View) -> None:
         documented = {"response_class": Response, "responses": media_docs(OCTETS)}
         add(computed.answer_file, view.file_ending, OCTETS, view.file_help, **documented)
 
+    if view.is_live:
+
+        async def part(
+            run: RecordedRun, compute: ComputationOf, given: BaseModel, status: StatusName
+        ) -> Response:
+            """Return the answer; 204 if the run no longer has this status."""
+            if run.status != status:
+                return Response(status_code=HTTPStatus.NO_CONTENT)
+            return HTMLResponse(
+                await _computed(compute, fragments.answer, run, view, given, view.page_values)
+            )
+
+        part.__annotations__["given"] = Annotated[given_type, Query()]
+        pages.get(f"/{view.name}/part")(part)
+
     @pages.get(f"/{view.name}")
     async def page(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
         """Show the form, and the answer to what it asks."""
@@ -65,7 +82,11 @@ def _add_routes(view: View) -> None:
                 body = await _computed(compute, fragments.answer, run, view, given, view.page_values)
         except RunnerError as error:
             problem = error
-        shown = {"view": view, "form": form, "body": body.decode(), "problem": problem}
+        live = ""
+        if view.is_live and run.status == "running":
+            asked = {name: text for name, text in form.items() if text}
+            live = link(f"/runs/{run.run_id}/{view.name}/part", asked | {"status": run.status})
+        shown = {"view": view, "form": form, "body": body.decode(), "problem": problem, "live": live}
         return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view))
 
 

@@ -17,13 +17,13 @@ import numpy as np
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
 from runner.analysis.panels import Panel, panels_of
-from runner.analysis.sections import Section
+from runner.analysis.sections import Plot, Section
 from runner.analysis.series import series_of
 from runner.archive.places import at_hand
 from runner.drawing import palette
 from runner.errors import RunnerError
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
-from runner.export.plots.curves import HEIGHT, WIDTH, Plot, footnote, panel_chart, panel_plots
+from runner.export.plots.curves import HEIGHT, WIDTH, footnote, panel_chart, panel_plots
 from runner.export.reports.rendering import LegendEntry, render
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range

@@ -10,10 +10,10 @@ from functools import cache
 from typing import Final
 
 from runner.util import plugins
-from runner.views import qtable, when, why
+from runner.views import console, qtable, system, when, why
 from runner.views.view import View
 
-VIEWS: Final = {module.VIEW.name: module.VIEW for module in (qtable, when, why)}
+VIEWS: Final = {module.VIEW.name: module.VIEW for module in (console, qtable, system, when, why)}
 """Name of a view -> the view."""
 
 

@@ -77,8 +77,8 @@ class View:
     title: str
     compute: Callable[..., Any]
     """Takes the recording, the inputs and `report`, called with the steps done; returns an `Answer`."""
-    button: str
-    """Text of the button that sends the form."""
+    button: str = ""
+    """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
     """What the page says first."""
     list_title: str = ""
@@ -89,6 +89,8 @@ class View:
     """What the command says that it does."""
     counts_steps: bool = True
     """Whether the function has the parameter `report`."""
+    is_live: bool = False
+    """Whether the answer changes while the run is running, so that the page loads it again."""
     has_default: bool = False
     """Whether the page has an answer before anything is asked."""
     file_ending: str = ""

@@ -10,13 +10,14 @@ import math
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Group
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
+from runner.analysis.sections import Plot
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
@@ -42,15 +43,6 @@ _LETTER: Final = 0.56
 """Width of an average letter, as a share of the text's size."""
 _LETTERS: Final = 215
 """Letters of a note that fit on a line of a sheet of three columns."""
-
-
-class Plot(NamedTuple):
-    """A chart in a page."""
-
-    title: str
-    svg: str
-    wide: bool
-    """Whether it takes a whole row."""
 
 
 def plots_of(groups: Sequence[Group], style: CurveStyle = PLAIN) -> tuple[list[Plot], str]:

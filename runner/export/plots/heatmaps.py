@@ -8,11 +8,12 @@ import numpy as np
 
 from runner.analysis.axes import axis_of
 from runner.analysis.histograms import ValueCounts
+from runner.analysis.sections import Plot
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import shortened
 from runner.export.plots.chart import SMALL, Chart, Scale, labelled, number_on_axis
-from runner.export.plots.curves import HEIGHT, WIDTH, Plot
+from runner.export.plots.curves import HEIGHT, WIDTH
 
 _TITLES: Final = {
     "return": "Returns of training episodes",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from runner.analysis.sections import Plot
 from runner.export.plots.chart import Chart, Scale, labelled, series_colour, series_marker
-from runner.export.plots.curves import HEIGHT, WIDTH, Plot, draw_legend
+from runner.export.plots.curves import HEIGHT, WIDTH, draw_legend
 from runner.recording.clock import SAMPLE_SECONDS, Clock
 from runner.recording.host import HostMetrics
 from runner.util import humanize
@@ -17,6 +19,12 @@ Values = Floats
 _INTERVALS: Final = 200
 """The most intervals of the time in which steps are counted."""
 _GB, _MB = 1e9, 1e6
+_SIZES: Final = {
+    "memory_bytes": "Memory of the process, largest",
+    "host_memory_total": "Memory of the machine",
+    "gpu_memory_bytes": "GPU memory, largest",
+    "disk_free_bytes": "Disk, free at the end",
+}
 
 
 class _Panel(NamedTuple):
@@ -34,30 +42,20 @@ def machine_facts(clock: Clock, host: HostMetrics | None) -> dict[str, str]:
         "Time": humanize.duration(clock.duration) + (f", in {sessions} sessions" if sessions > 1 else ""),
         "Steps a second, mean": humanize.UNKNOWN if rate is None else f"{rate:,.0f}",
     }
-    if host is not None:
-        of = host.values
-        largest = {
-            "Memory of the process, largest": of["memory_bytes"],
-            "Memory of the machine": of["host_memory_total"],
-            "GPU memory, largest": of["gpu_memory_bytes"],
-            "Disk, free at the end": of["disk_free_bytes"][-1:],
-        }
-        for name, values in largest.items():
-            if (finite := values[np.isfinite(values)]).size:
-                facts[name] = humanize.size(float(finite.max()))
-    return facts
+    largest = {} if host is None else host.largest
+    return facts | {_SIZES[name]: humanize.size(size) for name, size in largest.items()}
 
 
-def machine_plots(clock: Clock, host: HostMetrics | None) -> list[Plot]:
-    """Return the charts of a run over its time; those of its machine only if that was recorded."""
+def machine_plots(clock: Clock, host: HostMetrics | None) -> Iterator[Plot]:
+    """Yield the charts of a run over its time; those of its machine only if that was recorded."""
     edges = np.linspace(0, clock.duration, 1 + min(_INTERVALS, max(1, int(clock.duration / SAMPLE_SECONDS))))
     done = np.interp(edges, clock.seconds, clock.positions)
-    plots = []
     if clock.duration > 0:
         rate = {"": np.diff(done) / np.diff(edges)}
-        plots.append(_plot(_Panel("Steps a second", "steps a second", rate), edges[1:], clock.duration))
-    panels = [] if host is None else _host_panels(host)
-    return plots + [_plot(panel, host.seconds, clock.duration) for panel in panels if host is not None]
+        yield _plot(_Panel("Steps a second", "steps a second", rate), edges[1:], clock.duration)
+    if host is not None:
+        for panel in _host_panels(host):
+            yield _plot(panel, host.seconds, clock.duration)
 
 
 def _host_panels(host: HostMetrics) -> list[_Panel]:

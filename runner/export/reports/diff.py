@@ -24,7 +24,7 @@ from runner.analysis.diff.sections import (
 from runner.analysis.diff.tables import common_snapshots
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.groups import Group
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Grid, Plot, Section
 from runner.analysis.series import read_series
 from runner.drawing import svg
 from runner.environments.mdp import Mdp
@@ -36,7 +36,7 @@ from runner.environments.naming import (
     states_in_words,
 )
 from runner.export.plots.comparisons import tables_svg
-from runner.export.plots.curves import Plot, plots_of
+from runner.export.plots.curves import plots_of
 from runner.export.reports.maps import drawn, on_grid, situation, situation_in_words
 from runner.export.reports.rendering import Figure, LegendEntry, Link, render
 from runner.recording.reader import Recording

@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import Final
+from typing import Annotated, Final
+
+from fastapi import Query
 
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.qtable import recorded_tables
@@ -20,6 +22,8 @@ from runner.service.pages.rendering import Page, Values, made
 from runner.util import humanize
 from runner.util.plugins import VIEWS, plugin_names
 from runner.views import installed_view
+
+StatusName = Annotated[str, Query(max_length=20, description="The status that the page shows.")]
 
 TABS: Final = (
     ("", "Overview"),

@@ -45,8 +45,7 @@ from runner.service.dependencies import (
     WrittenRun,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunPage, environment_of, last_results, result_of
-from runner.service.pages.machine import StatusName
+from runner.service.pages.frame import RunPage, StatusName, environment_of, last_results, result_of
 from runner.service.pages.rendering import Form, Page, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize

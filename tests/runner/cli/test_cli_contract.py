@@ -72,6 +72,8 @@ WORDS = {
     "rerecord": "@latest",
     "show": "@latest",
     "play": "@latest --speed 1000",
+    "console": "@latest --search x",
+    "system": "@latest",
     "diff": "@latest @latest",
     "compare": "@latest other@latest",
     "verify": "@latest",

@@ -35,14 +35,14 @@ def host_of(gpus=0, **values):
     ],
 )
 def test_only_what_is_known_is_drawn(host, titles):
-    plots = machine_plots(CLOCK, host)
+    plots = [*machine_plots(CLOCK, host)]
     assert [plot.title for plot in plots] == ["Steps a second", *titles]
     assert all("nan" not in plot.svg for plot in plots)
 
 
 def test_a_run_that_took_no_time_has_no_charts():
     clock = Clock(np.zeros(1, np.int64), np.zeros(1), np.zeros(1))
-    assert machine_plots(clock, None) == []
+    assert [*machine_plots(clock, None)] == []
     assert machine_facts(clock, None)["Steps a second, mean"] == "–"
 
 

@@ -274,12 +274,12 @@ def test_output_is_shown_escaped_and_searched(client, recordings, capsys):
     assert "a warning" in shown
     assert "data-live" not in shown
     assert "script&gt;" not in page_of(client, "/runs/printing/console?stream=stderr")
-    found = page_of(client, "/runs/printing/console?q=WARN")
+    found = page_of(client, "/runs/printing/console?search=WARN")
     assert "script&gt;" not in found
     assert "1 line found, of 2" in found
-    assert "No line was found" in page_of(client, "/runs/printing/console?q=nothing")
+    assert "No line was found" in page_of(client, "/runs/printing/console?search=nothing")
     assert client.get("/runs/printing/console/part?status=running").status_code == 204
-    assert client.get("/runs/printing/console?stream=else", headers=ACCEPT_HTML).status_code == 422
+    assert client.get("/runs/printing/console?stream=else", headers=ACCEPT_HTML).status_code == 400
 
 
 def test_logged_pictures_are_shown_newest_first_with_their_steps(client, recordings):

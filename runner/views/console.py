@@ -1,0 +1,103 @@
+"""`console`: what the process that recorded a run printed."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Final
+
+from runner.analysis.sections import Grid, Section
+from runner.errors import ConfigError
+from runner.util.humanize import counted, duration
+from runner.views.view import View, view_input
+
+if TYPE_CHECKING:
+    from runner.recording.console import ConsoleLine
+    from runner.recording.reader import Recording
+    from runner.util.values import Json
+
+_BOTH: Final = "both"
+_STREAMS: Final = (_BOTH, "stdout", "stderr")
+
+
+@dataclass(frozen=True)
+class Output:
+    """The last lines of output, of those found."""
+
+    lines: list[ConsoleLine]
+    found: int
+    total: int
+    step_to_look_at = None
+
+    def as_json(self) -> Json:
+        """Return the lines and their numbers."""
+        return {"lines": [asdict(line) for line in self.lines], "found": self.found, "total": self.total}
+
+    def sections(self) -> list[Section]:
+        """Return a table of the lines."""
+        if not self.lines:
+            return [Section("Output", ["No line was found." if self.total else "No output was recorded."])]
+        sentence = counted(self.found, "line")
+        if self.found > len(self.lines):
+            sentence = f"The last {len(self.lines):,} of {sentence}"
+        if self.found < self.total:
+            sentence += f" found, of {self.total:,}"
+        rows = [(duration(line.seconds), f"{line.position:,}", line.text) for line in self.lines]
+        streams = [line.stream or "note" for line in self.lines]
+        return [
+            Section("Output", [f"{sentence}."], [Grid(("time", "step", "output"), rows, streams=streams)])
+        ]
+
+
+def console(
+    recording: Recording,
+    search: str = view_input(
+        "search", "Only lines with this text, in any case.", default="", metavar="TEXT", label="Text"
+    ),
+    stream: str = view_input(
+        "stream",
+        "Only lines of stdout, or of stderr.  [default: both]",
+        default=_BOTH,
+        metavar="NAME",
+        label="Stream",
+        choices=lambda _: _STREAMS,
+    ),
+    limit: int = view_input(
+        "limit",
+        "Maximum number of rows, 0 for all.  [default: 1000]",
+        kind=int,
+        default=1000,
+        metavar="N",
+        maximum=10**9,
+    ),
+) -> Output:
+    """Show what the process that recorded RUN printed: the last lines of its output, or of those with a text.
+
+    Each line has the time at which it began and the number of steps taken until then. A progress bar has its
+    last state; 10 MB are recorded.
+
+    Examples:
+      dualtaxi console @latest
+      dualtaxi console cartpole --search nan
+      dualtaxi console cartpole --stream stderr --limit 20
+    """
+    from runner.recording.clock import read_clock
+    from runner.recording.console import read_console
+
+    if stream not in _STREAMS:
+        raise ConfigError(f"stream: found {stream!r}, expected {', '.join(_STREAMS[:-1])} or {_STREAMS[-1]}.")
+    lines = read_console(recording, read_clock(recording))
+    matching = [
+        line for line in lines if search.casefold() in line.text.casefold() and stream in (_BOTH, line.stream)
+    ]
+    return Output(matching[-limit:], len(matching), len(lines))
+
+
+VIEW: Final = View(
+    "console",
+    "Console",
+    console,
+    button="Search",
+    counts_steps=False,
+    has_default=True,
+    is_live=True,
+)
