@@ -72,7 +72,7 @@ class RunCell(NamedTuple):
     address: str
     is_status: bool
     note: str
-    """What was changed, beside the name of a branch."""
+    """What a branch changed, shown after its name."""
 
 
 class RunRow(NamedTuple):
