@@ -255,6 +255,7 @@ def _informative(rows: Sequence[Row], folders: int) -> list[str]:
         "tag": any(row["tags"] for row in rows),
         "same_as": any(row["same_as"] for row in rows),
         "parent": any(row["parent"] for row in rows),
+        "change": any(row["origin"] for row in rows),
         "folder": folders > 1,
         "success_percent": has_success or not has_return,
         "mean_return": has_return,

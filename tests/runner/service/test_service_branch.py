@@ -23,6 +23,7 @@ from runner.service.jobs.episodes import run_episode_job
 from runner.service.jobs.store import JobStore
 from runner.service.jobs.worker import do_job
 from runner.service.settings import ServiceSettings
+from tests.waiting import until
 
 BRANCH = "/api/v1/runs/first/branch"
 
@@ -205,6 +206,7 @@ def test_the_replay_leads_to_the_form_which_queues_the_branch(client):
     number = queued.headers["location"].rpartition("/")[2]
     assert finished(client, number)["state"] == "finished"
     assert ">The run</a>" in client.get(queued.headers["location"]).text
+    until(lambda page: "taxi 1 north, epsilon 0.5" in page, lambda: client.get("/runs?group=none").text)
 
 
 def test_a_trial_offers_no_branch_of_training(client):
@@ -233,7 +235,7 @@ def test_the_form_shows_the_numbers_of_an_action(client, recordings):
         rec.step(numpy.array([0.25], numpy.float32))
     form = client.get(f"/runs/{rec.run.run_id}/branch?at=0:0")
     assert 'placeholder="as recorded: [0.25]"' in form.text
-    assert ">-2 to 2</span>" in form.text
+    assert re.search(r"<label>Action, -2 to 2\s", form.text)
     wrong = client.post(f"/runs/{rec.run.run_id}/branch", data={"at": "0:0", "action.": "left"})
     assert "action: found 'left', expected -2 to 2." in html.unescape(wrong.text)
 
