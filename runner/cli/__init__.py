@@ -29,6 +29,8 @@ from runner.util import __version__
 from runner.util.humanize import printable
 from runner.util.plugins import VIEWS
 
+_VIEW: Final = ""
+"""Stands for the module of a command that follows from a view, see `runner.views`."""
 COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Run": {
         "run": ("run", "Train, evaluate and record an experiment."),
@@ -42,8 +44,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "find": ("query", "Find the episodes of all runs that match an expression."),
         "sql": ("query", "Ask the recorded runs, and every step of them, in SQL."),
         "show": ("show", "Show a run: evaluations, tables, configuration."),
-        "console": ("views", "Show what the process that recorded a run printed."),
-        "system": ("views", "Show how fast a run went, and what it used of its machine."),
+        "console": (_VIEW, "Show what the process that recorded a run printed."),
+        "system": (_VIEW, "Show how fast a run went, and what it used of its machine."),
         "play": ("play", "Replay a recorded episode in the terminal."),
         "view": ("view", "Open runs in the Rerun viewer."),
         "plot": ("report", "Draw every metric of one or several runs over episodes."),
@@ -54,13 +56,13 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "checkpoints": ("checkpoints", "List the checkpoints that a loop recorded."),
         "checkpoint": ("checkpoints", "Write a checkpoint of a run into a file."),
         "values": ("checkpoints", "Compute what a checkpoint's agent returns along a recorded episode."),
-        "qtable": ("views", "Show the exact Q-table of a run at any step."),
+        "qtable": (_VIEW, "Show the exact Q-table of a run at any step."),
         "table": ("tables", "Print an environment's transition table with names."),
     },
     "Debug": {
         "branch": ("branch", "Change a recorded step, and see where that leads."),
-        "when": ("views", "Find the training steps after which something holds, such as a Q-value."),
-        "why": ("views", "Show the rewards and initial values that a Q-value is the sum of."),
+        "when": (_VIEW, "Find the training steps after which something holds, such as a Q-value."),
+        "why": (_VIEW, "Show the rewards and initial values that a Q-value is the sum of."),
         "explain": ("explain", "Find which settings make the difference between two runs."),
     },
     "Manage": {
@@ -87,7 +89,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "token": ("token", "Create, list and revoke access tokens of a server."),
     },
 }
-"""Section -> command -> its module in `runner.cli.commands`, and its short help."""
+"""Section -> command -> its module in `runner.cli.commands`, or `_VIEW`; and its short help."""
 
 _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
 _NO_THREAD: Final = "can't start new thread"
@@ -197,19 +199,21 @@ class LazyGroup(CommandGroup):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command."""
-        for section in COMMANDS.values():
-            if cmd_name in section:
-                module = importlib.import_module(f"runner.cli.commands.{section[cmd_name][0]}")
-                command: click.Command = getattr(module, f"{cmd_name}_command")
-                return command
-        return super().get_command(ctx, cmd_name)
+        modules = {name: row[0] for section in COMMANDS.values() for name, row in section.items()}
+        if cmd_name not in modules:
+            return super().get_command(ctx, cmd_name)
+        if modules[cmd_name] == _VIEW:
+            return self.plugin(cmd_name)
+        module = importlib.import_module(f"runner.cli.commands.{modules[cmd_name]}")
+        command: click.Command = getattr(module, f"{cmd_name}_command")
+        return command
 
     def plugin(self, name: str) -> click.Command:
-        """Return the command of a view that an installed package adds."""
+        """Return the command of a view."""
         from runner.cli.views import command_of
-        from runner.views import installed_view
+        from runner.views import view_named
 
-        return command_of(installed_view(name))
+        return command_of(view_named(name))
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections from their short help, without an import."""

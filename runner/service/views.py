@@ -19,7 +19,7 @@ from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
 from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import RUN_ERRORS, error_docs, filled, media_docs
-from runner.views import VIEWS, installed_view
+from runner.views import VIEWS, view_named
 from runner.views.view import Given, Input, View
 
 api = APIRouter(
@@ -132,5 +132,5 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
     return {"choices": choices, "refusal": refusal}
 
 
-for _view in (*VIEWS.values(), *map(installed_view, installed_names())):
+for _view in (*VIEWS.values(), *map(view_named, installed_names())):
     _add_routes(_view)

@@ -13,15 +13,15 @@ from runner.util import plugins
 from runner.views import console, qtable, system, when, why
 from runner.views.view import View
 
-VIEWS: Final = {module.VIEW.name: module.VIEW for module in (console, qtable, system, when, why)}
-"""Name of a view -> the view."""
+VIEWS: Final = {module.VIEW.name: module.VIEW for module in (qtable, when, why, system, console)}
+"""Name of a view -> the view, in the order of tabs."""
 
 
 @cache  # reading the metadata of all packages takes 0.1 s
-def installed_view(name: str) -> View:
-    """Return the view of this name that an installed package adds.
+def view_named(name: str) -> View:
+    """Return the view of this name, shipped or added by an installed package.
 
     Raises:
         RunnerError: it cannot be imported.
     """
-    return plugins.load_plugin(plugins.VIEWS, name, View)
+    return VIEWS[name] if name in VIEWS else plugins.load_plugin(plugins.VIEWS, name, View)

@@ -66,6 +66,7 @@ VIEW: Final = View(
     qtable,
     button="Show the table",
     stage="replaying recorded steps",
+    needs="tables",
     counts_steps=False,
     has_default=True,
     file_ending=".npy",

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Protocol
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -89,6 +89,8 @@ class View:
     """What the command says that it does."""
     counts_steps: bool = True
     """Whether the function has the parameter `report`."""
+    needs: Literal["", "tables", "training"] = ""
+    """What a run needs for a tab of this page: Q-tables, or a training that the runner can repeat."""
     is_live: bool = False
     """Whether the answer changes while the run is running, so that the page loads it again."""
     has_default: bool = False

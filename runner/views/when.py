@@ -87,6 +87,7 @@ VIEW: Final = View(
     lead="The expression is evaluated after every training step. S and A are a state and an action, by "
     "number or by name; a step is EPISODE:T, or step:N by its number in training.",
     stage="searched",
+    needs="training",
     list_title="What an expression may contain",
     page_values=(("limit", _INTERVALS),),
 )

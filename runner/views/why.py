@@ -89,6 +89,7 @@ VIEW: Final = View(
     lead="A Q-value is exactly a weighted sum of recorded rewards and initial values. This page shows which "
     "ones, and by which moves they came.",
     page_values=(("limit", _STEPS),),
+    needs="training",
     exclusive_spool=True,
     refusal=_refusal,
 )

@@ -19,9 +19,8 @@ from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
 from runner.runs.run import Run
 from runner.service.pages.rendering import Page, Values, made
-from runner.util import humanize
-from runner.util.plugins import VIEWS, plugin_names
-from runner.views import installed_view
+from runner.util import humanize, plugins
+from runner.views import VIEWS, view_named
 
 StatusName = Annotated[str, Query(max_length=20, description="The status that the page shows.")]
 
@@ -31,21 +30,17 @@ TABS: Final = (
     ("episodes", "Episodes"),
     ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
-    ("qtable", "Q-table"),
-    ("when", "When?"),
-    ("why", "Why?"),
+    *((view.name, view.title) for view in VIEWS.values()),
     ("config", "Configuration"),
     ("code", "Code"),
     ("pictures", "Pictures"),
-    ("system", "System"),
-    ("console", "Console"),
     ("rerun", "Rerun"),
 )
 
 
 def installed_names() -> list[str]:
     """Return the names of the views that installed packages add; those of shipped pages stay as they are."""
-    return [name for name in plugin_names(VIEWS) if name not in dict(TABS)]
+    return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in dict(TABS)]
 
 
 @dataclass(frozen=True)
@@ -60,6 +55,8 @@ class RunHead:
     tags: tuple[str, ...]
     note: str
     tabs: tuple[tuple[str, str], ...]
+    lacking: tuple[str, ...]
+    """The tabs that it does not have for want of Q-tables."""
 
 
 class RunPage(Page):
@@ -75,15 +72,16 @@ def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_episodes = has_environment(run.file.config)
     has_tables = run.can_train_again or _has_recorded_tables(run)
+    needs = {"tables": has_tables, "training": run.can_train_again}
+    of_tables = {"learned": has_tables} | {
+        view.name: needs[view.needs] for view in VIEWS.values() if view.needs
+    }
     has_tab = {
+        **of_tables,
         "replay": has_episodes,
         "episodes": has_episodes,
         "evaluations": has_episodes,
         "rerun": has_episodes,
-        "learned": has_tables,
-        "qtable": has_tables,
-        "when": run.can_train_again,
-        "why": run.can_train_again,
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
         or (run.status == "running" and not run.can_train_again),
     }
@@ -97,8 +95,9 @@ def head_of(run: Run) -> RunHead:
         note=run.note,
         tabs=(
             *(tab for tab in TABS if has_tab.get(tab[0], True)),
-            *((name, installed_view(name).title) for name in installed_names()),
+            *((name, view_named(name).title) for name in installed_names()),
         ),
+        lacking=tuple(name for name, has in of_tables.items() if not has),
     )
 
 

@@ -302,7 +302,7 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
             writer.add_scalars("v", {str(i): i + step for i in range(100)}, step)
     page = page_of(client, "/runs/alone")
     tabs = re.findall(r'<li><a href="/runs/\w+/?(\w*)"', page[page.index("tabs") :])
-    assert tabs == ["", "config", "code", "system", "console"]
+    assert tabs == ["", "system", "console", "config", "code"]
     assert "Training steps" not in page
     curves = client.get("/api/v1/curves?run=alone").json()
     assert ([axis["label"] for axis in curves["axes"]], curves["axis"]) == (
