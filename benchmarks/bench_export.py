@@ -98,13 +98,13 @@ def logged_rate(recording: Path, path: Path) -> float:
     """Return steps a second of logging the same archetypes one by one, without computing anything."""
     import rerun as rr
 
-    from runner.export.rerun.tracks import new_stream
-
     with open_recording(recording) as opened:
         steps = next(opened.train.steps.blocks())[:LOGGED_STEPS]
     points, vectors = np.ones((36, 2), np.float32), np.ones((2, 2), np.float32)
     strips, bars = np.ones((2, 6, 2), np.float32), np.ones((12, 2, 2), np.float32)
-    stream = new_stream("logged")
+    stream = rr.RecordingStream("dualtaxi", recording_id="logged")
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
     stream.save(path)
     started = time.perf_counter()
     for record in steps:

@@ -75,16 +75,14 @@ def rerun(
       dualtaxi export rerun k3v9m2xq --all --force
       dualtaxi export rerun my-loop --episodes 0..5 --frames
     """
-    from runner.recording.reader import open_recording
-
     require_rerun("export rerun")
-    from runner.export.rerun.writing import export_runs
+    from runner.export.rerun.writing import export
 
     started = time.monotonic()
     path = to.path(run)
     require_new(path, to.force)
-    with open_recording(run.recording) as recording, compilation_notice(), stage_line("exporting") as stage:
-        (selection,) = export_runs([run], [recording], selected, path, stage)
+    with compilation_notice(), stage_line("exporting") as stage:
+        (selection,) = export([run], selected, path, stage)
     print_selection(selection)
     took = duration(time.monotonic() - started)
     text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,17 +26,19 @@ def cached_export(
     """
     folder = files.cache_folder() / EXPORTS
     path = folder / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_cache_key(runs, request)}.rrd"
-    with contextlib.ExitStack() as stack:
-        recordings = [stack.enter_context(open_recording(run.recording)) for run in runs]
-        if path.exists():
-            path.touch()
-            return path, [select(recording, request) for recording in recordings]
-        from runner.export.rerun.writing import export_runs
+    if path.exists():
+        path.touch()
+        selections = []
+        for run in runs:
+            with open_recording(run.recording) as recording:
+                selections.append(select(recording, request))
+        return path, selections
+    from runner.export.rerun.writing import export
 
-        with storage_errors(folder, f"set {CACHE_VARIABLE} to another folder"):
-            folder.mkdir(parents=True, exist_ok=True)
-            files.remove_oldest(folder, "*.rrd", keep=MAX_CACHED - 1)
-        return path, export_runs(runs, recordings, request, path, stage)
+    with storage_errors(folder, f"set {CACHE_VARIABLE} to another folder"):
+        folder.mkdir(parents=True, exist_ok=True)
+        files.remove_oldest(folder, "*.rrd", keep=MAX_CACHED - 1)
+    return path, export(runs, request, path, stage)
 
 
 def _cache_key(runs: Sequence[Run], request: Request) -> str:

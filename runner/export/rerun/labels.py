@@ -20,7 +20,7 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.scene import Scene
-from runner.export.rerun.tracks import Component, Floats, Points, Track, pairs, repeated
+from runner.export.rerun.tracks import Floats, Points, Track, pairs, repeated
 from runner.util.arrays import Records
 
 MAX_REWARDS: Final = 2_000
@@ -98,9 +98,8 @@ class GridLabels:
             for number, (text, colour) in enumerate(zip(self.texts, self._colours, strict=True))
         ]
         # As Arrow, because Rerun is slow to convert thousands of labels.
-        empty: Any = rr.AnnotationContext([]).context
-        context = pa.array([classes], empty.as_arrow_array().type)
-        return Track("", static=[[Component(rr.AnnotationContext.descriptor_context(), context)]])
+        context: Any = pa.array([classes], rr.components.AnnotationContext.arrow_type())
+        return Track("", static=[rr.AnnotationContext(context)])
 
     @cached_property
     def points(self) -> Points:
@@ -118,13 +117,15 @@ class GridLabels:
 
         Movers have their name and what happened to them.
         """
-        scene, state = self.scene, records["state"].astype(np.int64)
+        scene = self.scene
         assert scene is not None
-        movers = 2 * np.arange(len(scene.movers)) + scene.is_carrying[state]
+        carriers = scene.carriers[records["state"]]
+        is_carrying = (carriers[..., None] == np.array(scene.movers, np.int64)).any(axis=1)
+        movers = 2 * np.arange(len(scene.movers)) + is_carrying
         waiting = self._waiting + np.arange(len(scene.passengers))
         labels = [
             movers * len(self._masks) + np.searchsorted(self._masks, events)[:, None],
-            np.where(scene.is_carried[state], self._riding, waiting),
+            np.where(carriers[:, scene.passengers] >= 0, self._riding, waiting),
             self._t + np.minimum(records["t"], self._longest)[:, None],
         ]
         for i, first, distinct in self._rewards:
@@ -135,7 +136,7 @@ class GridLabels:
     def of_values(self, values: Floats) -> NDArray[np.uint16]:
         """Return the label of each value."""
         levels = np.rint(np.nan_to_num(values, posinf=np.inf, neginf=-np.inf) / self._unit) - self._lowest
-        return (self._levels + levels.clip(0, self._level_count - 1)).astype(np.uint16)
+        return (self._levels + levels.clip(0)).clip(max=len(self.texts) - 1).astype(np.uint16)
 
     def _add(self, texts: Sequence[str], colour: str = palette.MIDTONE) -> int:
         """Add texts; return the number of the first."""
@@ -146,13 +147,12 @@ class GridLabels:
 
     def _add_movers(self, scene: Scene) -> None:
         """Number each mover's label by whether it carries someone, and by the events of a step."""
-        for i, (mover, agent) in enumerate(zip(scene.movers, scene.mover_agents, strict=True)):
+        for i, (mover, agent) in enumerate(zip(scene.movers, scene.agents, strict=True)):
             for carried in ("", " + passenger"):
                 for mask in self._masks.tolist():
-                    events = _event_labels(scene.mdp, mask, agent)
-                    is_bad = any(event.startswith(BAD_SIGN) for event in events)
-                    text = ": ".join(filter(None, (scene.labels[mover] + carried, ", ".join(events))))
-                    self._add([text], palette.BAD if is_bad else palette.agent(i))
+                    events = ", ".join(_event_labels(scene.mdp, mask, agent))
+                    text = ": ".join(filter(None, (scene.labels[mover] + carried, events)))
+                    self._add([text], palette.BAD if BAD_SIGN in events else palette.agent(i))
 
     def _add_levels(self, low: float, high: float) -> None:
         """Number values to three digits of the greatest one, with a margin on both sides."""
@@ -165,10 +165,11 @@ class GridLabels:
         digits = max(0, -round(math.log10(self._unit)))
         texts = [f"{k * self._unit:.{digits}f}" for k in range(self._lowest, highest + 1)]
         texts[0], texts[-1] = f"≤ {texts[0]}", f"≥ {texts[-1]}"
-        self._levels, self._level_count = self._add(texts), len(texts)
+        self._levels = self._add(texts)
+        """The first level; the others are the last labels."""
 
 
-def _event_labels(mdp: Mdp, mask: int, agent: str) -> list[str]:
+def _event_labels(mdp: Mdp, mask: int, agent: str | None) -> list[str]:
     """Return the events of a mask that concern one agent, or all of them, each with a sign."""
     labels = []
     for bit, name in enumerate(mdp.event_names):

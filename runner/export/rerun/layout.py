@@ -40,7 +40,7 @@ Shown = rrb.View | rrb.Container
 
 def blueprint(runs: Sequence[Writer]) -> rrb.Blueprint:
     """Return the arrangement of runs, jobs above loops, with the panels around it."""
-    jobs = [run for run in runs if run.source.recording.has_tables]
+    jobs = [run for run in runs if run.recording.has_tables]
     parts = [_jobs(jobs)] if jobs else []
     parts += [_loop(run) for run in runs if run not in jobs]
     return rrb.Blueprint(
@@ -69,7 +69,7 @@ def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
             columns = [rrb.Vertical(*grid, row_shares=[3, 1]), middle, *columns]
         return rrb.Horizontal(*columns, column_shares=[4, 3, 4] if values else [1])
     halves = [
-        rrb.Horizontal(*grid, rrb.Tabs(*_group(job, "values", "events")), name=job.source.title)
+        rrb.Horizontal(*grid, rrb.Tabs(*_group(job, "values", "events")), name=job.title)
         for job in jobs
         if (grid := _group(job, "grid"))
     ]
@@ -94,12 +94,12 @@ def _loop(loop: Writer) -> rrb.Container:
     ]
     right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
     if not left:
-        return rrb.Vertical(right, name=loop.source.title)
+        return rrb.Vertical(right, name=loop.title)
     shown, shares = zip(*left, strict=True)
     column = rrb.Vertical(*shown, row_shares=shares)
-    recording = loop.source.recording
+    recording = loop.recording
     share = 3 if max(recording.environments, len(recording.agents)) > 1 else 2
-    return rrb.Horizontal(column, right, column_shares=[share, 3], name=loop.source.title)
+    return rrb.Horizontal(column, right, column_shares=[share, 3], name=loop.title)
 
 
 def _group(run: Writer, *groups: str) -> list[rrb.View]:
@@ -110,7 +110,7 @@ def _group(run: Writer, *groups: str) -> list[rrb.View]:
         if group in schema.PHASES:  # frames: environments by number
             of_group.sort(key=lambda shown: (len(shown[0].name), shown[0].name))
         for view, entities in of_group[: MAX_SHOWN.get(group)]:
-            views.append(_drawn(view, f"{run.source.root}/", entities, run.last, run.selection.focus))
+            views.append(_drawn(view, f"{run.root}/", entities, run.last, run.selection.focus))
     return views
 
 

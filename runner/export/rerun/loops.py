@@ -21,6 +21,7 @@ from runner.export.painting import decoded, redrawn
 from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.selection import MAX_MEMBERS
+from runner.export.rerun.steps import Batch
 from runner.export.rerun.tracks import Times, Track, TrackRow, TrackView, Writer, in_tracks, scalars, times_of
 from runner.export.values import FEW, acted, number_names, observed
 from runner.recording import schema
@@ -63,102 +64,66 @@ class Member(NamedTuple):
 
 
 class LoopTracks:
-    """Makes the tracks of a loop: an overview, lines of its steps, and pictures that are drawn of them."""
+    """Makes the tracks of a phase of a loop: episodes, lines of its steps, and pictures."""
 
-    def __init__(self, writer: Writer) -> None:
-        recording = self._recording = writer.source.recording
-        self._writer = writer
+    def __init__(self, writer: Writer, phase: str) -> None:
+        recording = self._recording = writer.recording
+        self._writer, self._phase, self._of_phase = writer, phase, recording.phase(phase)
         if len(recording.agents) > 1:
             agents = enumerate(recording.agents)
             self._members = [Member(i, entity_name(a), i, _numbers(recording, a), a) for i, a in agents]
         else:
             numbers, environments = _numbers(recording), range(recording.environments)
             self._members = [Member(i, self._environment(i), numbers=numbers) for i in environments]
-        self._pictured: dict[tuple[str, int], int] = {}
-        """The step of the last picture, by phase and environment."""
+        self._pictured: dict[int, int] = {}
+        """The step of the last picture of each environment."""
 
-    def overview(self) -> Iterator[Track]:
-        """Yield everything but the steps."""
-        recording = self._recording
-        for phase in schema.PHASES:
-            yield from self._episodes(phase)
-            yield from in_tracks(self._frames(phase), FRAMES_SENT)
-        yield from in_tracks(self._named(), 1)  # they may be large
-        texts = (
-            TrackRow(
-                "log",
-                _step(text["log_time"]),
-                rr.TextLog(f"{text['name']}: {text['message']}", level="INFO"),
-                LOG,
-            )
-            for text in recording.table(schema.LOG_TOPIC).decoded()
-        )
-        yield from in_tracks(texts)
-        for series, rows in recording.scalars():
-            names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
-            for name in dict.fromkeys(names.tolist()):
-                own = rows[names == name]
-                times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
-                values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
-                yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
-
-    def _frames(self, phase: str) -> Iterator[TrackRow]:
-        """Yield recorded frames, at the steps of their environments."""
-        recording, is_each_step = self._recording, frames_every(self._recording) == 1
-        for frame in recording.phase(phase).frames.decoded():
-            environment, _ = frame_place(frame)
-            later = recording.environments - 1 - environment
-            step = max(0, _step(frame["log_time"]) - later)
-            if later >= 0 and (self._is_later(phase, environment, step) or not is_each_step):
-                yield self._frame(phase, environment, step, _picture(frame["data"]))
-
-    def _named(self) -> Iterator[TrackRow]:
-        """Yield logged pictures and arrays."""
-        for image in self._recording.table(schema.IMAGE_TOPIC).decoded():
-            if data := _still(image["data"]):
-                name, view = entity_name(image["frame_id"]), rrb.Spatial2DView
-                step, shown = _step(image["log_time"]), _picture(data)
-                yield TrackRow(f"picture/{name}", step, shown, TrackView("picture", name, view))
-        for time, array in self._recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
-            name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
-            yield TrackRow(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
-
-    def _episodes(self, phase: str) -> Iterator[Track]:
-        """Yield returns and lengths: of a game one length, and the return of each agent."""
-        for block in self._recording.phase(phase).episodes.blocks():
+    @property
+    def still(self) -> Iterator[Track]:
+        """Everything but the steps: episodes and recorded frames."""
+        for block in self._of_phase.episodes.blocks():
             for member in self._members:
                 own = block[member.is_own(block)]
                 if len(own):
                     times = times_of(own["log_time"], episode=own["episode"])
-                    yield self._line(phase, member, "return", times, own["returns"][:, [member.column]])
-                    if member.column == 0:
+                    yield self._line(member, "return", times, own["returns"][:, [member.column]])
+                    if member.column == 0:  # agents have one length
                         named = member._replace(name="") if member.agent else member
-                        yield self._line(phase, named, "length", times, own["length"][:, np.newaxis])
+                        yield self._line(named, "length", times, own["length"][:, np.newaxis])
+        yield from in_tracks(self._frames(), FRAMES_SENT)
 
-    def lines(self, phase: str, steps: Records) -> Iterator[Track]:
+    def _frames(self) -> Iterator[TrackRow]:
+        """Yield recorded frames, at the steps of their environments."""
+        recording, is_each_step = self._recording, frames_every(self._recording) == 1
+        for frame in self._of_phase.frames.decoded():
+            environment, _ = frame_place(frame)
+            later = recording.environments - 1 - environment
+            step = max(0, _step(frame["log_time"]) - later)
+            if later >= 0 and (self._is_later(environment, step) or not is_each_step):
+                yield self._frame(environment, step, _picture(frame["data"]))
+
+    def of(self, batch: Batch) -> Iterator[Track]:
         """Yield rewards, observations, actions and extras of steps."""
-        recording = self._recording
-        extras = recording.phase(phase).extras.at(steps["step"])
+        recording, steps = self._recording, batch.records
+        extras = self._of_phase.extras.at(steps["step"])
         for member in self._members:
             is_own = member.is_own(steps)
             if not is_own.any():
                 continue
             own = steps[is_own]
             times = times_of(own["log_time"], episode=own["episode"], t=own["t"])
-            yield self._line(phase, member, "reward", times, own["rewards"][:, [member.column]])
+            yield self._line(member, "reward", times, own["rewards"][:, [member.column]])
             for quantity, names in member.numbers.items():
                 values = OBSERVED[quantity](recording, own)
                 parts = leaves("", values[member.agent] if member.agent else values)
                 numbers = np.concatenate([part.reshape(len(own), -1) for _, part in parts], axis=1)
-                yield self._line(phase, member, quantity, times, numbers, names)
+                yield self._line(member, quantity, times, numbers, names)
+            prefix = f"{member.agent}/" if member.agent else ""
             for name, values in extras.items():
-                agent, _, own_name = name.partition("/") if member.agent else (member.name, "", name)
-                if entity_name(agent) == (member.name or "_"):
-                    yield from self._extra(phase, member, own_name, values[is_own], times)
+                if name.startswith(prefix):
+                    yield from self._extra(member, name.removeprefix(prefix), values[is_own], times)
 
-    def _extra(
-        self, phase: str, member: Member, name: str, values: MaskedArray, times: Times
-    ) -> Iterator[Track]:
+    def _extra(self, member: Member, name: str, values: MaskedArray, times: Times) -> Iterator[Track]:
         """Yield a value that the loop recorded with steps: as lines, as bars if it is long, or as text."""
         is_given = ~np.ma.getmaskarray(values).reshape(len(values), -1)[:, 0]
         quantity = f"extra/{entity_name(name)}"
@@ -167,9 +132,9 @@ class LoopTracks:
             numbers = values.data.reshape(len(values), -1).astype(np.float64)
             numbers[~is_given] = np.nan
             names = [f"{name}[{i}]" for i in range(numbers.shape[1])]
-            yield self._line(phase, member, quantity, times, numbers, names)
+            yield self._line(member, quantity, times, numbers, names)
             return
-        entity, title = _entity(phase, member.name, quantity), f"{member.name} {name}".strip()
+        entity, title = _entity(self._phase, member.name, quantity), f"{member.name} {name}".strip()
         texts = TrackView("texts", title, rrb.TextDocumentView)
         bars = TrackView("bars", title, rrb.BarChartView)
         rows = []
@@ -182,24 +147,18 @@ class LoopTracks:
         yield from in_tracks(rows)
 
     def _line(
-        self,
-        phase: str,
-        member: Member,
-        quantity: str,
-        times: Times,
-        values: Array,
-        names: Sequence[str] = ("",),
+        self, member: Member, quantity: str, times: Times, values: Array, names: Sequence[str] = ("",)
     ) -> Track:
         """Return series, [rows, names]; the first also with how they are drawn, and in which view.
 
         A view shows a quantity of all environments; one of several numbers those of one environment.
         """
-        entity = _entity(phase, member.name, quantity)
+        entity = _entity(self._phase, member.name, quantity)
         if entity in self._writer.entities:
             return Track(entity, times, scalars(values))
-        colours, lines = phase_colours(phase, len(names)), names
+        colours, lines = phase_colours(self._phase, len(names)), names
         if len(names) == 1:
-            lines = [f"{phase} {member.name}".strip()]
+            lines = [f"{self._phase} {member.name}".strip()]
             if member.name:
                 shades = line_colours(min(len(self._members), MAX_MEMBERS))
                 colours = [shades[member.number % len(shades)]]
@@ -207,7 +166,7 @@ class LoopTracks:
         if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
             style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
         tab, title = OVERVIEW, quantity.removeprefix("extra/")
-        actions = self._recording.phase(phase).action_names(member.agent) if quantity == "action" else ()
+        actions = self._of_phase.action_names(member.agent) if quantity == "action" else ()
         if 0 < len(actions) <= FEW:
             space = self._recording.spaces["action"]
             least = least_number(space["spaces"][member.agent] if member.agent else space)
@@ -219,47 +178,80 @@ class LoopTracks:
 
     def drawn(self) -> Iterator[TrackRow]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
-        recording, selection = self._recording, self._writer.selection
-        trust = selection.trust
-        for phase, episodes in selection.drawn.items():
-            sources = {number: pictures.source_of(recording, phase, trust, number) for number in episodes}
-            notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
-            redrawable = pictures.PictureSource.REDRAWN
-            chosen = [number for number, (source, _) in sources.items() if source is redrawable]
-            number = 0
-            try:
-                for number, t, pixels in redrawn(recording, phase, chosen, trust) if chosen else ():
-                    if t == 0:
-                        after = [_step(time) for time in log_times_of(recording, phase, number)]
-                        times, place = [after[0] - 1, *after], recording.phase(phase).episode(number).place
-                        count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
-                        self._writer.stage(f"drawing {phase} episode {count}")
-                    if self._is_later(phase, place, times[t]):
-                        yield self._frame(phase, place, times[t], _picture(encoded_picture(pixels)))
-                    if t == len(after):  # nothing is shown until the next picture
-                        end = times[t] + recording.environments
-                        yield self._frame(phase, place, end, rr.Clear(recursive=False))
-            except CannotRedo as error:
-                notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
-            for note in notes:
-                selection.warnings.append(note)
-                yield TrackRow("log", self._writer.last, rr.TextLog(note, level="WARN"), LOG)
+        recording, phase, selection = self._recording, self._phase, self._writer.selection
+        trust, episodes = selection.trust, selection.drawn.get(phase, ())
+        sources = {number: pictures.source_of(recording, phase, trust, number) for number in episodes}
+        notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
+        redrawable = pictures.PictureSource.REDRAWN
+        chosen = [number for number, (source, _) in sources.items() if source is redrawable]
+        number = 0
+        try:
+            for number, t, pixels in redrawn(recording, phase, chosen, trust) if chosen else ():
+                if t == 0:
+                    after = [_step(time) for time in log_times_of(recording, phase, number)]
+                    times, place = [after[0] - 1, *after], self._of_phase.episode(number).place
+                    count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
+                    self._writer.stage(f"drawing {phase} episode {count}")
+                if self._is_later(place, times[t]):
+                    yield self._frame(place, times[t], _picture(encoded_picture(pixels)))
+                if t == len(after):  # nothing is shown until the next picture
+                    yield self._frame(place, times[t] + recording.environments, rr.Clear(recursive=False))
+        except CannotRedo as error:
+            notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
+        for note in notes:
+            selection.warnings.append(note)
+            yield TrackRow("log", self._writer.last, rr.TextLog(note, level="WARN"), LOG)
 
-    def _is_later(self, phase: str, environment: int, step: int) -> bool:
+    def _is_later(self, environment: int, step: int) -> bool:
         """Return whether a picture is later than the one before.
 
         With a picture at each step, that of a reset must not hide that of the last step.
         """
-        before = self._pictured.get((phase, environment), -1)
-        self._pictured[phase, environment] = step
+        before = self._pictured.get(environment, -1)
+        self._pictured[environment] = step
         return before < step
 
-    def _frame(self, phase: str, environment: int, step: int, shown: rr.AsComponents) -> TrackRow:
-        entity = _entity(phase, self._environment(environment), "frame")
-        return TrackRow(entity, step, shown, TrackView(phase, entity.replace("/", " "), rrb.Spatial2DView))
+    def _frame(self, environment: int, step: int, shown: rr.AsComponents) -> TrackRow:
+        entity = _entity(self._phase, self._environment(environment), "frame")
+        view = TrackView(self._phase, entity.replace("/", " "), rrb.Spatial2DView)
+        return TrackRow(entity, step, shown, view)
 
     def _environment(self, number: int) -> str:
         return f"env_{number}" if self._recording.environments > 1 else ""
+
+
+def logged_tracks(recording: Recording) -> Iterator[Track]:
+    """Yield what a loop logged: pictures, arrays, texts and numbers."""
+    yield from in_tracks(_named(recording), 1)  # they may be large
+    texts = (
+        TrackRow(
+            "log",
+            _step(text["log_time"]),
+            rr.TextLog(f"{text['name']}: {text['message']}", level="INFO"),
+            LOG,
+        )
+        for text in recording.table(schema.LOG_TOPIC).decoded()
+    )
+    yield from in_tracks(texts)
+    for series, rows in recording.scalars():
+        names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
+        for name in dict.fromkeys(names.tolist()):
+            own = rows[names == name]
+            times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
+            values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
+            yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
+
+
+def _named(recording: Recording) -> Iterator[TrackRow]:
+    """Yield logged pictures and arrays."""
+    for image in recording.table(schema.IMAGE_TOPIC).decoded():
+        if data := _still(image["data"]):
+            name, view = entity_name(image["frame_id"]), rrb.Spatial2DView
+            step, shown = _step(image["log_time"]), _picture(data)
+            yield TrackRow(f"picture/{name}", step, shown, TrackView("picture", name, view))
+    for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
+        name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
+        yield TrackRow(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
 
 
 def _entity(*parts: str) -> str:

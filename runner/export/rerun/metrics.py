@@ -21,11 +21,9 @@ from runner.export.rerun.tracks import (
     Floats,
     Times,
     Track,
-    TrackSource,
     TrackView,
-    columns,
+    Writer,
     scalars,
-    texts,
     times_of,
 )
 from runner.recording import schema
@@ -48,9 +46,9 @@ Lines = tuple[str, Times, Array, Sequence[str]]
 """The path of an entity, its times, the values of its lines, [rows, lines], and their names."""
 
 
-def metric_tracks(source: TrackSource) -> Iterator[Track]:
+def metric_tracks(run: Writer) -> Iterator[Track]:
     """Yield the tracks of all metrics of a job."""
-    recording, evaluations = source.recording, source.recording.eval.all_metrics()
+    recording, evaluations = run.recording, run.recording.eval.all_metrics()
     reports = sorted([*recording.train.all_metrics(), *evaluations], key=lambda row: int(row["log_time"]))
     learners, events = [spoken(name) for name in recording.agents], list(recording.mdp.event_names)
     for path, times, values, names in itertools.chain(
@@ -60,14 +58,14 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
     ):
         phase, *_, name = path.split("/")
         width = 1.2 if phase == "train" else 2.2
-        colours = phase_colours(phase, len(names), source.tint)
+        colours = phase_colours(phase, len(names), run.tint)
         if name in SCHEDULES:
             number = SCHEDULES.index(name)
-            colours = [line_colours(1 + len(SCHEDULES), source.tint)[1 + number]]
+            colours = [line_colours(1 + len(SCHEDULES), run.tint)[1 + number]]
             width = 3.0 - number  # visible on top of each other where their values are equal
         elif name in _ONE_PHASE and len(names) > 1:
-            colours = line_colours(len(names), source.tint)
-        label = f"{recording.run_id} " if source.tint else ""
+            colours = line_colours(len(names), run.tint)
+        label = f"{recording.run_id} " if run.tint else ""
         static = [series_lines([label + name for name in names], colours, width)]
         title = next((title for title, paths in PLOTS if path in paths), "")
         view = TrackView("plots", title, options={"plot_legend": rrb.PlotLegend(visible=True)})
@@ -82,22 +80,28 @@ def metric_tracks(source: TrackSource) -> Iterator[Track]:
         yield log_track("eval/events", _times(evaluations), lines)
 
 
-def mark_tracks(source: TrackSource) -> Iterator[Track]:
+def mark_tracks(run: Writer) -> Iterator[Track]:
     """Yield the marks of a run at their steps; those at steps that it does not have are left out."""
     lines, times = [], []
-    for mark in source.marks:
+    for mark in run.marks:
         with contextlib.suppress(RecordingError):
-            steps = source.recording.phase(mark.phase).episode(mark.episode)
+            steps = run.recording.phase(mark.phase).episode(mark.episode)
             times.append(steps.one(min(mark.t, len(steps) - 1))["log_time"])
             lines.append(" ".join(["mark", mark.at, mark.text, *map("[{}]".format, mark.tags)]))
     if lines:
         yield log_track("marks", times_of(times), lines)
 
 
-def log_track(entity: str, times: Times, lines: Sequence[str], levels: Sequence[str] = ()) -> Track:
+def log_track(
+    entity: str,
+    times: Times,
+    lines: Sequence[str],
+    levels: Sequence[str] = (),
+    view: TrackView | None = EVENTS,
+) -> Track:
     """Return a track of lines of the log, by default of the level INFO."""
-    levels = levels or ["INFO"] * len(lines)
-    return Track(entity, times, columns(rr.TextLog, text=texts(lines), level=texts(levels)), view=EVENTS)
+    columns = rr.TextLog.columns(text=lines, level=levels or ["INFO"] * len(lines))
+    return Track(entity, times, columns, view=view)
 
 
 def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iterator[Lines]:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from runner.drawing import palette
-from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.metrics import series_lines
@@ -28,19 +27,16 @@ from runner.export.rerun.tracks import (
     TrackView,
     agent_colours,
     centred,
-    cleared,
     columns,
     grey_text,
     pairs,
     repeated,
     scalars,
     text_track,
-    times_of,
 )
 from runner.recording.reader import Recording
-from runner.replay.step_replay import StateProbe
 from runner.replay.tables import TableReplay, are_within, known_steps
-from runner.util.arrays import Ints, Records
+from runner.util.arrays import Ints
 
 NAME_X: Final = 1.0
 BAR_LEFT: Final = 2.5
@@ -68,65 +64,63 @@ class ValueReader:
     """Reads the Q-values at the steps of a recorded job, with maps of placements if there are any."""
 
     def __init__(self, recording: Recording, scene: Scene | None) -> None:
-        self._recording = recording
-        self._mdp: Mdp = recording.mdp
+        self._recording, mdp = recording, recording.mdp
         placements = scene.placements if scene else None
-        self._context = placements.context if placements else np.zeros(self._mdp.states, np.int64)
+        self._context = placements.context if placements else np.zeros(mdp.states, np.int64)
         self._states = placements.states if placements else np.empty((1, 0), np.int32)
         self._known = known_steps(recording)
         self._replay: TableReplay | None = None
-        self._last = (-1, -1)
+        self._last = (-2, -1)
         """Time and context of the step before."""
 
-    def batches(self, phase: str, steps: Records, *numbers: Ints) -> Iterator[Batch]:
-        """Yield steps in parts with known or unknown values, as they were before the update of each step.
+    def batches(self, batch: Batch, trained: Ints, stride: int) -> Iterator[Batch]:
+        """Yield a batch in parts with known or unknown values, as they were before the update of each step.
 
-        The numbers are those of a `Batch`, and the training steps before each step.
+        `trained` are the training steps before each step, and `stride` the number of updates that it makes.
         """
-        trained = numbers[-1]
         is_known = are_within(self._known, trained)
-        edges = np.flatnonzero(np.diff(is_known)) + 1
-        for part, *own, before, known in zip(
-            *(np.split(rows, edges) for rows in (steps, *numbers, is_known)), strict=True
-        ):
-            values = self._values(part, before, int(phase == "train")) if known[:1].any() else ()
-            yield Batch(part, *own, *values)
-
-    def _values(self, steps: Records, trained: Ints, stride: int) -> tuple[Any, ...]:
-        """Return the values of a `Batch`; `stride` is the number of updates that a step makes."""
-        context, times = self._context[steps["state"]], times_of(steps["log_time"])["step"]
-        # Maps where an episode begins, the context changes, or steps are left out.
-        has_map = (steps["t"] == 0) | (np.diff(context, prepend=self._last[1]) != 0)
-        has_map |= np.diff(times, prepend=self._last[0]) != 1
-        self._last = int(times[-1]), int(context[-1])
-        rows = np.flatnonzero(has_map)
-        shape = len(rows), len(self._recording.agents), self._states.shape[1]
-        maps = np.empty(shape, np.float32), np.empty(shape, np.int32)
-        probe = StateProbe(rows, self._states[context[rows]], *maps)
-        replay = self._replay = self._replay or TableReplay(self._recording, int(trained[0]))
-        tables = replay.empty_rows(len(steps))
-        edges = [0, *np.flatnonzero(np.diff(trained) != stride) + 1, len(steps)]
+        edges = [0, *np.flatnonzero(np.diff(is_known)) + 1, len(trained)]
         for start, stop in pairwise(edges):
+            rows = slice(start, stop)
+            part = Batch(batch.records[rows], batch.at(rows), batch.number[rows])
+            yield self._with_values(part, trained[rows], stride) if is_known[start] else part
+
+    def _with_values(self, batch: Batch, trained: Ints, stride: int) -> Batch:
+        """Return a batch with values, and with maps where anything but the movers changes."""
+        steps, context = batch.records, self._context[batch.records["state"]]
+        is_new = batch.starts(self._last[0]) | (np.diff(context, prepend=self._last[1]) != 0)
+        is_new |= steps["t"] == 0
+        self._last = int(batch.times["step"][-1]), int(context[-1])
+        replay = self._replay = self._replay or TableReplay(self._recording, int(trained[0]))
+        tables, learned = replay.empty_rows(len(steps)), replay.learner.tables
+        map_rows = np.flatnonzero(is_new)
+        shape = len(map_rows), len(learned.value), self._states.shape[1]
+        value, greedy = np.empty(shape, np.float32), np.empty(shape, np.int32)
+        maps = zip(value, greedy, self._states[context[map_rows]], strict=True)
+        leaps = np.flatnonzero(np.diff(trained) != stride) + 1
+        for start, stop in pairwise(np.unique([0, *leaps, *map_rows, len(steps)]).tolist()):
             if replay.step != trained[start]:
                 replay.seek(int(trained[start]))
-            own = probe.between(start, stop)
+            if is_new[start]:
+                best, choice, states = next(maps)
+                best[:] = np.where(states < 0, np.nan, learned.value[:, states])
+                choice[:] = np.where(states < 0, -1, learned.greedy[:, states])
             if stride:
-                replay.apply(steps[start:stop], tables[start:stop], own)
+                replay.apply(steps[start:stop], tables[start:stop])
             else:
-                replay.read(own)
                 tables[start:stop] = replay.values_in(steps["state"][start:stop])
-        return *self._by_agent(tables), has_map, *maps
+        return Batch(*batch[:3], *self._by_agent(tables), map_rows, value, greedy)
 
     def _by_agent(self, tables: Floats) -> tuple[Floats, Ints]:
         """Return values and greedy actions by agent, of rows by learner."""
-        counts = self._mdp.action_counts
+        counts = self._recording.mdp.action_counts
         if tables.shape[1] == len(counts):
             own = [tables[:, i, :count] for i, count in enumerate(counts)]
             return np.concatenate(own, axis=1), np.stack([q.argmax(axis=1) for q in own], axis=1)
         joint = tables[:, 0].reshape(-1, *counts)
         axes = set(range(1, joint.ndim))
         best = [joint.max(axis=tuple(axes - {axis})) for axis in sorted(axes)]
-        return np.concatenate(best, axis=1), self._mdp.own_actions[tables[:, 0].argmax(axis=1)]
+        return np.concatenate(best, axis=1), self._recording.mdp.own_actions[tables[:, 0].argmax(axis=1)]
 
 
 class ValueTracks:
@@ -134,7 +128,6 @@ class ValueTracks:
 
     def __init__(self, phase: str, labels: GridLabels) -> None:
         self._phase, self._labels, mdp = phase, labels, labels.mdp
-        self._is_shown = False
         agents, self._own_actions = len(mdp.agents), mdp.own_actions
         self._agent = np.repeat(np.arange(agents), mdp.action_counts)
         """[values]: the agent of each value."""
@@ -142,8 +135,8 @@ class ValueTracks:
         self._explored_bit = np.arange(agents) * (len(labels.learners) == agents)
         y = self._y = 1.0 + np.arange(len(self._agent)) + _AGENT_GAP * self._agent
         """[values]: the row of each value in the table, from top to bottom."""
-        self._points = pairs((x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y)
-        """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
+        # Of each action's number, then of its mark as greedy, then of its mark as chosen.
+        positions = [(x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y]
         words, lines, colours = [], [], agent_colours(range(agents))
         for i, names in enumerate(numbered_actions(mdp)):
             agent, rows = spoken(mdp.agents[i]), y[self._agent == i]
@@ -161,7 +154,7 @@ class ValueTracks:
         words_style = rr.Points2D(points, labels=texts, colors=tints, radii=0.0, show_labels=True)
         style = [
             rr.LineStrips2D.from_fields(colors=agent_colours(self._agent.tolist()), radii=0.22),
-            rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=40.0),
+            rr.Points2D(positions, radii=0.0, show_labels=True, draw_order=40.0),
             series_lines(lines),
         ]
         self.still = [
@@ -171,13 +164,7 @@ class ValueTracks:
         """What never changes; the words around the table for both phases."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
-        """Yield the values of each step of a batch as they were before its update; none where unknown."""
-        if not len(batch.values):
-            if self._is_shown:
-                yield from cleared([f"{self._phase}/q", f"{self._phase}/map"], batch.times()["step"][:1])
-            self._is_shown = False
-            return
-        self._is_shown = True
+        """Yield the values of each step of a batch as they were before its update."""
         q, labels, first, agent = batch.values, self._labels, self._first, self._agent
         n, count = q.shape
         own = self._own_actions[batch.records["action"]]
@@ -195,11 +182,7 @@ class ValueTracks:
         bars[:, :, 1, 0] = BAR_LEFT + np.ceil((q - low[:, agent]) * scale[:, agent]) / _BAR_FRACTION
         bars[..., 1] = self._y[:, None]
         shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
-        yield Track(f"{self._phase}/q", batch.times(), [*scalars(q), *shown])
-        rows = np.flatnonzero(batch.has_map)  # the points never change, but are cleared with the rest
-        if len(rows):
-            points = repeated(self._points, len(rows))
-            yield Track(f"{self._phase}/q", batch.times(rows), columns(rr.Points2D, positions=points))
+        yield Track(f"{self._phase}/q", batch.times, [*scalars(q), *shown])
 
 
 class MapTracks:
@@ -210,7 +193,7 @@ class MapTracks:
         self._learner, self._path, self._placements = learner, f"{phase}/map/{name}", placements
         is_joint = len(labels.learners) != len(mdp.agents)
         agents = [*range(len(mdp.agents))] if is_joint else [learner]
-        movers, agent_name = scene.mover_agents, mdp.agents[agents[0]]
+        movers, agent_name = scene.agents, mdp.agents[agents[0]]
         self._order = placements.order(movers.index(agent_name) if agent_name in movers else 0)
         row, column = np.divmod(np.arange(len(self._order)), placements.width)
         centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
@@ -251,35 +234,27 @@ class MapTracks:
         """What never changes; the frame for both phases and all learners."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
-        """Yield where each step of a batch is in the map, and the maps that there are; none if unknown."""
-        if not len(batch.values):
-            return
+        """Yield where each step of a batch is in the map, and the maps that there are."""
         state, path, placements = batch.records["state"], self._path, self._placements
         here = self._here.take(state, axis=0)[:, None]
-        yield Track(f"{path}/here", batch.times(), columns(rr.Boxes2D, centers=here))
-        rows = np.flatnonzero(batch.has_map)
-        if not (n := len(rows)):
+        yield Track(f"{path}/here", batch.times, columns(rr.Boxes2D, centers=here))
+        if not (n := len(batch.map_rows)):
             return
-        times, maps = batch.times(rows), (batch.value_maps, batch.greedy_maps)
+        times, maps = batch.at(batch.map_rows), (batch.value_maps, batch.greedy_maps)
         values, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
         with np.errstate(all="ignore"):
             low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
         ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
-        image = [
-            *columns(rr.DepthImage, buffer=np.ascontiguousarray(values).view(np.uint8)[:, None]),
-            *rr.DepthImage.columns(depth_range=np.nan_to_num(ranges)),
-        ]
+        buffers = np.ascontiguousarray(values).view(np.uint8)
+        image = rr.DepthImage.columns(buffer=buffers, depth_range=np.nan_to_num(ranges))
         vectors = self._arrows[:, greedy].swapaxes(0, 1).reshape(n, -1, 2)
         letters = self._letters[:, greedy].swapaxes(0, 1)
         is_letter = letters >= 0
         points = repeated(self._origins - np.array([0.0, _LETTER_RISE], np.float32), n)
-        stops = columns(
-            rr.Points2D,
-            is_letter.sum(axis=(1, 2)),
-            positions=points[is_letter],
-            class_ids=letters[is_letter].astype(np.uint16),
-        )
-        contexts = placements.names[placements.context[state[rows]]]
+        stops = rr.Points2D.columns(
+            positions=points[is_letter], class_ids=letters[is_letter].astype(np.uint16)
+        ).partition(is_letter.sum(axis=(1, 2)))
+        contexts = placements.names[placements.context[state[batch.map_rows]]]
         labels = [
             f"as of step {time:,}\n{context}"
             for time, context in zip(times["step"].tolist(), contexts, strict=True)

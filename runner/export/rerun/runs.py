@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import rerun as rr
 
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import GridLabels
-from runner.export.rerun.loops import FRAMES_SENT, LoopTracks
+from runner.export.rerun.loops import FRAMES_SENT, LoopTracks, logged_tracks
 from runner.export.rerun.metrics import EVENTS, mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
@@ -27,6 +27,7 @@ from runner.export.rerun.tracks import (
     in_tracks,
     scalars,
     text_track,
+    times_of,
 )
 from runner.recording import schema
 from runner.recording.turns import taken
@@ -40,24 +41,25 @@ class RunReader:
     """Reads a run as tracks: an overview, of which all views of a job follow, then its steps."""
 
     def __init__(self, writer: Writer) -> None:
-        recording, selection = writer.source.recording, writer.selection
+        recording, spans = writer.recording, writer.selection.by_phase
         self.writer, self._recording, self._is_job = writer, recording, recording.has_tables
-        self._loop = None if self._is_job else LoopTracks(writer)
         scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
-        self._makers: dict[str, list[StepTracks | ValueTracks | MapTracks]] = {}
+        self._makers: dict[str, list[Any]] = {
+            phase: [] if self._is_job else [LoopTracks(writer, phase)] for phase in spans
+        }
         """Makers of the tracks of each phase: of the steps, and of the Q-values at them."""
+        self._labels: GridLabels | None = None
         self._edges: set[int] = set()
         """First steps of the stretches of time that were sent, and the steps after their last ones."""
         if self._is_job:
-            reports = [*recording.train.all_metrics()[-1:], *recording.eval.all_metrics()[-1:]]
-            steps = sum(phase.steps.count() for phase in recording.phases)
-            writer.last = max([steps, *(row["log_time"] // schema.STEP_NANOSECONDS for row in reports)])
-        if not (selection.steps and (scene or self._is_job)):
+            writer.last = sum(phase.steps.count() for phase in recording.phases)
+        if not (writer.selection.steps and (scene or self._is_job)):
             return
         bounds = [0.0, *(b for q in recording.snapshots() for b in (q.values.min(), q.values.max()))]
         labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
-        for phase in (phase for phase, spans in selection.by_phase.items() if spans):
-            makers = self._makers[phase] = [StepTracks(phase, writer.source.title, labels)]
+        for phase in filter(spans.get, spans):
+            makers = self._makers[phase]
+            makers.append(StepTracks(phase, writer.title, labels))
             if self._is_job:
                 makers.append(ValueTracks(phase, labels))
                 if scene and scene.placements:
@@ -66,59 +68,60 @@ class RunReader:
 
     def overview(self) -> Iterator[Track]:
         """Yield everything but steps, and what never changes of them."""
-        source = self.writer.source
-        yield from self._loop.overview() if self._loop else metric_tracks(source)
-        yield from mark_tracks(source)
-        if not self._makers:
-            return
-        yield self._labels.track()
-        if self._scene:
-            view = grid_view(source.title, self._scene)
-            yield from background(self._scene, view)
-            if self._is_job:
-                text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
-                yield Track("notice/text", static=[text], view=view)
+        writer = self.writer
+        yield from metric_tracks(writer) if self._is_job else logged_tracks(self._recording)
+        yield from mark_tracks(writer)
+        if self._labels:
+            yield self._labels.track()
+            if self._scene:
+                view = grid_view(writer.title, self._scene)
+                yield from background(self._scene, view)
+                if self._is_job:
+                    text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
+                    yield Track("notice/text", static=[text], view=view)
         for phase, makers in self._makers.items():
-            if self._is_job:
+            if self._is_job and makers:
                 yield Track(f"{phase}/events", view=EVENTS)
             for maker in makers:
                 yield from maker.still
 
     def steps(self) -> Iterator[Track]:
         """Yield the selected steps, then pictures that are drawn of them."""
-        names = [f"reward {spoken(name)}" for name in self._recording.agents]
-        values = ValueReader(self._recording, self._scene) if self._is_job and self._makers else None
-        for phase, spans in self.writer.selection.by_phase.items():
+        recording, is_job, scene = self._recording, self._is_job, self._scene
+        names = [f"reward {spoken(name)}" for name in recording.agents]
+        values = ValueReader(recording, scene) if is_job and self._labels else None
+        for phase, makers in self._makers.items():
             style = [series_lines(names, phase_colours(phase, len(names)))]
-            makers, batches = self._makers.get(phase, ()), self._batches(phase, spans, values)
-            edges: set[int] = set()
-            for batch in _prefetched(batches) if self._is_job else batches:
-                if self._loop:
-                    yield from self._loop.lines(phase, batch.records)
-                else:
-                    yield Track(f"{phase}/reward", batch.times(), scalars(batch.records["rewards"]), style)
-                for maker in makers:
+            parts = ("grid", "q", "map") if is_job else ("grid",)
+            edges: dict[str, set[int]] = {part: set() for part in parts if self._labels}
+            batches = self._batches(phase, values)
+            for batch in _prefetched(batches) if is_job else batches:
+                if is_job:
+                    yield Track(f"{phase}/reward", batch.times, scalars(batch.records["rewards"]), style)
+                has_values = len(batch.values) > 0
+                for maker in makers[:1] if is_job and not has_values else makers:
                     yield from maker.of(batch)
-                edges ^= batch.edges()  # no edge where a stretch continues the one before
-            if makers:
-                self._edges ^= edges
-                parts = ("q", "map", "grid") if self._is_job else ("grid",)
-                # A job's last step stays in view.
-                last = self.writer.last if self._is_job else np.inf
-                stops = [stop for stop in sorted(edges)[1::2] if stop <= last]
-                yield from cleared([f"{phase}/{part}" for part in parts], stops)
-        if self._loop:
-            yield from in_tracks(self._loop.drawn(), FRAMES_SENT)
-        elif self._scene and self._makers:
-            yield from self._notice(self._scene.columns / 2, self._scene.rows / 2)
+                for part in edges if has_values else [*edges][:1]:
+                    edges[part] ^= batch.edges()  # no edge where a stretch continues the one before
+            self._edges ^= edges.get("grid", set())
+            # A job's last step stays in view.
+            last = self.writer.last if is_job else np.inf
+            for part, steps in edges.items():
+                stops = [stop for stop in sorted(steps)[1::2] if stop <= last]
+                yield from cleared(f"{phase}/{part}", stops)
+        if not is_job:
+            for maker, *_ in self._makers.values():
+                yield from in_tracks(maker.drawn(), FRAMES_SENT)
+        elif scene and self._labels:
+            yield from self._notice(scene.columns / 2, scene.rows / 2)
 
-    def _batches(self, phase: str, spans: Sequence[range], values: ValueReader | None) -> Iterator[Batch]:
+    def _batches(self, phase: str, values: ValueReader | None) -> Iterator[Batch]:
         """Yield the steps of a phase after checking them, at most a batch of each environment at a time."""
         recording, train = self._recording, episodes_of(self._recording, "train")
         plan = recording.config["evaluation"] if self._is_job else None
         trials = int(plan["trials"]) if plan else 2**63 - 1
-        for steps in self._blocks(phase, spans):
-            if self._makers:
+        for steps in self._blocks(phase, self.writer.selection.by_phase[phase]):
+            if self._labels:
                 recording.mdp.check_steps(steps, str(recording.path), schema.PHASE_NAMES[phase])
             trained, episode = (steps[name].astype(np.int64) for name in ("step", "episode"))
             number = episode
@@ -126,10 +129,11 @@ class RunReader:
                 number = episode % trials
                 trained = steps["log_time"].astype(np.int64) // schema.STEP_NANOSECONDS - 1 - trained
                 episode = train.before(trained)
+            batch = Batch(steps, times_of(steps["log_time"], episode=episode, t=steps["t"]), number)
             if values is None:
-                yield Batch(steps, episode, number)
+                yield batch
             else:
-                yield from values.batches(phase, steps, episode, number, trained)
+                yield from values.batches(batch, trained, int(phase == "train"))
 
     def _blocks(self, phase: str, spans: Sequence[range]) -> Iterator[Records]:
         """Yield the steps of a phase in blocks of bounded size; values that vary in size as they are read."""
@@ -153,7 +157,7 @@ class RunReader:
         if len(gaps):
             words = ["no steps of this time were exported"] * len(gaps)
             yield text_track(entity, {"step": gaps[:, 0]}, (x, y), words)
-            yield from cleared([entity], gaps[gaps[:, 1] <= last, 1])
+            yield from cleared(entity, gaps[gaps[:, 1] <= last, 1])
 
 
 def _prefetched(items: Iterable[T]) -> Iterator[T]:

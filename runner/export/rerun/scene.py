@@ -57,50 +57,44 @@ class Scene:
         """`cells`: where each thing is in each state."""
         carriers = self.carriers = mdp.carriers.astype(np.int64)
         things, self.rows, self.columns = description["things"], description["rows"], description["columns"]
-        self.labels = [str(thing["label"]) for thing in things]
+        self.labels = [thing["label"] for thing in things]
         self.movers, self.goals = (
             [i for i, thing in enumerate(things) if thing["kind"] == kind] for kind in ("mover", "goal")
         )
         """Indices of the things that agents move, and of goals."""
         self.passengers = [i for i in range(len(things)) if i not in self.movers + self.goals]
-        self.mover_agents = [str(things[mover].get("agent", "")) for mover in self.movers]
-        """The name of the agent that moves each mover; empty for none."""
-        centres = np.stack((cells % self.columns + 0.5, cells // self.columns + 0.5), 2).astype(np.float32)
-        self.goal_points = centres[:, self.goals]
-        """[S, goals, 2]: the centre of each goal's cell."""
-        offsets = pairs((x, x * 0.6 - 0.05) for x in centred(len(self.movers), _SPACING))
-        self.mover_points = np.ascontiguousarray(centres[:, self.movers] + offsets)
+        self.agents = [things[mover].get("agent") for mover in self.movers]
+        """The name of the agent that moves each mover; None for none."""
+        corners = np.stack((cells % self.columns, cells // self.columns), 2)
+        self.centres = (corners + 0.5).astype(np.float32)
+        """[S, things, 2]: the centre of each thing's cell."""
+        places = self.centres.copy()
+        places[:, self.movers] += pairs((x, x * 0.6 - 0.05) for x in centred(len(self.movers), _SPACING))
+        places[:, self.passengers] += np.array([0.2, 0.26], np.float32)
+        rides = np.isin(carriers, self.movers)[..., None]
+        riding = np.where(rides, np.take_along_axis(places, carriers.clip(0)[..., None], 1), places)
+        self.mover_points = places[:, self.movers]
         """[S, movers, 2]: where each mover is drawn."""
-        passengers = centres[:, self.passengers] + np.array([0.2, 0.26], np.float32)
-        shapes: list[tuple[int, SceneShape]] = []
-        for i, mover in enumerate(self.movers):
-            rides = carriers[:, self.passengers, None] == mover
-            passengers = np.where(rides, self.mover_points[:, i : i + 1], passengers)
-            body = CAR if self.labels[mover].split(" ")[0] in VEHICLES else PAWN
-            shapes += [(i, shape._replace(colour=shape.colour or palette.agent(i))) for shape in body]
-        people = range(len(self.movers), len(self.movers + self.passengers))
-        shapes += [(i, shape) for i in people for shape in PERSON]
-        self.shapes = [shape for _, shape in shapes]
-        """The boxes that are drawn."""
-        self.owners = [owner for owner, _ in shapes]
-        """The number of the mover or passenger that each box belongs to."""
-        self.points = np.concatenate((self.mover_points, passengers), axis=1)
+        self.points = np.concatenate((self.mover_points, riding[:, self.passengers]), axis=1)
         """[S, movers + passengers, 2]: where each is drawn."""
+        labels = [self.labels[mover].split(" ")[0] for mover in self.movers]
+        bodies = [CAR if label in VEHICLES else PAWN for label in labels] + [PERSON] * len(self.passengers)
+        self.shapes = [shape for body in bodies for shape in body]
+        """The boxes that are drawn."""
+        self.owners = [owner for owner, body in enumerate(bodies) for _ in body]
+        """The number of the mover or passenger that each box belongs to."""
         self.shape_centres = self.points[:, self.owners] + pairs(shape.offset for shape in self.shapes)
         """[S, shapes, 2]: the centre of each shape."""
-        self.is_carrying = (carriers[..., None] == np.array(self.movers, np.int64)).any(axis=1)
-        """[S, movers]: whether a mover carries something."""
-        self.is_carried = carriers[:, self.passengers] >= 0
-        """[S, passengers]: whether something carries the passenger."""
         actions = description["actions"] if action_names(mdp) else ()
-        moves = [action.get("move") or (0, 0) for action in actions] or [(0, 0)] * max(mdp.action_counts)
-        self.stops = [own for own, move in enumerate(moves) if actions and not any(move)]
+        moves = [action.get("move") or (0, 0) for action in actions]
+        self.stops = [own for own, move in enumerate(moves) if not any(move)]
         """Actions of an agent that are no moves, such as a pickup, as far as actions have names."""
+        moves = moves or [(0, 0)] * max(mdp.action_counts)
         self.own_moves = pairs([*(move[::-1] for move in moves), (0, 0)]) * np.float32(_BLOCKED_ARROW)
         """[own actions + 1, 2]: a short arrow for an agent's action; zero if it is no move, or none."""
         self.moves = np.zeros((mdp.joint_actions, len(self.movers), 2), np.float32)
         """[J, movers, 2]: the arrow of each mover's own action."""
-        for i, agent in enumerate(self.mover_agents):
+        for i, agent in enumerate(self.agents):
             if agent in mdp.agents:
                 self.moves[:, i] = self.own_moves[mdp.own_actions[:, mdp.agents.index(agent)]]
 
@@ -134,11 +128,10 @@ class Placements:
         keys, context = np.unique(where, axis=0, return_inverse=True)
         self.context = context.reshape(-1)
         """[S]: the number of each state's context."""
-        places = {-1 - i: f"in {label}" for i, label in enumerate(scene.labels)}
-        places |= {cell: str(divmod(cell, scene.columns)) for cell in range(scene.rows * scene.columns)}
+        places = [str(divmod(cell, scene.columns)) for cell in range(scene.rows * scene.columns)]
         for mark in scene.description["landmarks"]:
-            mark_row, mark_column = mark["cell"]
-            places[mark_row * scene.columns + mark_column] = mark["name"]
+            places[mark["cell"][0] * scene.columns + mark["cell"][1]] = mark["name"]
+        places += [f"in {label}" for label in reversed(scene.labels)]  # -1 is in the first thing
         names = [
             ", ".join(f"{scene.labels[i]} {places[k]}" for i, k in zip(things, key, strict=True))
             for key in keys.tolist()

@@ -19,7 +19,7 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import events_in_words, states_in_words
 from runner.export.rerun.labels import GridLabels
-from runner.export.rerun.metrics import phase_colours, series_lines
+from runner.export.rerun.metrics import log_track, phase_colours, series_lines
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.tracks import (
     Floats,
@@ -34,10 +34,8 @@ from runner.export.rerun.tracks import (
     repeated,
     scalars,
     text_track,
-    texts,
-    times_of,
 )
-from runner.util.arrays import Ints, Records
+from runner.util.arrays import Flags, Ints, Ints32, Records
 
 TRAIL_STEPS: Final = 5
 TITLE_Y: Final = -0.62
@@ -49,8 +47,8 @@ class Batch(NamedTuple):
     """n steps of one phase, with the learners' Q-values and maps of them if they are known."""
 
     records: Records
-    episode: Ints
-    """[n]: training episodes; for evaluation those before it."""
+    times: Times
+    """Evaluation is shown by the training episodes before it."""
     number: Ints
     """[n]: the number of the episode, or of the trial within its evaluation."""
     values: Floats = NO_ARRAY
@@ -58,23 +56,26 @@ class Batch(NamedTuple):
     best over the actions of the others. Empty if they are unknown, or not exported."""
     greedy: Ints = NO_ARRAY
     """[n, agents]: each agent's greedy action."""
-    has_map: NDArray[np.bool_] = NO_ARRAY
-    """[n]: the k steps that have maps."""
+    map_rows: Ints = NO_ARRAY
+    """[k]: the steps that have maps."""
     value_maps: NDArray[np.float32] = NO_ARRAY
     """[k, learners, pixels]: the greatest value in the state of each pixel; nan for no state."""
-    greedy_maps: NDArray[np.int32] = NO_ARRAY
+    greedy_maps: Ints32 = NO_ARRAY
     """[k, learners, pixels]: the learner's greedy action there; -1 for no state."""
 
-    def times(self, rows: slice | Ints = slice(None)) -> Times:
+    def at(self, rows: slice | Ints | Flags) -> Times:
         """Return the timelines of some rows."""
-        records = self.records[rows]
-        return times_of(records["log_time"], episode=self.episode[rows], t=records["t"])
+        return {name: numbers[rows] for name, numbers in self.times.items()}
+
+    def starts(self, before: int = -2) -> Flags:
+        """Return which steps do not follow the one before them, the first the time `before`."""
+        starts: Flags = np.diff(self.times["step"], prepend=before) != 1
+        return starts
 
     def edges(self) -> set[int]:
         """Return the first steps of stretches of time without gaps, and the steps after their last ones."""
-        steps = self.times()["step"]
-        starts, stops = np.diff(steps, prepend=-2) != 1, np.diff(steps, append=-2) != 1
-        return {*steps[starts].tolist(), *(steps[stops] + 1).tolist()}
+        steps, starts = self.times["step"], self.starts()
+        return {*steps[starts].tolist(), *(steps[np.append(starts[1:], True)] + 1).tolist()}
 
 
 class StepTracks:
@@ -90,8 +91,9 @@ class StepTracks:
         if scene := labels.scene:
             view = grid_view(title, scene)
             colours = agent_colours(range(len(scene.movers)))
-            radii = [shape.radius for shape in scene.shapes]
-            fills, faded = [palette.rgb(shape.colour) for shape in scene.shapes], [(*c, 120) for c in colours]
+            shapes = zip(scene.shapes, scene.owners, strict=True)
+            fills = [palette.rgb(shape.colour or palette.agent(owner)) for shape, owner in shapes]
+            radii, faded = [shape.radius for shape in scene.shapes], [(*colour, 120) for colour in colours]
             parts["grid/things"] = [
                 rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=50.0),
                 rr.Boxes2D.from_fields(radii=radii, colors=fills, draw_order=40.0),
@@ -110,55 +112,55 @@ class StepTracks:
 
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield the tracks of a batch of steps."""
-        records, times = batch.records, batch.times()
-        events = events_of(self._labels.mdp, records)
+        events = events_of(self._labels.mdp, batch.records)
         yield from self._events(batch, events)
         if scene := self._labels.scene:
-            yield from self._grid(scene, batch, events, times)
+            yield from self._grid(scene, batch, events)
         else:
             for name in ("state", "action"):
-                yield Track(f"{self._phase}/{name}", times, scalars(records[name][:, None]))
+                values = scalars(batch.records[name][:, None])
+                yield Track(f"{self._phase}/{name}", batch.times, values)
 
-    def _grid(self, scene: Scene, batch: Batch, events: NDArray[np.uint32], times: Times) -> Iterator[Track]:
+    def _grid(self, scene: Scene, batch: Batch, events: NDArray[np.uint32]) -> Iterator[Track]:
         """Yield the grid of each step: movers, passengers, goals, trails and moves.
 
         The movers, passengers and texts of a step are points of one entity, with their arrows and trails,
         because a row costs more than its content.
         """
         records, labels, path = batch.records, self._labels, f"{self._phase}/grid"
-        state, next_state = (records[name].astype(np.int64) for name in ("state", "next_state"))
-        points, origins = labels.points.take(state, axis=0), scene.mover_points.take(state, axis=0)
-        moved = scene.mover_points.take(next_state, axis=0) - origins
-        blocked = scene.moves.take(records["action"].astype(np.int64), axis=0)
-        vectors = np.where(moved.any(axis=2, keepdims=True), moved, blocked)
+        state, texts = records["state"], labels.of_steps(records, events)
+        origins = scene.mover_points.take(state, axis=0)
+        moved = scene.mover_points.take(records["next_state"], axis=0) - origins
+        vectors = np.where(moved.any(axis=2, keepdims=True), moved, scene.moves[records["action"]])
         things = [
-            *columns(rr.Points2D, positions=points, class_ids=labels.of_steps(records, events)),
+            *columns(rr.Points2D, positions=labels.points.take(state, axis=0), class_ids=texts),
             *columns(rr.Boxes2D, centers=scene.shape_centres.take(state, axis=0)),
             *columns(rr.Arrows2D, vectors=vectors, origins=origins),
             *columns(rr.LineStrips2D, strips=self._trails(scene, state, records["t"])),
         ]
-        yield Track(f"{path}/things", times, things)
+        yield Track(f"{path}/things", batch.times, things)
         # Sizes wherever the grid may have been cleared: static ones would stay visible.
         begins = records["t"] == 0
-        rows = np.flatnonzero(begins | (np.diff(times["step"], prepend=-1) != 1))
-        sizes = repeated(pairs(shape.half_size for shape in scene.shapes), len(rows))
-        yield Track(f"{path}/things", batch.times(rows), columns(rr.Boxes2D, half_sizes=sizes))
+        times = batch.at(begins | batch.starts())
+        sizes = repeated(pairs(shape.half_size for shape in scene.shapes), len(times["step"]))
+        yield Track(f"{path}/things", times, columns(rr.Boxes2D, half_sizes=sizes))
         if not begins.any():
             return
-        times, n = batch.times(begins), int(begins.sum())
+        times = batch.at(begins)
         titles = [
             f"TRAINING, episode {trained:,}"
             if self._phase == "train"
             else f"EVALUATION after {trained:,} episodes, trial {trial:,}"
-            for trained, trial in zip(batch.episode[begins], batch.number[begins], strict=True)
+            for trained, trial in zip(times["episode"], batch.number[begins], strict=True)
         ]
         yield text_track(f"{path}/title", times, (scene.columns / 2, TITLE_Y), titles)
         if scene.goals:
+            centres = scene.centres[state[begins]][:, scene.goals]
             goals = columns(
                 rr.Boxes2D,
-                centers=scene.goal_points[records["state"][begins]],
-                half_sizes=repeated(pairs([(0.44, 0.44)] * len(scene.goals)), n),
-                labels=repeated(np.array([scene.labels[goal] for goal in scene.goals]), n),
+                centers=centres,
+                half_sizes=np.full_like(centres, 0.44),
+                labels=repeated(np.array([scene.labels[goal] for goal in scene.goals]), len(centres)),
             )
             yield Track(f"{path}/goal", times, goals)
 
@@ -177,25 +179,23 @@ class StepTracks:
 
     def _events(self, batch: Batch, events: NDArray[np.uint32]) -> Iterator[Track]:
         """Yield the text log: beginnings and ends of episodes, pickups, collisions; not illegal actions."""
-        mdp, records = self._labels.mdp, batch.records
+        mdp, records, entity = self._labels.mdp, batch.records, f"{self._phase}/events"
+        if len(begins := np.flatnonzero(records["t"] == 0)):
+            kind = "episode" if self._phase == "train" else "trial"
+            states = zip(batch.number[begins], self._states[records["state"][begins]], strict=True)
+            lines = [f"{kind} {number:,} begins: {state}" for number, state in states]
+            yield log_track(entity, batch.at(begins), lines, view=None)
         names = enumerate(mdp.event_names)
         masks = events & np.uint32(sum(1 << bit for bit, name in names if ".illegal" not in name))
         endings = np.where(records["terminated"], 1, 2 * records["truncated"])
-        kind = "episode" if self._phase == "train" else "trial"
-        begins, happened = np.flatnonzero(records["t"] == 0), np.flatnonzero((masks != 0) | (endings != 0))
-        states = zip(batch.number[begins], self._states[records["state"][begins]], strict=True)
-        lines = [f"{kind} {number:,} begins: {state}" for number, state in states]
-        levels = ["INFO"] * len(lines)
-        happenings = (part[happened].tolist() for part in (masks, endings, records["t"]))
-        for mask, ending, t in zip(*happenings, strict=True):
-            text, level = self._entry(mask, ending)
-            lines.append(f"{text} after {t + 1} steps" if ending else text)
-            levels.append(level)
-        if lines:
-            rows = np.concatenate((begins, happened))
-            order = np.argsort(rows, kind="stable")
-            log = columns(rr.TextLog, text=texts(lines)[order], level=texts(levels)[order])
-            yield Track(f"{self._phase}/events", batch.times(rows[order]), log)
+        if len(rows := np.flatnonzero(masks | endings)):
+            lines, levels = [], []
+            parts = (part[rows].tolist() for part in (masks, endings, records["t"]))
+            for mask, ending, t in zip(*parts, strict=True):
+                text, level = self._entry(mask, ending)
+                lines.append(f"{text} after {t + 1} steps" if ending else text)
+                levels.append(level)
+            yield log_track(entity, batch.at(rows), lines, levels, view=None)
 
 
 def _entry(mdp: Mdp, mask: int, ending: int) -> tuple[str, str]:

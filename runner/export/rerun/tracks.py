@@ -17,16 +17,14 @@ from runner.export.rerun.selection import Selection
 from runner.recording.marks import Mark
 from runner.recording.reader import Recording
 from runner.recording.schema import STEP_NANOSECONDS
-from runner.util.arrays import Array, Ints, Scalar
+from runner.util.arrays import Array, Scalar
 
 APPLICATION: Final = "dualtaxi"
 MAX_ROWS: Final = 8_192
 """Maximum number of rows sent at once: the web viewer drops larger columns."""
 MAX_QUEUED: Final = 40 * MAX_ROWS
 """Rows that may wait to be compressed, which takes longer than making them."""
-_POINT: Final = pa.list_(pa.field("item", pa.float32(), nullable=False), 2)
-_STRIP: Final = pa.list_(pa.field("item", _POINT, nullable=False))
-_BLOB: Final = pa.list_(pa.field("item", pa.uint8(), nullable=False))
+_STRIP: Final = rr.components.LineStrip2D.arrow_type()
 Colour = tuple[int, ...]
 GREY: Final[Colour] = palette.rgb(palette.MIDTONE)
 Floats = NDArray[np.float64]
@@ -70,28 +68,21 @@ class TrackRow(NamedTuple):
     view: TrackView | None = None
 
 
-@dataclass(frozen=True)
-class TrackSource:
-    """A run to export."""
-
-    recording: Recording
-    title: str
-    root: str = ""
-    """Entity path of everything of the run; empty for the root."""
-    tint: str | None = None
-    """Base colour of its metrics, where runs are compared."""
-    marks: Sequence[Mark] = ()
-    """The marks at its steps."""
-
-
 @dataclass(eq=False)
 class Writer:
     """Sends the tracks of a run to a stream, and keeps which views they have."""
 
     stream: rr.RecordingStream
-    source: TrackSource
+    recording: Recording
     selection: Selection
-    stage: Callable[[str], None]
+    title: str
+    marks: Sequence[Mark] = ()
+    """The marks at its steps."""
+    root: str = ""
+    """Entity path of everything of the run; empty for the root."""
+    tint: str | None = None
+    """Base colour of its metrics, where runs are compared."""
+    stage: Callable[[str], None] = lambda _: None
     """Called with what takes long."""
     last: int = 0
     """The last step of the run, or else of its lines that were sent."""
@@ -103,7 +94,7 @@ class Writer:
     def send(self, tracks: Iterable[Track]) -> None:
         """Send tracks by columns."""
         for track in tracks:
-            entity = f"{self.source.root}/{track.entity}"
+            entity = f"{self.root}/{track.entity}"
             if track.entity not in self.entities:
                 self.entities.add(track.entity)
                 for archetype in track.static:
@@ -122,57 +113,31 @@ class Writer:
                     self._queued = 0
 
 
-class Component(NamedTuple):
-    """An Arrow array with the interface of a batch of Rerun's, which would copy it."""
-
-    descriptor: rr.ComponentDescriptor
-    array: pa.Array
-
-    def component_descriptor(self) -> rr.ComponentDescriptor:
-        """Return the descriptor of the component."""
-        return self.descriptor
-
-    def as_arrow_array(self) -> pa.Array:
-        """Return the array."""
-        return self.array
-
-
-def new_stream(recording_id: str) -> rr.RecordingStream:
-    """Return a stream without the timelines that Rerun adds by itself."""
-    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
-    stream.set_log_time_enabled(False)
-    stream.set_log_tick_enabled(False)
-    return stream
-
-
 def times_of(log_time: ArrayLike, **timelines: Array) -> Times:
     """Return the timeline `step` of log times, and others."""
     steps = np.asarray(log_time, np.int64) // STEP_NANOSECONDS
     return {"step": steps, **{name: each.astype(np.int64) for name, each in timelines.items()}}
 
 
-def columns(archetype: object, lengths: Ints | None = None, **parts: Array) -> list[rr.ComponentColumn]:
+def columns(archetype: object, **parts: Array) -> list[rr.ComponentColumn]:
     """Return the columns of n rows of a class such as `rerun.Points2D`, without one object per row.
 
-    The parts are, by component, text or numbers [n, instances], points [n, instances, 2], line strips
-    [n, strips, points, 2] or bytes [n, 1, size]. With `lengths`, rows have different numbers of instances,
-    and the parts are [all instances, ...].
+    The parts are, by component, numbers [n, instances] or text, points [n, instances, 2], or line strips
+    [n, strips, points, 2].
     """
     made = []
     for name, part in parts.items():
-        counts = np.full(len(part), part.shape[1]) if lengths is None else lengths
-        flat = part if lengths is not None else part.reshape(-1, *part.shape[2:])
         # Arrow refuses memory that is not aligned, which the field of a lone record may be.
-        flat = np.require(flat, requirements=["C", "A"])
-        items = pa.array(flat.reshape(-1))
-        if flat.dtype == np.float32 and flat.ndim > 1:
-            items = pa.FixedSizeListArray.from_arrays(items, type=_POINT)
-        if flat.ndim == 3 or flat.dtype == np.uint8:
-            kind = _BLOB if flat.dtype == np.uint8 else _STRIP
-            offsets = np.arange(len(flat) + 1, dtype=np.int32) * np.int32(flat.shape[1])
-            items = pa.ListArray.from_arrays(offsets, items, type=kind)
-        component = Component(getattr(archetype, f"descriptor_{name}")(), items)
-        made.append(rr.ComponentColumn(component.descriptor, component, lengths=counts))
+        items = pa.array(np.require(part, requirements=["C", "A"]).reshape(-1))
+        if part.ndim > 2:
+            items = pa.FixedSizeListArray.from_arrays(items, type=_STRIP.value_type)
+        if part.ndim > 3:
+            strips = np.arange(part[..., 0, 0].size + 1, dtype=np.int32) * np.int32(part.shape[2])
+            items = pa.ListArray.from_arrays(strips, items, type=_STRIP)
+        rows = np.arange(len(part) + 1, dtype=np.int32) * np.int32(part.shape[1])
+        descriptor = getattr(archetype, f"descriptor_{name}")()
+        batch = rr.AnyBatchValue(descriptor, items)  # other ways would copy it
+        made.append(rr.ComponentColumn(descriptor, batch, offsets=rows))
     return made
 
 
@@ -197,15 +162,14 @@ def _track_of(rows: Sequence[TrackRow]) -> Track:
     shown = []
     for batches in zip(*(row.shown.as_component_batches() for row in rows), strict=True):
         items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
-        component = Component(batches[0].component_descriptor(), items)
-        shown.append(rr.ComponentColumn(component.descriptor, component))
-    steps = np.array([row.step for row in rows])
-    return Track(rows[0].entity, {"step": steps}, shown, view=rows[0].view)
+        descriptor = batches[0].component_descriptor()
+        shown.append(rr.ComponentColumn(descriptor, rr.AnyBatchValue(descriptor, items)))
+    return Track(rows[0].entity, {"step": np.array([row.step for row in rows])}, shown, view=rows[0].view)
 
 
-def cleared(entities: Iterable[str], steps: Array | Sequence[int]) -> Iterator[Track]:
-    """Yield the tracks that clear entities, and all below them, from each of these steps on."""
-    for entity in entities if len(steps) else ():
+def cleared(entity: str, steps: Array | Sequence[int]) -> Iterator[Track]:
+    """Yield the track that clears an entity, and all below it, from each of these steps on."""
+    if len(steps):
         yield Track(entity, {"step": np.array(steps)}, rr.Clear.columns(is_recursive=[True] * len(steps)))
 
 
@@ -224,15 +188,9 @@ def centred(count: int, spacing: float) -> list[float]:
     return [(i - (count - 1) / 2) * spacing for i in range(count)]
 
 
-def texts(rows: Sequence[str]) -> NDArray[np.object_]:
-    """Return one text per row, [n, 1]."""
-    return np.array(rows, dtype=object)[:, None]
-
-
 def text_track(entity: str, times: Times, where: tuple[float, float], rows: Sequence[str]) -> Track:
     """Return a track of one text per row, always at the same point."""
-    positions = repeated(pairs([where]), len(rows))
-    return Track(entity, times, columns(rr.Points2D, positions=positions, labels=texts(rows)))
+    return Track(entity, times, rr.Points2D.columns(positions=[where] * len(rows), labels=rows))
 
 
 def agent_colours(agents: Iterable[int]) -> list[Colour]:

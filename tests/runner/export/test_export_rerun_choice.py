@@ -143,7 +143,7 @@ class TestCommand:
         path = tmp_path / "file" / "a.rrd"
         result = invoke("export", "rerun", pictured("lake").folder, "-o", path)
         assert result.exit_code == 2
-        assert f"{path}: cannot be written (" in result.stderr
+        assert f"{path}: {path.parent} is a file, expected a folder." in result.stderr
 
     def test_the_default_path_is_in_exports(self, pictured, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

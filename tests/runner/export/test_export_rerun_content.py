@@ -11,18 +11,17 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 import runner
-from runner.drawing.palette import COMPARED
 from runner.environments.mdp import events_of
 from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.layout import PLOTS
 from runner.export.rerun.scene import scene_of
 from runner.export.rerun.selection import Request
-from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.viewer import viewer_program
-from runner.export.rerun.writing import export, export_runs
+from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at
+from runner.runs.listing import run_at
 from runner.runs.resolve import find_run
 from tests.runner.export.rerun_views import views_of
 
@@ -35,7 +34,7 @@ class Exported:
     def __init__(self, recording, path):
         self.recording = recording
         self.path = path
-        (self.selection,) = export([TrackSource(recording, "a run")], Request(everything=True), path)
+        (self.selection,) = export([run_at(recording.path)], Request(everything=True), path)
         self.store = RrdReader(str(path)).store()
 
     def table(self, entity, component=None):
@@ -254,7 +253,7 @@ def test_views_show_what_was_sent(exported):
 
 def test_rerun_verifies_the_file(exported, tmp_path):
     path = tmp_path / "some.rrd"
-    export([TrackSource(exported.recording, "a run")], Request(episodes=((0, 2),), evaluations=(20,)), path)
+    export([run_at(exported.recording.path)], Request(episodes=((0, 2),), evaluations=(20,)), path)
     done = subprocess.run(
         [viewer_program(), "rrd", "verify", path],
         capture_output=True,
@@ -310,13 +309,9 @@ def test_lines_show_recorded_values_each_in_its_own_colour(exported):
 
 
 def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
-    with (
-        open_recording(pictured("taxis").recording) as a,
-        open_recording(pictured("rivals").recording) as b,
-    ):
-        sources = [TrackSource(a, "A", "/a", COMPARED[0]), TrackSource(b, "B", "/b", COMPARED[1])]
-        export(sources, Request(), tmp_path / "both.rrd")
-    views = [[f"/{run}/{path}" for run in "ab" for path in paths] for _, paths in PLOTS]
+    runs = [pictured("taxis"), pictured("rivals")]
+    export(runs, Request(), tmp_path / "both.rrd")
+    views = [[f"/{run.run_id}/{path}" for run in runs for path in paths] for _, paths in PLOTS]
     check_lines(tmp_path / "both.rrd", views)
 
 
@@ -328,7 +323,7 @@ def test_marks_are_in_the_log_at_their_steps(pictured, tmp_path):
     with open_recording(copied.recording) as recording:
         step = recording.train.episode(3).one(1)
         request = Request(everything=True)
-        export_runs([copied], [recording], request, tmp_path / "run.rrd")
+        export([copied], request, tmp_path / "run.rrd")
     store = RrdReader(str(tmp_path / "run.rrd")).store()
     (chunk,) = [c for c in store.stream().filter(content="/marks").to_chunks() if not c.is_static]
     (row,) = chunk.to_record_batch().to_pylist()

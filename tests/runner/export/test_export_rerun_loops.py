@@ -20,13 +20,13 @@ from runner.export.pictures import Pictures, PictureSource
 from runner.export.rerun import selection
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request, select
-from runner.export.rerun.tracks import TrackSource
-from runner.export.rerun.writing import export, export_runs
+from runner.export.rerun.writing import export
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
 from runner.recording.observation_names import NAMES
 from runner.recording.reader import open_recording
 from runner.recording.turns import taken
+from runner.runs.listing import run_at
 from tests.runner.export.making import made_otherwise
 from tests.runner.export.rerun_views import shown_ranges
 from tests.runner.loops.making import Leaving, Rooms, parallel, play, record_counting
@@ -57,7 +57,7 @@ class Exported:
     """An export, read back."""
 
     def __init__(self, recording, path, **request):
-        (self.selection,) = export([TrackSource(recording, "a run")], Request(**request), path)
+        (self.selection,) = export([run_at(recording.path)], Request(**request), path)
         self._chunks = RrdReader(str(path)).store().stream().to_chunks()
 
     @property
@@ -271,9 +271,7 @@ def test_a_run_with_tables_and_a_loop_are_shown_together(pictured, tmp_path):
         list(play(env, 50))
     runs = [pictured("lake"), env.run]
     path = tmp_path / "both.rrd"
-    with contextlib.ExitStack() as stack:
-        opened = [stack.enter_context(open_recording(run.recording)) for run in runs]
-        export_runs(runs, opened, Request(), path)
+    export(runs, Request(), path)
     chunks = RrdReader(str(path)).store().stream().to_chunks()
     entities = {str(chunk.entity_path) for chunk in chunks}
     for run in runs:

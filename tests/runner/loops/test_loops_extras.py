@@ -20,7 +20,6 @@ import runner
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.export.rerun.selection import Request
-from runner.export.rerun.tracks import TrackSource
 from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.blocks import message_record
@@ -132,7 +131,7 @@ def test_rerun_has_extras_on_the_timeline_as_lines_or_as_bars(tmp_path):
                 rec.note_step(logits=np.array([k, -k]), histogram=np.full(20, k))
     path = tmp_path / "run.rrd"
     with runner.open_recording(rec.run.recording) as recording:
-        export([TrackSource(recording, "a run")], Request(everything=True), path)
+        export([rec.run], Request(everything=True), path)
         steps = next(recording.train.extras.blocks())["step"]
     chunks = RrdReader(str(path)).store().stream().to_chunks()
     rows = {"logits": [], "histogram": []}
