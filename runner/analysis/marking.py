@@ -7,12 +7,11 @@ from datetime import UTC, datetime
 
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import opened
-from runner.errors import RecordingError, RunnerError
-from runner.recording.labels import MAX_TAGS, TAG_EXPECTED
+from runner.errors import RunnerError
+from runner.recording.labels import check_tags
 from runner.recording.marks import MAX_MARK_TEXT, Mark, Marks, change_marks
 from runner.recording.reader import Recording
 from runner.runs.run import Run
-from runner.util.stored import stored_as
 from runner.util.values import is_utf8
 
 
@@ -22,13 +21,13 @@ def mark(run: Run, at: StepLike, text: str = "", *, tags: Iterable[str] = ()) ->
     Args:
         run: the run, in a folder of its own.
         at: the step, such as `"812:57"`, `"eval:3000:17:5"` or `"worst"`; the number of its steps is its end.
-        text: at most 1,000 characters.
+        text: at most 1,000 characters; it may be empty if there are tags.
         tags: tags of the mark.
 
     Raises:
         NotInRecording: the run has no such step.
-        RunnerError: the recording is not in a folder of its own, a tag or the text is not valid, or there are
-            too many marks.
+        RunnerError: the recording is not in a folder of its own, there is neither text nor tag or one
+            of them is not valid, or there are too many marks.
         StorageError: the run's folder cannot be written.
     """
     (made,) = mark_steps(run, [at], text, tags=tags)
@@ -40,22 +39,18 @@ def mark_steps(
 ) -> list[Mark]:
     """Mark steps of a run with the same text; arguments and errors as for `mark`."""
     run.require_folder()
+    text, names = text.strip(), tuple(sorted(set(tags)))
     with opened(run) as recording:
         existing = [_existing(recording, EpisodeRef.parse(at)) for at in steps]
-    created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    values = {"text": text.strip(), "tags": sorted(set(tags)), "created": created}
-    if not is_utf8(text):
-        raise RunnerError(f"text: found {text[:100]!r}, expected text in UTF-8.")
-    try:
-        marks = [
-            stored_as(Mark, {"at": str(step), "episode": episode} | values, "mark")
-            for step, episode in existing
-        ]
-    except RecordingError as error:
+    check_tags(names)
+    if not (text or names):
+        raise RunnerError("mark: found no text, expected a text or tags.")
+    if not is_utf8(text) or len(text) > MAX_MARK_TEXT:
         raise RunnerError(
-            f"{error} A text has at most {MAX_MARK_TEXT:,} characters; a mark at most {MAX_TAGS} tags of "
-            f"{TAG_EXPECTED}."
-        ) from error
+            f"text: found {text[:100]!r}, expected at most {MAX_MARK_TEXT:,} characters in UTF-8."
+        )
+    created = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    marks = [Mark(str(step), episode, text, names, created) for step, episode in existing]
     change_marks(run.folder, lambda before: before.merged(marks))
     return marks
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -29,7 +29,7 @@ MAX_TAGS: Final = 100
 LOCK_SECONDS: Final = 30.0
 
 TAG_PATTERN: Final = r"\w[\w.=+/@-]{0,63}"
-TAG_EXPECTED: Final = "1 to 64 letters, digits or any of _ . - = + / @, the first a letter, digit or _"
+_TAG_EXPECTED: Final = "1 to 64 letters, digits or any of _ . - = + / @, the first a letter, digit or _"
 
 
 @dataclass(frozen=True)
@@ -118,12 +118,21 @@ def is_tag(text: object) -> bool:
     return isinstance(text, str) and re.fullmatch(TAG_PATTERN, text) is not None
 
 
-def _check(labels: Labels) -> None:
-    for tag in labels.tags:
+def check_tags(tags: Collection[str]) -> None:
+    """Refuse tags that a run or a mark cannot have.
+
+    Raises:
+        RunnerError: one of them is not valid, or there are too many.
+    """
+    for tag in tags:
         if not is_tag(tag):
-            raise RunnerError(f"tag: found {tag!r}, expected {TAG_EXPECTED}.")
-    if len(labels.tags) > MAX_TAGS:
-        raise RunnerError(f"tag: found {len(labels.tags)} tags, expected at most {MAX_TAGS}.")
+            raise RunnerError(f"tag: found {tag!r}, expected {_TAG_EXPECTED}.")
+    if len(tags) > MAX_TAGS:
+        raise RunnerError(f"tag: found {len(tags)} tags, expected at most {MAX_TAGS}.")
+
+
+def _check(labels: Labels) -> None:
+    check_tags(labels.tags)
     if not is_utf8(labels.note):
         raise RunnerError(f"note: found {labels.note[:100]!r}, expected text in UTF-8.")
     if len(labels.note) > MAX_NOTE:

@@ -95,16 +95,19 @@ class Marks:
 
 def marks_from(values: object) -> Marks:
     """Return the marks in a JSON object that anyone may have written; invalid ones are ignored."""
-    values = values if isinstance(values, Mapping) else {}
-    marks, removed = values.get("marks"), values.get("removed")
     valid = []
-    for value in (marks if isinstance(marks, list) else [])[:MAX_MARKS]:
+    for value in _items(values, "marks", MAX_MARKS):
         with contextlib.suppress(RecordingError, ValueError):
             mark = stored_as(Mark, value, MARKS_FILE)
             datetime.fromisoformat(mark.created)
             valid.append(mark)
-    ids = [each for each in (removed if isinstance(removed, list) else []) if isinstance(each, str)]
-    return Marks().merged(valid, [each for each in ids[:_MAX_REMOVED] if len(each) == _ID_LENGTH])
+    ids = (item for item in _items(values, "removed", _MAX_REMOVED) if isinstance(item, str))
+    return Marks().merged(valid, (item for item in ids if len(item) == _ID_LENGTH))
+
+
+def _items(values: object, key: str, most: int) -> list[object]:
+    items = values.get(key) if isinstance(values, Mapping) else None
+    return items[:most] if isinstance(items, list) else []
 
 
 def read_marks(folder: Path) -> Marks:

@@ -62,7 +62,7 @@ from runner.views.view import Answer, FileAnswer, Given
 TABLE_NAME: Final = "scores.csv"
 """Stands for a table of scores in messages."""
 MAX_ROWS: Final = 1000
-"""The most rows of a query."""
+"""The most rows of a query, and the most episodes of a search."""
 MAX_FILM_STEPS: Final = 5_000
 """The most steps of a film, as one film is made at a time."""
 MAX_NAMES: Final = 10_000
@@ -397,7 +397,7 @@ def find(roots: tuple[Path, ...], expression: str, runs: str, phase: str, sort: 
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query import find
 
-    found = find.find(expression, roots, runs=runs, phase=phase or None, sort=sort, limit=limit)
+    found = find.find(expression, roots, runs=runs, phase=phase or None, sort=sort, limit=limit or MAX_ROWS)
     return as_json(found.as_json())
 
 

@@ -48,7 +48,9 @@ class EpisodeQuestion(BaseModel):
     runs: str = Field("", max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")
     phase: Literal["", "train", "eval"] = Field("", description="Training or evaluation; both by default.")
     sort: str = Field("", max_length=1000, description="A number to sort by, such as `-ret`.")
-    limit: int = Field(20, ge=1, le=1000, description="Maximum number of episodes.")
+    limit: int = Field(
+        20, ge=0, le=1000, description="Maximum number of episodes; 0 for the most of a server, 1,000."
+    )
 
 
 SearchOf = Annotated[EpisodeQuestion, Query()]

@@ -242,7 +242,7 @@ COMMANDS = {
     "export tensorboard": ["RUN", "-o", "OUT"],
     "import": ["RECORDING"],
     "ls": [],
-    "mark": ["RUN", "0:1"],
+    "mark": ["RUN", "0:1", "seen"],
     "play": ["RUN", "--episode", "0"],
     "plot": ["RUN", "-o", "OUT.svg"],
     "qtable": ["RUN"],

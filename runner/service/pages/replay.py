@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
@@ -39,6 +40,7 @@ from runner.service.dependencies import (
 )
 from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Form, Page
+from runner.service.pictures import PictureStreams
 from runner.service.problems import status_of
 from runner.util.values import JsonView
 
@@ -172,6 +174,45 @@ async def latest(
     return Page("latest.html", show)
 
 
+async def _replay(
+    run: Run,
+    compute: Computation,
+    streams: PictureStreams,
+    catalogue: Catalogue,
+    at: EpisodeRef,
+    refused: RunnerError | None = None,
+    form: Mapping[str, str] = {},  # noqa: B006 - never changed
+) -> Response:
+    """Return the page of a step of an episode.
+
+    Args:
+        refused: why the step was not marked.
+        form: what was sent then.
+    """
+    part: bytes | RunnerError
+    preparing = asyncio.create_task(prepare_pictures(run, streams, at))
+    start = max(0, at.t - BEFORE)
+    step = at if start else replace(at, t=0)  # one part, cached once, for all of the first steps
+    try:
+        part = await compute(fragments.episode_part, run.recording, step, start, STEPS)
+    except RunnerError as error:
+        part = error
+    await preparing
+
+    def show() -> dict[str, object]:
+        with open_recording(run.recording) as recording:
+            branches = _branches(recording, run, catalogue)
+        stage, problem = (
+            (None, part) if isinstance(part, RunnerError) else (stage_of(json.loads(part), at.t), "")
+        )
+        shown = {"problem": problem, "refused": str(refused or ""), "form": form}
+        return _values(run, replace(at, t=0), branches, stage) | shown
+
+    error = refused or part
+    status = status_of(error) if isinstance(error, RunnerError) else None
+    return RunPage(run, "replay", "run_replay.html", show, status)
+
+
 def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
     @router.get(path)
     async def replay(
@@ -183,25 +224,7 @@ def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None
         t: T = 0,
     ) -> Response:
         """Show a step of an episode."""
-        part: bytes | RunnerError
-        preparing = asyncio.create_task(prepare_pictures(run, streams, replace(at, t=t)))
-        start = max(0, t - BEFORE)
-        step = replace(at, t=t) if start else at  # one part, cached once, for all of the first steps
-        try:
-            part = await compute(fragments.episode_part, run.recording, step, start, STEPS)
-        except RunnerError as error:
-            part = error
-        await preparing
-
-        def show() -> dict[str, object]:
-            with open_recording(run.recording) as recording:
-                branches = _branches(recording, run, catalogue)
-            if isinstance(part, RunnerError):
-                return _values(run, at, branches, None) | {"problem": part}
-            return _values(run, at, branches, stage_of(json.loads(part), t)) | {"problem": ""}
-
-        status = status_of(part) if isinstance(part, RunnerError) else None
-        return RunPage(run, "replay", "run_replay.html", show, status)
+        return await _replay(run, compute, streams, catalogue, replace(at, t=t))
 
 
 for _path, _episode in EPISODES.items():
@@ -209,13 +232,19 @@ for _path, _episode in EPISODES.items():
 
 
 @router.post("/mark")
-def mark_step(run: WrittenRun, form: Form) -> Response:
+async def mark_step(
+    run: WrittenRun, form: Form, compute: ComputationOf, streams: PicturesOf, catalogue: CatalogueOf
+) -> Response:
     """Mark the step of a replay, or remove a mark, and show the replay again."""
     step = EpisodeRef.parse(form.get("at", ""))
-    if removed := form.get("remove"):
-        unmark(run, removed)
-    else:
-        mark(run, step, form.get("text", ""), tags=form.get("tags", "").split())
+    try:
+        if removed := form.get("remove"):
+            await run_in_threadpool(unmark, run, removed)
+        else:
+            tags = form.get("tags", "").split()
+            await run_in_threadpool(mark, run, step, form.get("text", ""), tags=tags)
+    except RunnerError as error:
+        return await _replay(run, compute, streams, catalogue, step, error, form)
     address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
     return RedirectResponse(f"{address}#marks", HTTPStatus.SEE_OTHER)
 

@@ -82,7 +82,7 @@ WORDS = {
     "why": "{run} --at 0:1 --agent taxi_1",
     "explain": "{tiny} {patient} --seeds 2",
     "label": "@latest --tag good",
-    "mark": "{run} 0:1",
+    "mark": "{run} 0:1 seen",
     "find": "length>0 --limit 2",
     "sql": "VALUES(1)",
     "rm": "@latest --dry-run",

@@ -29,7 +29,7 @@ def test_a_mark_names_a_step_that_the_run_has(run):
     digest = run.recording.read_bytes()
     first = runner.mark(run, "3:1", " both stuck ", tags=["stuck", "again"])
     assert (first.at, first.episode, first.text, first.tags) == ("3:1", 3, "both stuck", ("again", "stuck"))
-    trial = runner.mark(run, "eval:6:1")
+    trial = runner.mark(run, "eval:6:1", tags=["trial"])
     assert (trial.at, trial.phase, trial.episode, trial.t) == ("eval:6:1:0", "eval", 3, 0)
     word = runner.mark(run, "last", "the end")
     assert word.at == "11:0"
@@ -42,7 +42,7 @@ def test_a_mark_names_a_step_that_the_run_has(run):
 
 @pytest.mark.parametrize(
     ("text", "tags"),
-    [("x" * 1001, []), ("", ["not a tag"]), ("", map(str, range(MAX_TAGS + 1))), ("\udcff", [])],
+    [("x" * 1001, []), ("", ["not a tag"]), ("", map(str, range(MAX_TAGS + 1))), ("\udcff", []), (" ", [])],
 )
 def test_marks_that_cannot_be_are_refused(run, text, tags):
     with pytest.raises(RunnerError, match="expected"):
@@ -110,7 +110,7 @@ def test_there_are_not_too_many(run):
     (run.folder / MARKS_FILE).write_text(json.dumps({"marks": many}))
     assert len(run.marks) == MAX_MARKS
     with pytest.raises(RunnerError, match="expected at most 1,000"):
-        runner.mark(run, "3:1")
+        runner.mark(run, "3:1", "one more")
 
 
 def test_the_command_marks_lists_and_removes(run):
@@ -132,5 +132,5 @@ def test_the_command_marks_lists_and_removes(run):
 
 def test_a_mark_does_not_make_a_run_trusted(run):
     before = mark_of(run.folder)
-    runner.mark(run, "3:1")
+    runner.mark(run, "3:1", "seen")
     assert mark_of(run.folder) == before

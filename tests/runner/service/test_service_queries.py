@@ -115,7 +115,16 @@ def test_a_wrong_search_is_refused_in_both_forms(client):
     response = client.get("/find", params=search)
     assert response.status_code == 400
     assert "lenght" in response.text
-    assert client.get("/find", params={"expression": "length > 0", "limit": 0}).status_code == 422
+    assert client.get("/find", params={"expression": "length > 0", "limit": 1001}).status_code == 422
+
+
+def test_a_limit_of_0_is_the_most_of_a_server(client, recordings):
+    every = runner.find("length > 0", recordings, limit=None)
+    for path in ("/api/v1/find", "/find"):
+        assert client.get(path, params={"expression": "length > 0", "limit": 0}).status_code == 200
+    answer = client.get("/api/v1/find", params={"expression": "length > 0", "limit": 0}).json()
+    assert len(answer["hits"]) == min(len(every.hits), 1000) > 20
+    assert answer["count"] == every.count
 
 
 def test_marks_are_set_listed_and_removed(client, recordings):
@@ -130,6 +139,23 @@ def test_marks_are_set_listed_and_removed(client, recordings):
     assert client.post(path, json={"at": "x"}).status_code == 400
     assert client.delete(f"{path}/{mark['mark']}").json()["marks"] == []
     assert client.delete(f"{path}/{mark['mark']}").status_code == 400
+
+
+@pytest.mark.parametrize(
+    ("form", "message"),
+    [
+        ({"text": "both <stuck>", "tags": "no,tag"}, "1 to 64 letters, digits or any of _ . - = + / @"),
+        ({"text": " ", "tags": ""}, "expected a text or tags"),
+    ],
+)
+def test_a_mark_that_is_refused_is_explained_in_the_replay(client, recordings, form, message):
+    response = client.post("/runs/first/replay/mark", data={"at": "3:1"} | form)
+    assert response.status_code == 400
+    assert message in html.unescape(response.text)
+    assert "regex" not in response.text
+    assert f'value="{html.escape(form["text"])}"' in response.text
+    assert 'name="at" value="3:1"' in response.text
+    assert find_run("first", recordings).marks == ()
 
 
 def test_only_a_writer_marks(connect, settings):
