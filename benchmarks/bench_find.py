@@ -59,8 +59,9 @@ def _write_many_episodes() -> None:
         table = pq.read_table(path)
         chosen = np.random.default_rng(number).integers(len(table), size=EPISODES_OF_RUN)
         rows = table.take(chosen)
-        at = rows.column_names.index("episode")
-        rows = rows.set_column(at, "episode", pa.array(np.arange(EPISODES_OF_RUN)))
+        for name in {"episode", "row"} & set(rows.column_names):
+            at = rows.column_names.index(name)
+            rows = rows.set_column(at, name, pa.array(np.arange(EPISODES_OF_RUN)))
         pq.write_table(rows, path, compression="zstd")
 
 

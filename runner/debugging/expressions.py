@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import from_mapping
-from runner.environments.naming import actions_in_words, numbered_actions, spoken, states_in_words
-from runner.errors import RunnerError, nearest
+from runner.environments.naming import actions_in_words, numbered_actions, states_in_words
+from runner.errors import nearest
 from runner.recording.reader import Recording
 from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, Term
 
@@ -93,6 +93,7 @@ class JobParser(Parser[Series]):
     """Parses a condition on the training of a job; `quantities` lists what it names."""
 
     what = "expression"
+    needed = "a quantity in it that changes"
     example = "max(q[300]) > 20"
     max_length = MAX_CHARACTERS
     max_nodes = 300
@@ -144,8 +145,6 @@ class JobParser(Parser[Series]):
             RunnerError: it is no condition over quantities, or too large; a line marks the place.
         """
         condition = self.whole()
-        if not self._shown:
-            raise RunnerError(f"expression: found {self.text}, expected a quantity in it that changes.")
         parts = self._conditions if len(self._conditions) > 1 else {}
         return Expression(self.text, condition, tuple((self._shown | parts).values()))
 
@@ -161,9 +160,8 @@ class JobParser(Parser[Series]):
         text = self.text_of(node)
         return noted.setdefault(text, replace(term, text=text))
 
-    def fixed(self, value: float | str) -> Series:
+    def fixed(self, kind: str, value: float | str) -> Series:
         """Return the term of a number, of True or False, or of a text, whose value is never asked."""
-        kind = {bool: CONDITION, str: TEXT}.get(type(value), NUMBER)
         constant = np.array(value, np.float64 if kind == NUMBER else None)
         return Series(kind, lambda _: constant)
 
@@ -200,7 +198,7 @@ class JobParser(Parser[Series]):
             raise self.error(node, "found an order of actions, expected == or !=.")
         for k, side in enumerate((left, right)):
             if not terms[k].names:
-                terms[k] = self.fixed(self._number_of(side, names, "action"))
+                terms[k] = self.fixed(NUMBER, self.numbered(side, names, "action"))
             elif terms[k].names != names:
                 raise self.error(node, "found a joint action and one agent's, which are not comparable.")
         return self.applied(CONDITION, operator, *terms)
@@ -229,8 +227,8 @@ class JobParser(Parser[Series]):
             index = node.slice.elts if isinstance(node.slice, ast.Tuple) else [node.slice]
         if not (name in _INDEXED) <= len(index) <= _FORMS[name].count(",") + (name in _INDEXED):
             raise self.error(node, f"found {self.text_of(node)}, expected {_FORMS[name]}.")
-        state = self._number_of(index[0], self._state_names, "state") if index else -1
-        action = self._number_of(index[1], self._actions(learner), "action") if index[1:] else -1
+        state = self.numbered(index[0], self._state_names, "state") if index else -1
+        action = self.numbered(index[1], self._actions(learner), "action") if index[1:] else -1
         return self._quantity(Quantity(name, learner, state, action))
 
     def _check_algorithm(self, node: ast.expr, name: str) -> None:
@@ -277,35 +275,3 @@ class JobParser(Parser[Series]):
             self._actions(quantity.learner) if kind == _ACTION else (),
             quantity.name in ("visits", "step", "episode"),
         )
-
-    def _number_of(self, node: ast.expr, names: Sequence[str], what: str) -> int:
-        """Return the state or action that a number or a name stands for, among all names by number.
-
-        `what` is `state` or `action`, for errors.
-        """
-        value = node.value if isinstance(node, ast.Constant) else None
-        if type(value) is int and value < len(names):
-            return value
-        if not isinstance(value, str):
-            raise self.error(
-                node,
-                f"found {what} {self.text_of(node)}, expected one of 0 to {len(names) - 1}, or its name.",
-            )
-        wanted = _spelt(value)
-        named = [k for k, name in enumerate(names) if _spelt(name) == wanted]
-        if len(named) == 1:
-            return named[0]
-        if named:
-            raise self.error(node, f"found a name of {len(named)} {what}s, expected a number.")
-        parts = names[0].count(" + ") + 1
-        hint = nearest(value, names) or nearest(" + ".join([value] * parts), names)
-        raise self.error(
-            node,
-            f"found {what} {value[:60]!r}, expected one of {len(names):,}, by number or by name, such as "
-            f"{names[0]!r}.{hint}",
-        )
-
-
-def _spelt(name: str) -> str:
-    """Return a name of a state or action in one spelling."""
-    return spoken(" + ".join(part.strip() for part in name.split("+")))

@@ -31,7 +31,7 @@ from runner.archive.store import ArchiveStore
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import Phase, Recording, open_recording
-from runner.recording.schema import STEP_NANOSECONDS, Topic
+from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.topic_chunks import TopicChunks
 from runner.runs.run import Run
 from runner.util.arrays import Ints
@@ -119,23 +119,14 @@ def _selected(columns: pa.Schema, is_selected: Callable[[str], bool]) -> pa.Sche
 
 
 @dataclass(frozen=True)
-class Chunks:
-    """Chunks of a table that have one reader."""
-
-    known: Sequence[Known]
-    read: Callable[[Sequence[int], Sequence[str]], Iterator[pa.RecordBatch]]
-    """Yields the columns of these names in the chunks of these numbers."""
-
-
-@dataclass(frozen=True)
 class RunTables:
     """The tables of one run."""
 
     shape: Shape
     count: Callable[[Table], int]
     """Returns the number of chunks of a table, or of its rows."""
-    chunks: Callable[[Table, Condition], Iterator[Chunks]]
-    """Yields the chunks of a table."""
+    batches: Callable[[Table, Condition, Sequence[str]], Iterator[pa.RecordBatch]]
+    """Yields the columns of these names in the chunks of a table with rows that may satisfy a condition."""
 
 
 @contextlib.contextmanager
@@ -151,8 +142,8 @@ def opened_tables(run: Run) -> Iterator[RunTables]:
             batches = Batches(recording)
             yield RunTables(
                 batches.shape,
-                partial(_count_chunks, recording),
-                partial(_chunks_of_recording, recording, batches),
+                lambda table: sum(len(recording.table(topic)) for topic in table.topics),
+                partial(_batches_of_recording, recording, batches),
             )
         return
     store = archive_store(run)
@@ -163,31 +154,24 @@ def opened_tables(run: Run) -> Iterator[RunTables]:
                 f"{store.place(run.run_id)}: found an archive of digest {archive.manifest.digest}, expected "
                 f"{run.archive.digest}."
             )
-        chunks = partial(_chunks_of_archive, archive, store)
-        yield RunTables(archive.shape, lambda table: archive.count(*table.topics), chunks)
+        yield RunTables(
+            archive.shape,
+            lambda table: archive.count(*table.topics),
+            partial(_batches_of_archive, archive, store),
+        )
 
 
 # --- recordings -------------------------------------------------------------------------------------------
 
 
-def _count_chunks(recording: Recording, table: Table) -> int:
-    return sum(len(recording.table(topic)) for topic in table.topics)
-
-
-def _chunks_of_recording(
-    recording: Recording, batches: Batches, table: Table, condition: Condition
-) -> Iterator[Chunks]:
+def _batches_of_recording(
+    recording: Recording, batches: Batches, table: Table, condition: Condition, names: Sequence[str]
+) -> Iterator[pa.RecordBatch]:
     for topic in batches.shape.topics_of(table):
         if (chunks := batches.chunks_of(topic)) is not None:
-            known = _known_of(recording, chunks, condition)
-            yield Chunks(known, partial(_read_records, batches, table, topic))
-
-
-def _read_records(
-    batches: Batches, table: Table, topic: Topic, chunks: Sequence[int], names: Sequence[str]
-) -> Iterator[pa.RecordBatch]:
-    for records in batches.records(topic, chunks):
-        yield batch_of(table, topic, records, batches.shape, names)
+            kept = condition.may_hold(_known_of(recording, chunks, condition))
+            for records in batches.records(topic, kept):
+                yield batch_of(table, topic, records, batches.shape, names)
 
 
 def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -> list[Known]:
@@ -202,9 +186,10 @@ def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -
         ranges[schema.NUMBERED_BY[topic.message]] = first, stop - 1
     if topic.message is schema.STEP and condition.mentions("episode"):
         ranges |= _episodes_of_steps(recording.phase(topic.phase), starts, ends)
-    columns = {name: zip(*map(np.ndarray.tolist, pair), strict=True) for name, pair in ranges.items()}
-    rows = zip(*columns.values(), strict=True)
-    return [same | dict(zip(columns, row, strict=True)) for row in rows]
+    return [
+        same | {name: (int(low[k]), int(high[k])) for name, (low, high) in ranges.items()}
+        for k in range(len(starts))
+    ]
 
 
 def _times_of(chunks: TopicChunks) -> tuple[Ints, Ints]:
@@ -216,52 +201,45 @@ def _times_of(chunks: TopicChunks) -> tuple[Ints, Ints]:
 def _episodes_of_steps(phase: Phase, starts: Ints, ends: Ints) -> dict[str, tuple[Ints, Ints]]:
     """Return the first and the last episode of chunks of steps, as an episode has the time of its last step.
 
-    Nothing is known where a repair lost episodes, or environments take turns: each counts its own episodes.
+    Environments that take turns count their own episodes. Nothing is known where a repair lost episodes.
     """
-    if phase.steps.have_turns or phase.episodes.lost:
+    if phase.episodes.lost:
         return {}
-    ended = [(block["episode"], block["log_time"].astype(np.int64)) for block in phase.episodes.rows()]
-    numbers, times = (
-        np.concatenate([[first], *columns]) for first, *columns in zip((-1, 0), *ended, strict=True)
-    )
-    before = np.searchsorted(times, starts) - 1
-    after = np.append(numbers, numbers[-1] + 1)[np.searchsorted(times, ends)]
-    return {"episode": (numbers[before] + 1, after)}
+    turns = phase.steps.environments if phase.steps.have_turns else 1
+    ended: list[list[Ints]] = [[np.zeros(0, np.int64)] for _ in range(turns)]
+    for block in phase.episodes.rows():
+        for k, times in enumerate(ended):
+            mine = block[block["environment"] == k] if turns > 1 else block
+            times.append(mine["log_time"].astype(np.int64))
+    counts = [[np.searchsorted(times, at) for times in map(np.concatenate, ended)] for at in (starts, ends)]
+    return {"episode": (np.min(counts[0], axis=0), np.max(counts[1], axis=0))}
 
 
 # --- archives ---------------------------------------------------------------------------------------------
 
 
-def _chunks_of_archive(
-    archive: Archive, store: ArchiveStore, table: Table, condition: Condition
-) -> Iterator[Chunks]:
-    del condition  # what is known of groups of rows stands in the file
+def _batches_of_archive(
+    archive: Archive, store: ArchiveStore, table: Table, condition: Condition, names: Sequence[str]
+) -> Iterator[pa.RecordBatch]:
     rows = archive.count(*table.topics)
     if not rows:
         return
     run_id, where = archive.run_id, f"{store.place(archive.run_id)}/{table.name}"
+    places = {name: k for k, name in enumerate(table.columns.names) if name in _COMPARED}
     try:
         with (
             store.opened(run_id, table.name) as source,
             pq.ParquetFile(source, buffer_size=_BUFFER, pre_buffer=False) as file,
         ):
             check_table(file, where, source.size(), table.columns, rows)
-            about = file.metadata
-            places = {name: k for k, name in enumerate(table.columns.names) if name in _COMPARED}
             known = []
-            for group in map(about.row_group, range(about.num_row_groups)):
+            for group in map(file.metadata.row_group, range(file.num_row_groups)):
                 facts = {name: group.column(k).statistics for name, k in places.items()}
                 known.append(
                     {"run": (run_id, run_id)}
                     | {name: (s.min, s.max) for name, s in facts.items() if s is not None and s.has_min_max}
                 )
-            yield Chunks(known, partial(_read_groups, file))
+            for batch in file.iter_batches(_ROWS, condition.may_hold(known), list(names)):
+                yield batch.select(names)
     except (pa.ArrowException, OverflowError) as error:
         raise RecordingError(f"{where}: cannot be read as a table ({error}).") from error
-
-
-def _read_groups(
-    file: pq.ParquetFile, groups: Sequence[int], names: Sequence[str]
-) -> Iterator[pa.RecordBatch]:
-    for batch in file.iter_batches(_ROWS, row_groups=list(groups), columns=list(names)):
-        yield batch.select(names)

@@ -15,17 +15,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Final
 
-from runner.errors import nearest
-from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, Term
+from runner.errors import RunnerError, nearest
+from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, Term, spelt
 
 ENDS: Final = ("success", "terminated", "truncated")
 """The conditions of an episode."""
 AGGREGATES: Final[dict[Any, tuple[str, str]]] = {
-    "any": ("coalesce(bool_or({0.sql}), FALSE)", "{0.some}"),
-    "never": ("NOT coalesce(bool_or({0.sql}), FALSE)", "(NOT {0.some})"),
-    "all": ("coalesce(bool_and({0.sql}), TRUE)", "(NOT {0.fails})"),
-    "count": ("count_if({0.sql})", "CASE WHEN NOT {0.some} THEN 0 WHEN NOT {0.fails} THEN length END"),
-    "then": ("coalesce(bool_or({0.sql} AND {1.sql}), FALSE)", "({0.some} AND {1.some} AND NULL)"),
+    "any": ("coalesce(bool_or({0.sql}), FALSE)", "{0.high}"),
+    "never": ("NOT coalesce(bool_or({0.sql}), FALSE)", "(NOT {0.high})"),
+    "all": ("coalesce(bool_and({0.sql}), TRUE)", "{0.low}"),
+    "count": ("count_if({0.sql})", "CASE WHEN NOT {0.high} THEN 0 WHEN {0.low} THEN length END"),
+    "then": ("coalesce(bool_or({0.sql} AND {1.sql}), FALSE)", "({0.high} AND {1.high} AND NULL)"),
     "min": ("min({0.sql})", "{0.low}"),
     "max": ("max({0.sql})", "{0.high}"),
     "sum": ("sum({0.sql})", "NULL"),
@@ -34,22 +34,23 @@ AGGREGATES: Final[dict[Any, tuple[str, str]]] = {
 }
 """The functions of an episode's steps, and what the index says of them if it has no column for them."""
 _OF_NUMBERS: Final = ("min", "max", "sum", "first", "last")
-_AT_STEPS: Final[dict[Operation, tuple[str, str]]] = {
-    ast.Not: ("{0.fails}", "{0.some}"),
-    ast.And: ("({0.some} AND {1.some} AND NULL)", "({0.fails} OR {1.fails})"),
-    ast.Or: ("({0.some} OR {1.some})", "({0.fails} AND {1.fails} AND NULL)"),
-    ast.Lt: ("{0.low} < {1.high}", "{0.high} >= {1.low}"),
-    ast.LtE: ("{0.low} <= {1.high}", "{0.high} > {1.low}"),
-    ast.Gt: ("{0.high} > {1.low}", "{0.low} <= {1.high}"),
-    ast.GtE: ("{0.high} >= {1.low}", "{0.low} < {1.high}"),
+_LOGIC: Final = (ast.Not, ast.And, ast.Or)
+_BOUNDS: Final[dict[Operation, tuple[str, str]]] = {
+    ast.Not: ("(NOT {0.high})", "(NOT {0.low})"),
+    ast.And: ("({0.low} AND {1.low})", "({0.high} AND {1.high} AND NULL)"),
+    ast.Or: ("({0.low} OR {1.low} OR NULL)", "({0.high} OR {1.high})"),
+    ast.Lt: ("({0.high} < {1.low})", "({0.low} < {1.high})"),
+    ast.LtE: ("({0.high} <= {1.low})", "({0.low} <= {1.high})"),
+    ast.Gt: ("({0.low} > {1.high})", "({0.high} > {1.low})"),
+    ast.GtE: ("({0.low} >= {1.high})", "({0.high} >= {1.low})"),
     ast.Eq: (
+        "({0.low} = {1.high} AND {0.high} = {1.low})",
         "({0.low} <= {1.high} AND {0.high} >= {1.low} AND NULL)",
-        "({0.low} <> {1.high} OR {0.high} <> {1.low})",
     ),
 }
-"""Over the index, whether a condition holds at some step, and whether it fails at some step."""
-
-
+"""Over the index, whether a condition holds at all steps of an episode, and whether it holds at some."""
+_OTHERS: Final = "a filter of runs can exclude it"
+_MAX_WITHIN: Final = 2**31 - 1
 _OF_STEPS: Final = re.compile(r"(?:min|count)\((?!.* == )(.*)\)|n_(.*)")
 """A column of the index for each column of steps, and for each event, which may be known without steps."""
 
@@ -63,11 +64,12 @@ class Facts:
     actions: Mapping[str, Sequence[str]]
     """The names of actions by number, by the column of steps."""
 
-    @property
-    def steps(self) -> list[str]:
-        """The columns of steps with numbers, flags and events."""
+    def columns(self, of_steps: bool) -> dict[str, str]:
+        """Return the columns of steps, or of episodes, by their names in expressions."""
         matches = map(_OF_STEPS.fullmatch, self.index)
-        return list(dict.fromkeys(match[1] or match[2] for match in matches if match))
+        steps = [match[1] or match[2] for match in matches if match]
+        columns = steps if of_steps else [name for name in self.index if "(" not in name and name != "phase"]
+        return {re.sub("^return(?=_|$)", "ret", spelt(column)): column for column in columns}
 
 
 def quoted(name: str) -> str:
@@ -75,18 +77,23 @@ def quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
+class NotInRun(RunnerError):
+    """A run does not have what an expression names; `reason` says so of it."""
+
+    def __init__(self, error: RunnerError, reason: str) -> None:
+        super().__init__(str(error))
+        self.reason = reason
+
+
 @dataclass(frozen=True)
 class Part(Term):
     """A part of a condition in SQL."""
 
     sql: str
-    some: str = "NULL"
-    """Over the index: whether a condition on steps holds at some step of the episode."""
-    fails: str = "NULL"
-    """Whether it fails at some step."""
     low: str = "NULL"
-    """Over the index: the least value of a number of steps."""
+    """Over the index: its least value at the steps of an episode; of a condition, whether it always holds."""
     high: str = "NULL"
+    """Its greatest value; of a condition, whether it holds at some step."""
     label: str = ""
     """What the index calls it."""
     value: float | str | None = None
@@ -135,42 +142,32 @@ class EpisodeParser(Parser[Part]):
     def __post_init__(self) -> None:
         super().__init__(self.given)
 
-    def sort_key(self) -> str:
-        """Return the number that the whole expression is, in SQL."""
-        try:
-            return self.number(ast.parse(self.text, mode="eval").body).sql
-        except SyntaxError as error:
-            raise self.syntax_error(error) from None
-
-    def fixed(self, value: float | str) -> Part:
-        """Return a constant; a text has no SQL."""
-        if isinstance(value, bool):
-            return Part(CONDITION, str(value), str(value), str(not value))
-        sql = "" if isinstance(value, str) else f"'{value!r}'::DOUBLE"
-        return Part(NUMBER if sql else TEXT, sql, low=sql, high=sql, label=repr(value), value=value)
+    def fixed(self, kind: str, value: float | str) -> Part:
+        """Return a constant; the SQL of a text is never used."""
+        sql = f"'{value!r}'::DOUBLE" if kind == NUMBER else repr(value)
+        return Part(kind, sql, sql, sql, repr(value), value)
 
     def applied(self, kind: str, operation: Operation, *parts: Part) -> Part:
         """Return an operation on one or two terms, and what the index knows of it."""
         left, right = parts[0], parts[-1]
         if operation is ast.USub and isinstance(left.value, int | float):
-            return self.fixed(-left.value)
-        part = Part(kind, self.operations[operation].format(*(part.sql for part in parts)))
-        if not self._is_inside or operation not in _AT_STEPS:
-            return part
-        some, fails = (text.format(*parts) for text in _AT_STEPS[operation])
-        if operation in (ast.Not, ast.And, ast.Or):
-            return replace(part, some=some, fails=fails)
-        part = replace(part, sql=f"coalesce({part.sql}, FALSE)")
-        if operation is ast.Eq:
-            part = self._flag(replace(part, label=f"{left.label} == {right.label}"))
-        is_known = part.some != "NULL" or left.value is right.value is None
-        return part if is_known else replace(part, some=some, fails=fails)
+            return self.fixed(kind, -left.value)
+        sql = self.operations[operation].format(*(part.sql for part in parts))
+        if not self._is_inside or operation not in _BOUNDS:
+            return Part(kind, sql)
+        low, high = (text.format(*parts) for text in _BOUNDS[operation])
+        if operation in _LOGIC:
+            return Part(kind, sql, low, high)
+        label = f"{left.label} == {right.label}" if operation is ast.Eq else ""
+        counted = self._flag(Part(kind, f"coalesce({sql}, FALSE)", label=label))
+        is_known = counted.high != "NULL" or left.value is right.value is None
+        return counted if is_known else replace(counted, low=low, high=high)
 
     def _flag(self, part: Part) -> Part:
         """Return a condition on steps, which the index may count."""
         if (count := self._column("count", part)) == "NULL":
             return part
-        return replace(part, some=f"({count} > 0)", fails=f"({count} < length)")
+        return replace(part, low=f"({count} >= length)", high=f"({count} > 0)")
 
     def _column(self, function: str, part: Part) -> str:
         """Return the column of the index with a function of steps; NULL if there is none."""
@@ -187,30 +184,34 @@ class EpisodeParser(Parser[Part]):
     def compared(self, node: ast.Compare, left: ast.expr, operator: type[ast.cmpop], right: ast.expr) -> Part:
         """Return the condition that compares two numbers, or an action with its name."""
         action, text = self.term(left), self.term(right)
-        names = self.facts.actions.get(action.label, ())
-        if text.kind != TEXT or operator is not ast.Eq or not names:
+        if text.kind != TEXT or operator is not ast.Eq or not re.match("action(_|$)", action.label):
             return super().compared(node, left, operator, right)
-        numbers = {spelt(name): k for k, name in enumerate(names)}
-        if (number := numbers.get(spelt(str(text.value)))) is None:
-            raise self.error(
-                right,
-                f"found {str(text.value)[:60]!r}, expected one of {len(names):,} actions, such as "
-                f"{names[0]!r}.{nearest(str(text.value), names)}",
-            )
-        return self.applied(CONDITION, ast.Eq, action, self.fixed(number))
+        names = self.facts.actions.get(action.label, ())
+        try:
+            if not names:
+                raise self.error(
+                    right, f"found {text.label}, expected a number, as its actions have no names."
+                )
+            number = self.numbered(right, names, "action")
+        except RunnerError as error:
+            raise NotInRun(error, f"it has no action {text.label}; {_OTHERS}.") from None
+        return self.applied(CONDITION, ast.Eq, action, self.fixed(NUMBER, number))
 
     def call(self, node: ast.Call, name: str) -> Part:
         """Return the term of a call: of abs(), or of a function of steps."""
         if name not in AGGREGATES:
             return super().call(node, name)
         within = "UNBOUNDED"
-        match name, node.keywords:
-            case "then", [ast.keyword(arg="within", value=ast.Constant(value=int() as steps))] if (
-                0 < steps < 2**31
-            ):
-                within = str(int(steps))
-            case _, [_, *_]:
-                raise self.error(node, f"expected {name}() without options; then() has within=STEPS, from 1.")
+        for option in node.keywords:
+            if (name, option.arg) != ("then", "within"):
+                raise self.error(node, f"expected {name}() without options; then() alone has within=STEPS.")
+            within = self.text_of(option.value)
+            if not (within.isdecimal() and 0 < int(within) <= _MAX_WITHIN):
+                raise self.error(
+                    option.value,
+                    f"found within={within}, expected a whole number of steps from 1; D comes after C in "
+                    "then(C, D), so C and D at one step are any(C and D).",
+                )
         if self._is_inside or len(node.args) != 1 + (name == "then"):
             raise self.error(
                 node,
@@ -234,31 +235,25 @@ class EpisodeParser(Parser[Part]):
 
     def named(self, node: ast.expr) -> Part:
         """Return the column that a node names: `next_observation[2]` is next_observation_2."""
-        text, facts = self.text_of(node)[:60], self.facts
-        name = re.sub("^ret(?=_|$)", "return", spelt(text))
-        plain = [column for column in facts.index if "(" not in column and column != "phase"]
-        of_steps = {spelt(column): column for column in facts.steps}
-        columns = of_steps if self._is_inside else {spelt(column): column for column in plain}
-        if self._is_inside and not columns:
-            raise self.error(node, f"found {text}, and the run has no steps")
-        if name not in columns:
-            hint = nearest(text, [*columns, *AGGREGATES])
-            if not self._is_inside and name in of_steps:
-                hint = f" Steps have it: any({text}), count({text})."
-            listed = (
-                ", ".join(columns) if self._is_inside else f"{', '.join(columns)}, any(), count(), then()"
+        text, columns = self.text_of(node)[:60], self.facts.columns(self._is_inside)
+        if (column := columns.get(spelt(text))) is None:
+            hint, more, reason = nearest(text, [*columns, *AGGREGATES]), "", f"no {text}; {_OTHERS}"
+            if not self._is_inside:
+                more = ", any(), count(), then()"
+                if spelt(text) in self.facts.columns(True):
+                    hint = f" Steps have it: any({text}), count({text})."
+            elif "t" not in columns:
+                more, reason = (
+                    ", as the run has no steps",
+                    "no steps; `dualtaxi rerecord` records those of jobs",
+                )
+            listed = f"{', '.join(columns)[:1000] or 'nothing'}{more}"
+            raise NotInRun(
+                self.error(node, f"found {text}, expected one of {listed}.{hint}"), f"it has {reason}."
             )
-            listed = re.sub(r"\breturn(?=_|\b)", "ret", listed)
-            raise self.error(node, f"found {text}, expected one of {listed[:1000]}.{hint}")
-        column = columns[name]
         part = Part(CONDITION if column in ENDS else NUMBER, quoted(column), label=column)
         if not self._is_inside:
             return part
-        if f"min({column})" in facts.index:
+        if f"min({column})" in self.facts.index:
             return replace(part, low=self._column("min", part), high=self._column("max", part))
         return self._flag(replace(part, kind=CONDITION))
-
-
-def spelt(name: str) -> str:
-    """Return a name in one spelling."""
-    return re.sub(r"(?:[^\w-]|_)+|(?<=\w)-(?=[a-z])", "_", name).strip("_")

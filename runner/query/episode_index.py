@@ -10,10 +10,12 @@ state, and of the facts in the file's metadata. An index of another state is not
 
 from __future__ import annotations
 
+import glob
 import json
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,9 +28,10 @@ from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.archive.columns import Shape
 from runner.archive.places import at_hand
-from runner.environments.naming import action_names, actions_in_words
+from runner.environments.naming import action_names
 from runner.errors import RecordingError
 from runner.query.conditions import ENDS, Facts, quoted
+from runner.query.sql import Database
 from runner.query.views import SelectedRuns
 from runner.recording.reader import Recording, open_recording
 from runner.runs.catalogue.columns import IndexRow
@@ -40,7 +43,7 @@ if TYPE_CHECKING:
     from runner.query.chunks import Relation
 
 MAX_FILES: Final = 20_000
-_VERSION: Final = 6
+_VERSION: Final = 7
 _PACKED: Final = 64
 """The files that a pack has in the mean."""
 _LEAST: Final = 8
@@ -61,11 +64,11 @@ _COUNTED: Final = "row_number() OVER (PARTITION BY phase, environment ORDER BY e
 
 
 class EpisodeIndex:
-    """The files of the index, made by a connection to DuckDB."""
+    """The files of the index, made by DuckDB."""
 
-    def __init__(self, connection: Any) -> None:
+    def __init__(self, database: Database) -> None:
         self.folder = cache_folder() / EPISODES
-        self._connection = connection
+        self._database = database
         with storage_errors(self.folder):
             (self.folder / "packs").mkdir(parents=True, exist_ok=True)
             written = self.folder.glob("[!.]*-*.parquet")  # a hidden one is being written by another search
@@ -86,7 +89,7 @@ class EpisodeIndex:
         path = Path(row["root"], row["entry"], name)
         with storage_errors(path):
             state = path.stat()
-        start = f"{row['id']}-{_hash(str(path))}"
+        start = f"{row['id']}-{_hash(path)}"
         stem = start + _hash([_VERSION, state.st_mtime_ns, state.st_size, state.st_ino])
         if stem not in self._files:
             for older in self._of_runs[start]:  # a search that reads it now begins again
@@ -101,39 +104,38 @@ class EpisodeIndex:
         remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
         remove_oldest(self.folder / "packs", "*.parquet", keep=MAX_FILES // _LEAST)
 
-    def packs(self, files: Set[Path]) -> Iterator[tuple[Path, list[Path]]]:
-        """Yield packs of files with the same facts, each with all files that are in it.
+    def packed(self, files: set[Path]) -> list[Path]:
+        """Return files with the same facts, or packs where these have many of them.
 
         The files, by their age, are cut where a name says so. Thus a pack is made once, and a new file, which
         comes last, changes none. It is named by its files and their times. Packs of other files are removed.
         """
-        kind, group = kind_of(next(iter(files))), list[tuple[int, str]]()
-        folder, kept = self.folder / "packs", set[Path]()
-        alike = [path for path in self._files.values() if kind_of(path) == kind]
-        for changed, path in sorted((path.stat().st_mtime_ns, str(path)) for path in alike):
-            group.append((changed, path))
-            if int(Path(path).stem[-2 * _HEX : -_HEX], 16) % _PACKED:
-                continue
-            packed, pack = [Path(path) for _, path in group], folder / f"{kind}-{_hash(group)}.parquet"
-            group.clear()
-            kept.add(pack)
-            if len(files & set(packed)) >= _LEAST:
+        kind, folder, chosen, loose = (
+            kind_of(next(iter(files))),
+            self.folder / "packs",
+            list[Path](),
+            set(files),
+        )
+        alike = sorted((p.stat().st_mtime_ns, p) for p in self._files.values() if kind_of(p) == kind)
+        cuts = [k for k, (_, p) in enumerate(alike, 1) if not int(p.stem[-2 * _HEX : -_HEX], 16) % _PACKED]
+        groups = [alike[start:stop] for start, stop in pairwise([0, *cuts])]
+        packs = {folder / f"{kind}-{_hash(group)}.parquet": [path for _, path in group] for group in groups}
+        for pack, packed in packs.items():
+            if len(files.intersection(packed)) >= _LEAST:
                 self.read.update(packed)
                 if not pack.exists():
-                    self._pack(packed, pack)
+                    self._write(pack, f"FROM {in_files(packed)}", "ROW_GROUP_SIZE 30720")
                 self.read.add(pack)
-                yield pack, packed
-        for other in folder.glob(f"{kind}-*"):
-            if other not in kept:
-                other.unlink(missing_ok=True)
+                chosen.append(pack)
+                loose.difference_update(packed)
+        for other in set(folder.glob(f"{kind}-*")) - packs.keys():
+            other.unlink(missing_ok=True)
+        return [*chosen, *loose]
 
-    def _pack(self, files: Sequence[Path], pack: Path) -> None:
-        with storage_errors(pack), replacing(pack) as fresh:
-            self._connection.execute(
-                "COPY (SELECT file_index::BIGINT AS part, file_row_number AS row, * FROM "
-                f"read_parquet([{', '.join(literal(str(path)) for path in files)}])) TO "
-                f"{literal(str(fresh))} (FORMAT parquet, COMPRESSION zstd, ROW_GROUP_SIZE 30720)"
-            )
+    def _write(self, path: Path, rows: str, options: str) -> None:
+        with storage_errors(path), replacing(path) as fresh:
+            options = f"FORMAT parquet, COMPRESSION zstd, {options}"
+            self._database.rows(f"COPY ({rows}) TO {literal(fresh)} ({options})")
 
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""
@@ -149,35 +151,27 @@ class EpisodeIndex:
             shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
             actions = _names_of_actions(shape, recording)
-        self._connection.register("episodes", episodes)
-        self._connection.register("evaluations", evaluations)
-        steps = register_steps(
-            self._connection, own_steps, runs.table("extras", [row]) if shape.extras else None
-        )
-        episodes = episodes.schema
-        plain = [name for name in episodes.names if name in _PLAIN or name.startswith(("return_", "n_"))]
+        connection = self._database.connection
+        connection.register("episodes", episodes)
+        connection.register("evaluations", evaluations)
+        steps = register_steps(connection, own_steps, runs.table("extras", [row]) if shape.extras else None)
+        columns = episodes.schema
+        plain = [name for name in columns.names if name in _PLAIN or name.startswith(("return_", "n_"))]
         if shape.mdp is not None and shape.mdp.success_events:
             plain.append("success")
-        environment, own = ("environment", _COUNTED) if "environment" in episodes.names else ("0", "episode")
-        numbers = {column.name for column in episodes if pa.types.is_floating(column.type)}
-        columns = ", ".join(
-            f"nullif({quoted(name)}, 'NaN') AS {quoted(name)}" if name in numbers else quoted(name)
-            for name in plain
-        )
+        environment, own = ("environment", _COUNTED) if "environment" in columns.names else ("0", "episode")
+        named = cleaned(map(columns.field, plain))
         rows = (
-            f"SELECT {columns}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
+            f"SELECT {_number(stem)} AS file, row_number() OVER (ORDER BY phase DESC, episode) AS row, "
+            f"{named}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
             "ASOF LEFT JOIN evaluations ON episode >= start"
         )
         if aggregates := _aggregates(shape, steps):
-            rows = with_steps(rows, steps, aggregates, {})
+            rows = with_steps(rows, aggregates, {})
         facts = json.dumps(asdict(Facts([*plain, *aggregates], actions)))
         path = self.folder / f"{stem}{_hash(facts)}.parquet"
-        with storage_errors(path), replacing(path) as fresh:
-            self._connection.execute(
-                f"COPY (FROM ({rows}) ORDER BY phase DESC, episode) TO {literal(str(fresh))} "
-                f"(FORMAT parquet, COMPRESSION zstd, KV_METADATA {{facts: {literal(facts)}}})"
-            )
-            _check(row, runs)
+        self._write(path, f"FROM ({rows}) ORDER BY row", f"KV_METADATA {{facts: {literal(facts)}}}")
+        _check(row, runs)
         return path
 
 
@@ -185,6 +179,15 @@ def _check(row: IndexRow, runs: SelectedRuns) -> None:
     """Raise the error for which a run was left out."""
     for sentence in runs.left_out.get(row["id"], {}).values():
         raise RecordingError(sentence)
+
+
+def number_of(path: Path) -> int:
+    """Return the number of an index in its rows."""
+    return _number(path.stem[:-_HEX])
+
+
+def _number(stem: str) -> int:
+    return int(_hash(stem), 16) >> 1
 
 
 def kind_of(path: Path) -> str:
@@ -197,65 +200,72 @@ def facts_of(path: Path) -> Facts:
     return Facts(**json.loads(pq.read_schema(path).metadata[b"facts"]))
 
 
+def cleaned(columns: Iterable[pa.Field]) -> str:
+    """Return SQL for columns: NaN is NULL, and a flag that is missing is false."""
+    texts = []
+    for column in columns:
+        name = text = quoted(column.name)
+        if pa.types.is_floating(column.type):
+            text = f"nullif({name}, 'NaN')"
+        elif pa.types.is_boolean(column.type):
+            text = f"coalesce({name}, FALSE)"
+        texts.append(f"{text} AS {name}")
+    return ", ".join(texts)
+
+
 def register_steps(connection: Any, steps: Relation, extras: Relation | None) -> pa.Schema:
     """Register the view `steps` with columns for extras, and return its columns.
 
     An extra that a step lacks is NULL, a flag false.
     """
     connection.register("own_steps", steps)
-    joined, columns, more = "", "own_steps.*", []
+    columns, joined = list(steps.schema), ""
     if extras is not None and "step" in steps.schema.names:
         connection.register("extras", extras)
-        joined = "LEFT JOIN extras USING (phase, step)"
-        more = [column for column in extras.schema if column.name.startswith(layout.EXTRA_PREFIX)]
-        for column in more:
-            name = f"extras.{quoted(column.name)}"
-            if pa.types.is_boolean(column.type):
-                name = f"coalesce({name}, FALSE) AS {quoted(column.name)}"
-            columns += f", {name}"
-    connection.execute(f"CREATE OR REPLACE TEMP VIEW steps AS SELECT {columns} FROM own_steps {joined}")
-    return pa.schema([*steps.schema, *more])
+        named = f"SELECT phase, step, COLUMNS('^{layout.EXTRA_PREFIX}') FROM extras"
+        joined = f"LEFT JOIN ({named}) USING (phase, step)"
+        columns += [column for column in extras.schema if column.name.startswith(layout.EXTRA_PREFIX)]
+    environment = "" if "environment" in steps.schema.names else ", 0 AS environment"
+    selected = f"SELECT {cleaned(columns)}{environment} FROM own_steps {joined}"
+    connection.execute(f"CREATE OR REPLACE TEMP VIEW steps AS {selected}")
+    return pa.schema(columns)
 
 
 def with_steps(
-    chosen: str,
-    steps: pa.Schema,
-    aggregates: Mapping[str, str],
-    windows: Mapping[str, str],
-    among: str = "TRUE",
+    chosen: str, aggregates: Mapping[str, str], windows: Mapping[str, str], among: str = "TRUE"
 ) -> str:
     """Return SQL for episodes and aggregates of their steps, which are NULL where steps were lost.
 
     Args:
         chosen: SQL for the episodes.
-        steps: the columns of the view `steps`. NaN in them is NULL.
         aggregates: the SQL of each, by name.
         windows: columns of steps that these need, the SQL of each by name.
         among: a condition on the steps to read.
     """
-    numbers = [quoted(one.name) for one in steps if pa.types.is_floating(one.type)]  # rewards, at least
-    replaced = ", ".join(f"nullif({name}, 'NaN') AS {name}" for name in numbers)
-    environment = "" if "environment" in steps.names else ", 0 AS environment"
     more, parts = (
         "".join(f", {sql} AS {quoted(name)}" for name, sql in named.items())
         for named in (windows, aggregates)
     )
-    read = f"SELECT * REPLACE ({replaced}){environment} FROM steps WHERE {among}"
     return (
         f"SELECT chosen.*, s.* EXCLUDE (of, turn, own, n) FROM ({chosen}) chosen LEFT JOIN "
         f"(SELECT phase AS of, environment AS turn, episode AS own, count(*) AS n{parts} "
-        f"FROM (SELECT *{more} FROM ({read})) GROUP BY ALL) s "
+        f"FROM (SELECT *{more} FROM steps WHERE {among}) GROUP BY ALL) s "
         "ON of = phase AND turn = environment AND s.own = chosen.own AND n = length"
     )
 
 
-def literal(text: str) -> str:
+def literal(text: object) -> str:
     """Return a text in SQL."""
-    return "'" + text.replace("'", "''") + "'"
+    return "'" + str(text).replace("'", "''") + "'"
+
+
+def in_files(paths: Iterable[Path], options: str = "") -> str:
+    """Return SQL for the rows of files of Parquet."""
+    return f"read_parquet([{', '.join(literal(glob.escape(str(path))) for path in paths)}]{options})"
 
 
 def _hash(value: object) -> str:
-    return blake3(json.dumps(value).encode()).hexdigest()[:_HEX]
+    return blake3(json.dumps(value, default=str).encode()).hexdigest()[:_HEX]
 
 
 def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
@@ -276,15 +286,14 @@ def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
     }
 
 
-def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, list[str]]:
+def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, Sequence[str]]:
     """Return the names of actions by number, by the column of steps."""
-    if shape.mdp is None or (names := action_names(shape.mdp)) is None:
-        named = {}
-        space = recording.spaces.get("action", {})
-        for agent, part in (space["spaces"] if len(recording.agents) > 1 else {"": space}).items():
-            if recording.has_states or not part.get("start"):  # names are by number from 0
-                column = "_".join(filter(None, ("action", agent.replace(".", "_"))))
-                named[column] = list(recording.train.action_names(agent))
-        return named
-    own = dict(zip(shape.own_actions, names, strict=False))
-    return {"action": list(actions_in_words(shape.mdp))} | own
+    train, space, agents = recording.train, recording.spaces.get("action", {}), recording.agents
+    if shape.mdp is not None:
+        own = zip(shape.own_actions, action_names(shape.mdp) or (), strict=False)
+        return {"action": train.action_names(), **dict(own)}
+    return {
+        "_".join(filter(None, ("action", agent.replace(".", "_")))): train.action_names(agent)
+        for agent, part in (space["spaces"] if len(agents) > 1 else {"": space}).items()
+        if recording.has_states or not part.get("start")  # names are by number from 0
+    }

@@ -11,31 +11,38 @@ does not decide. `runner.query.conditions` has the language.
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
-
-import pyarrow as pa
-import pyarrow.parquet as pq
+from typing import Final
 
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.marking import mark_steps
 from runner.analysis.sections import Grid
 from runner.errors import RunnerError
-from runner.query.conditions import ENDS, EpisodeParser, Facts
-from runner.query.episode_index import EpisodeIndex, facts_of, kind_of, literal, register_steps, with_steps
-from runner.query.sql import MEMORY_MB, SETTINGS
+from runner.query.conditions import ENDS, EpisodeParser, Facts, NotInRun
+from runner.query.episode_index import (
+    EpisodeIndex,
+    facts_of,
+    in_files,
+    kind_of,
+    literal,
+    number_of,
+    register_steps,
+    with_steps,
+)
+from runner.query.sql import MEMORY_MB, Database, QueryFailed
 from runner.query.views import SelectedRuns
 from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
 from runner.runs.listing import listed_run
 from runner.runs.run import recordings_folder
-from runner.util.extras import require
+from runner.util.expressions import NUMBER
 from runner.util.humanize import UNKNOWN, counted
 from runner.util.processes import Tell
 from runner.util.values import Json, is_whole
@@ -51,6 +58,7 @@ _MOST_EVENTS: Final = 3
 _MAX_LISTED: Final = 2_000
 """The most episodes whose steps are asked for one by one."""
 _OPEN: Final = {"enable_external_access": "true"}
+"""Until the folder that may be read is set."""
 
 
 @dataclass(frozen=True)
@@ -202,26 +210,17 @@ def _answer(
     runs: SelectedRuns, memory: int, question: tuple[str, str | None, str], expression: str, limit: int | None
 ) -> Found:
     search = _Search(runs, memory)
-    with contextlib.closing(search.connection):
+    with contextlib.closing(search.database):
         try:
             search.take(*question)
             return search.found(expression, limit)
-        except KeyboardInterrupt as interrupt:
-            interrupt.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
-            raise
-        except search.errors as error:
-            if "KeyboardInterrupt" in str(error):  # Python raised it while it gave DuckDB rows
-                interrupted = KeyboardInterrupt()
-                interrupted.add_note(f"Interrupted; {search.runs}; {len(search.files):,} were indexed.")
-                raise interrupted from None
+        except QueryFailed as error:
             if not all(path.exists() for path in search.index.read):
-                raise FileNotFoundError(str(error)) from error
-            if "Out of Memory" in str(error):
-                raise RunnerError(f"find: needs more than {memory:,} MB of memory.") from error
+                raise FileNotFoundError from error
             for path in search.index.read:
                 path.unlink(missing_ok=True)
             raise RunnerError(
-                f"find: {error}\nThe index of these runs was removed: the next search makes it again."
+                f"{error}\nThe index of these runs was removed: the next search makes it again."
             ) from error
 
 
@@ -233,18 +232,18 @@ class _Search:
     """A search in some runs."""
 
     def __init__(self, runs: SelectedRuns, memory: int) -> None:
-        duckdb = require("duckdb", extra="sql", purpose="`find`")
-        self.errors = (duckdb.Error, pa.ArrowException)
         self.runs = runs
-        self.connection = duckdb.connect(
-            ":memory:", config=SETTINGS | {"memory_limit": f"{memory}MB"} | _OPEN
-        )
-        self.index = EpisodeIndex(self.connection)
-        self._sql(f"SET allowed_directories = [{literal(str(self.index.folder))}]")
-        self._sql(f"SET temp_directory = {literal(str(self.index.folder / 'spilled'))}")
-        self._sql(f"SET max_temp_directory_size = '{_MAX_SPILLED}'")
-        self._sql("SET enable_external_access = false")
-        self._sql("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
+        self.database = Database("find", runs, memory, settings=_OPEN)
+        self.index = EpisodeIndex(self.database)
+        folder = str(self.index.folder)
+        for name, value in {
+            "allowed_directories": f"[{literal(folder)}, {literal(glob.escape(folder))}]",
+            "temp_directory": literal(self.index.folder / "spilled"),
+            "max_temp_directory_size": literal(_MAX_SPILLED),
+            "enable_external_access": "false",
+        }.items():
+            self.database.rows(f"SET {name} = {value}")
+        self.database.rows("CREATE TABLE hits (run INTEGER, row INTEGER, key DOUBLE, is_open BOOLEAN)")
         self.files: dict[int, Path] = {}
         """The indexes of runs, by the number of the row."""
 
@@ -260,18 +259,22 @@ class _Search:
                 self.files[k] = self.index.file(row, self.runs)
                 kinds.setdefault(kind_of(self.files[k]), []).append(k)
             except RunnerError as error:
-                if not self.runs.left_out.get(row["id"]):
-                    self.runs.leave_out("find", row, error)
+                self.runs.left_out[row["id"]] = {"find": str(error)}
         self.index.trim()
+        self.database.rows(
+            "CREATE TABLE runs AS SELECT unnest($files) AS file, unnest($runs) AS run",
+            {"files": list(map(number_of, self.files.values())), "runs": list(self.files)},
+        )
         wrong = []
         for numbers in kinds.values():
-            facts = facts_of(self.files[numbers[0]])
+            facts = self.database.call(facts_of, self.files[numbers[0]])
             try:
                 first, second = (_parsed(facts, condition, sort, reads) for reads in (False, True))
             except RunnerError as error:
                 wrong.append(error)
+                reason = error.reason if isinstance(error, NotInRun) else str(error).partition("\n")[0]
                 for k in numbers:
-                    self.runs.leave_out("find", self.runs.rows[k], error)
+                    self.runs.leave_out("find", self.runs.rows[k], reason)
             else:
                 self._ask(numbers, first, second, f" AND phase = '{phase}'" if phase else "")
         if wrong and len(wrong) == len(kinds):
@@ -281,102 +284,76 @@ class _Search:
         """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
         where, key, aggregates, _ = first
         is_open = f"{where} IS NULL OR {key} IS NULL" if aggregates else "FALSE"
-        runs = {self.files[k]: k for k in numbers}
-        packs = list(self.index.packs(runs.keys()))
-        loose = runs.keys() - {path for _, packed in packs for path in packed}
-        for files, part, row in (
-            ([(path, [path]) for path in loose], "0", "file_row_number"),
-            (packs, "part", "row"),
-        ):
-            parts = [
-                (file, member, runs[path])
-                for file, (_, packed) in enumerate(files)
-                for member, path in enumerate(packed)
-                if path in runs
-            ]
-            if parts:
-                self._sql(
-                    f"INSERT INTO hits SELECT run, {row}, {key}, {is_open} FROM read_parquet($files) "
-                    "JOIN (SELECT unnest($of) AS of, unnest($members) AS member, unnest($runs) AS run) "
-                    f"ON of = file_index AND member = {part} "
-                    f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}",
-                    {"files": [str(path) for path, _ in files]}
-                    | dict(zip(("of", "members", "runs"), map(list, zip(*parts, strict=True)), strict=True)),
-                )
-        opened = self._sql("SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run")
-        for (k,) in opened:
+        files = in_files(self.index.packed({self.files[k] for k in numbers}))
+        self.database.rows(
+            f"INSERT INTO hits SELECT run, row, {key}, {is_open} FROM {files} JOIN runs USING (file) "
+            f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}"
+        )
+        for (k,) in self.database.rows("SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run"):
             with self.runs.reading("find", self.runs.rows[k]):
                 self._read(k, *second)
-        self._sql("DELETE FROM hits WHERE is_open")
+        self.database.rows("DELETE FROM hits WHERE is_open")
 
     def _read(
         self, k: int, where: str, key: str, aggregates: dict[str, str], windows: dict[str, str]
     ) -> None:
         """Add those of the open episodes of a run that match by their steps."""
-        row, path = self.runs.rows[k], literal(str(self.files[k]))
+        row = self.runs.rows[k]
         chosen = (
-            f"SELECT * FROM read_parquet({path}) JOIN (SELECT row FROM hits WHERE is_open AND run = {k}) "
-            "ON row = file_row_number"
+            f"SELECT * FROM {in_files([self.files[k]])} "
+            f"JOIN (SELECT row FROM hits WHERE is_open AND run = {k}) USING (row)"
         )
-        ends = "min(first_step), max(last_step), list(DISTINCT episode)"
-        ((low, high, episodes),) = self._sql(f"SELECT {ends} FROM ({chosen})")
+        ends = "min(first_step), max(last_step), list(DISTINCT own)"
+        ((low, high, episodes),) = self.database.rows(f"SELECT {ends} FROM ({chosen})")
         steps = self.runs.table("steps", [row])
         if "step" not in steps.schema.names:
             return  # it is left out
         among = f"step BETWEEN {low} AND {high}"
-        if "environment" not in steps.schema.names and len(episodes) <= _MAX_LISTED:
+        if len(episodes) <= _MAX_LISTED:
             among += f" AND episode IN ({', '.join(map(str, episodes))})"
         needs_extras = any('"extra_' in sql for sql in (*aggregates.values(), *windows.values()))
-        extras = self.runs.table("extras", [row]) if needs_extras else None
-        columns = register_steps(self.connection, steps, extras)
-        rows = with_steps(chosen, columns, aggregates, windows, among)
-        self._sql(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM ({rows}) WHERE {where}")
+        register_steps(
+            self.database.connection, steps, self.runs.table("extras", [row]) if needs_extras else None
+        )
+        rows = with_steps(chosen, aggregates, windows, among)
+        self.database.rows(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM ({rows}) WHERE {where}")
 
     def found(self, expression: str, limit: int | None) -> Found:
         """Return the first episodes, as they are sorted."""
         searched = [k for k, row in enumerate(self.runs.rows) if not self.runs.left_out.get(row["id"])]
-        self._sql("DELETE FROM hits WHERE run NOT IN (SELECT unnest($runs))", {"runs": searched})
-        ((count,),) = self._sql("SELECT count(*) FROM hits")
-        first = "SELECT run, row FROM hits ORDER BY key NULLS LAST, run, row LIMIT $limit"
-        places = self._sql(first, {"limit": count if limit is None else limit})
-        by_run = defaultdict[int, list[int]](list)
-        for k, row in places:
-            by_run[k].append(row)
-        hits_by_place: dict[tuple[int, int], Hit] = {}
-        for k, wanted in by_run.items():
-            with pq.ParquetFile(self.files[k]) as file:
-                plain = [name for name in file.schema_arrow.names if "(" not in name]
-                values = file.read(plain, use_threads=False).take(wanted).to_pylist()
-            run = self.runs.rows[k]
-            marks = read_marks(Path(run["root"], run["entry"])).marks
-            hits_by_place |= {
-                (k, row): _hit(run, of_row, marks) for row, of_row in zip(wanted, values, strict=True)
-            }
-        hits = [hits_by_place[k, row] for k, row in places]
-        folders = {
-            row["id"]: Path(row["root"], row["entry"]) for row in map(self.runs.rows.__getitem__, by_run)
-        }
-        return Found(expression, hits, count, len(searched), self.runs.sentences, folders)
-
-    def _sql(self, query: str, values: Mapping[str, object] | None = None) -> list[Any]:
-        rows: list[Any] = self.connection.execute(query, values).fetchall()
-        return rows
+        self.database.rows("DELETE FROM hits WHERE run NOT IN (SELECT unnest($runs))", {"runs": searched})
+        ((count,),) = self.database.rows("SELECT count(*) FROM hits")
+        order = "ORDER BY key NULLS LAST, first.run, first.row"
+        wanted = {"limit": count if limit is None else limit}
+        self.database.rows(f"CREATE TABLE first AS FROM hits AS first {order} LIMIT $limit", wanted)
+        runs = {k: self.runs.rows[k] for (k,) in self.database.rows("SELECT DISTINCT run FROM first")}
+        folders = {k: Path(run["root"], run["entry"]) for k, run in runs.items()}
+        marks = {k: read_marks(folder).marks for k, folder in folders.items()}
+        hits = []
+        if runs:
+            files = in_files((self.files[k] for k in runs), ", union_by_name = TRUE")
+            joined = f"first JOIN runs USING (run) JOIN {files} USING (file, row)"
+            query = f"SELECT COLUMNS('^[^(]*$') FROM {joined} {order}"
+            table = self.database.call(lambda: self.database.connection.sql(query).to_arrow_table())
+            hits = [_hit(runs[row["run"]], row, marks[row["run"]]) for row in table.to_pylist()]
+        by_id = {runs[k]["id"]: folder for k, folder in folders.items()}
+        return Found(expression, hits, count, len(searched), self.runs.sentences, by_id)
 
 
 def _hit(run: IndexRow, row: Json, marks: Sequence[Mark]) -> Hit:
     """Return the episode of a row in the index of a run, which has these marks."""
     return Hit(
-        run_id=run["id"],
-        name=run["name"],
-        at=row["at"],
-        phase=row["phase"],
-        episode=row["episode"],
-        replay=f"/runs/{run['id']}/replay/{EpisodeRef.parse(row['at']).episode_path}",
-        ret=row["return"],
-        length=row["length"],
-        ended=next((name for name in ENDS if row.get(name)), "reset"),
-        events={name[2:]: n for name, n in row.items() if name.startswith("n_") and n},
-        marks=[mark.text for mark in marks if (mark.phase, mark.episode) == (row["phase"], row["episode"])],
+        run["id"],
+        run["name"],
+        row["at"],
+        row["phase"],
+        row["episode"],
+        row["return"],
+        row["length"],
+        next((name for name in ENDS if row.get(name)), "reset"),
+        {name[2:]: n for name, n in row.items() if name.startswith("n_") and n},
+        [mark.text for mark in marks if (mark.phase, mark.episode) == (row["phase"], row["episode"])],
+        f"/runs/{run['id']}/replay/{EpisodeRef.parse(row['at']).episode_path}",
     )
 
 
@@ -384,5 +361,6 @@ def _parsed(facts: Facts, condition: str, sort: str, reads_steps: bool) -> _Ques
     parser = EpisodeParser(condition, facts, reads_steps)
     where, key = parser.whole().sql, "0"
     if sort:
-        key = EpisodeParser(sort, facts, reads_steps, parser.aggregates, parser.windows).sort_key()
+        sorting = EpisodeParser(sort, facts, reads_steps, parser.aggregates, parser.windows)
+        key = sorting.whole(NUMBER).sql
     return f"({where})", f"({key})::DOUBLE", parser.aggregates, parser.windows

@@ -11,7 +11,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 MEMORY_MB: Final = 500
 _ROWS: Final = 1 << 14
-SETTINGS: Final = {
-    "enable_external_access": "false",
+_CLOSED: Final = {"enable_external_access": "false"}
+_SETTINGS: Final = {
     "autoload_known_extensions": "false",
     "autoinstall_known_extensions": "false",
     "allow_community_extensions": "false",
@@ -46,18 +46,79 @@ _WHOLE: Final = pa.decimal128(38, 0)
 """The type in which DuckDB returns sums of whole numbers."""
 
 
+class QueryFailed(RunnerError):
+    """DuckDB refuses a query, or cannot answer it."""
+
+
+class Database:
+    """A connection to DuckDB, with limits; an error says how far a query has read.
+
+    Args:
+        name: the command, for errors.
+        runs: the runs that are read.
+        memory: the megabytes that DuckDB may use.
+        seconds: the time after which a call is stopped; unlimited by default.
+        settings: further settings of DuckDB.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        runs: SelectedRuns,
+        memory: int,
+        seconds: float | None = None,
+        settings: Mapping[str, str] = _CLOSED,
+    ) -> None:
+        duckdb = require("duckdb", extra="sql", purpose=f"`{name}`")
+        self._errors = (duckdb.Error, pa.ArrowException, RuntimeError)
+        self._name, self._runs, self._seconds, self._memory = name, runs, seconds, memory
+        self._deadline = time.monotonic() + (seconds or threading.TIMEOUT_MAX)
+        config = {**_SETTINGS, **settings, "memory_limit": f"{memory}MB"}
+        self.connection = duckdb.connect(":memory:", config=config)
+        self._thread = ThreadPoolExecutor(1, name)  # as nothing interrupts a call of DuckDB in this one
+
+    def call(self, function: Callable[..., Any], *args: object) -> Any:
+        """Return what a function that uses DuckDB or Arrow returns, within the limits.
+
+        Raises:
+            QueryFailed: it fails.
+            RunnerError: it exceeds its time or memory.
+        """
+        future = self._thread.submit(function, *args)
+        try:
+            return future.result(max(self._deadline - time.monotonic(), 0))
+        except KeyboardInterrupt as interrupt:
+            interrupt.add_note(f"Interrupted; {self._runs}.")
+            raise
+        except TimeoutError:
+            raise RunnerError(f"{self._name}: stopped after {self._seconds:g} s; {self._runs}.") from None
+        except self._errors as error:
+            message = str(error).removeprefix("Error: ").strip()
+            if "Out of Memory" in message:
+                limit = f"needs more than {self._memory:,} MB of memory, and was stopped"
+                raise RunnerError(f"{self._name}: {limit}; {self._runs}.") from error
+            raise QueryFailed(f"{self._name}: {message}") from error
+
+    def rows(self, query: str, values: Mapping[str, object] | None = None) -> list[Any]:
+        """Return the rows of a query; errors as for `call`."""
+        rows: list[Any] = self.call(lambda: self.connection.execute(query, values).fetchall())
+        return rows
+
+    def close(self) -> None:
+        """End the query."""
+        self._runs.is_stopped = True
+        self.connection.interrupt()
+        self._thread.shutdown()
+        self.connection.close()
+
+
 class QueryResult:
     """The rows of a query, which are read once: as batches, a table, or a frame."""
 
     def __init__(self, query: str, runs: SelectedRuns, seconds: float | None, memory: int) -> None:
-        duckdb = require("duckdb", extra="sql", purpose="SQL")
-        self._errors = (duckdb.Error, pa.ArrowException, RuntimeError)
-        self._runs, self._seconds, self._memory = runs, seconds, memory
-        self._deadline = time.monotonic() + (seconds or threading.TIMEOUT_MAX)
-        self._connection = duckdb.connect(":memory:", config=SETTINGS | {"memory_limit": f"{memory}MB"})
-        self._thread = ThreadPoolExecutor(1, "sql")  # as nothing interrupts a call of DuckDB in this one
+        self._runs, self._database = runs, Database("sql", runs, memory, seconds)
         try:
-            self._reader = self._call(self._begin, query)
+            self._reader = self._database.call(self._begin, query)
         except BaseException:
             self.close()
             raise
@@ -68,15 +129,16 @@ class QueryResult:
         self.columns = pa.schema(columns)
 
     def _begin(self, query: str) -> pa.RecordBatchReader:
-        kinds = [statement.type.name for statement in self._connection.extract_statements(query)]
+        connection = self._database.connection
+        kinds = [statement.type.name for statement in connection.extract_statements(query)]
         if kinds != ["SELECT"]:
             raise RunnerError(f"sql: found {', '.join(kinds) or 'nothing'}, expected one SELECT.")
         for name in VIEWS:
             is_named = name in query.casefold()
             view = self._runs.view(name) if is_named else pa.table({"run": pa.array([], pa.string())})
-            self._connection.register(name, view)
-        self._connection.execute("SET lock_configuration = true")
-        return self._connection.sql(query).to_arrow_reader(_ROWS)
+            connection.register(name, view)
+        connection.execute("SET lock_configuration = true")
+        return connection.sql(query).to_arrow_reader(_ROWS)
 
     @property
     def left_out(self) -> list[str]:
@@ -90,8 +152,8 @@ class QueryResult:
             RunnerError: the query fails, or exceeds its time or memory.
         """
         with contextlib.closing(self):
-            while (batch := self._call(next, self._reader, None)) is not None:
-                yield self._call(batch.cast, self.columns)
+            while (batch := self._database.call(next, self._reader, None)) is not None:
+                yield self._database.call(batch.cast, self.columns)
 
     def rows(self) -> Generator[list[object], None, None]:
         """Yield the rows one by one, their values as JSON can hold them; errors as for `batches`."""
@@ -125,26 +187,7 @@ class QueryResult:
 
     def close(self) -> None:
         """End the query."""
-        self._runs.is_stopped = True
-        self._connection.interrupt()
-        self._thread.shutdown()
-        self._connection.close()
-
-    def _call(self, function: Callable[..., Any], *args: object) -> Any:
-        """Return what a function returns, within the limits."""
-        future = self._thread.submit(function, *args)
-        try:
-            return future.result(max(self._deadline - time.monotonic(), 0))
-        except KeyboardInterrupt as interrupt:
-            interrupt.add_note(f"Interrupted; {self._runs}.")
-            raise
-        except TimeoutError:
-            raise RunnerError(f"sql: stopped after {self._seconds:g} s; {self._runs}.") from None
-        except self._errors as error:
-            message = str(error).removeprefix("Error: ").strip()
-            if "Out of Memory" in message:
-                message = f"needs more than {self._memory:,} MB of memory, and was stopped; {self._runs}."
-            raise RunnerError(f"sql: {message}") from error
+        self._database.close()
 
 
 def _as_json(value: Any) -> Any:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from functools import partial
@@ -31,6 +32,7 @@ from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
 from runner.runs.listing import listed_run
 from runner.runs.run import Run
+from runner.util.humanize import listed
 from runner.util.processes import Tell
 from runner.util.values import flatten
 
@@ -72,7 +74,7 @@ class SelectedRuns:
         self._read_runs: set[str] = set()
         self._read_rows = 0
         self.left_out: dict[str, dict[str, str]] = {}
-        """Sentences on runs that are left out, or the rest of them, by their id and the view."""
+        """Why runs are left out, or the rest of them, by their id and the view."""
         self.is_stopped = False
         """Set to make the query end before it reads another chunk or run."""
 
@@ -82,8 +84,17 @@ class SelectedRuns:
 
     @property
     def sentences(self) -> list[str]:
-        """Sentences on the runs that are left out."""
-        return [sentence for reasons in self.left_out.values() for sentence in reasons.values()]
+        """Sentences on the runs that are left out, one for each view and reason."""
+        runs = defaultdict[tuple[str, str], list[str]](list)
+        for run_id, reasons in self.left_out.items():
+            for reason in reasons.items():
+                runs[reason].append(run_id)
+        return [
+            f"run {ids[0]} is left out of {view}: {reason}"
+            if len(ids) == 1
+            else f"{len(ids):,} runs are left out of {view} ({listed(ids)}): each because {reason}"
+            for (view, reason), ids in runs.items()
+        ]
 
     def view(self, name: str) -> pa.Table | Relation:
         """Return a view."""
@@ -99,12 +110,11 @@ class SelectedRuns:
         try:
             yield listed_run(Path(row["root"], row["entry"]), row["id"])
         except RunnerError as error:
-            self.leave_out(name, row, error)
+            self.leave_out(name, row, str(error))
 
-    def leave_out(self, name: str, row: IndexRow, error: RunnerError) -> None:
+    def leave_out(self, name: str, row: IndexRow, reason: str) -> None:
         """Leave a run out of a view, or of `find`."""
-        reasons = self.left_out.setdefault(row["id"], {})
-        reasons[name] = f"run {row['id']} is left out of {name}: {error}"
+        self.left_out.setdefault(row["id"], {})[name] = reason
 
     def _count(self, row: IndexRow, rows: int) -> None:
         if self.is_stopped:
@@ -206,31 +216,23 @@ def _batches_of(
     tables: RunTables, file: str, own_names: Mapping[str, str], needed: pa.Schema, condition: Condition
 ) -> Iterator[pa.RecordBatch]:
     table = tables.shape.tables[file]
-    names = [own_names[name] for name in needed.names]
+    names, run_id = [own_names[name] for name in needed.names], pa.scalar(tables.shape.run_id)
     stored = [name for name in names if name in table.columns.names]
-    masks = tables.shape.event_masks if file == layout.STEPS else {}
-    masks = {name: masks[name] for name in names if name in masks and name not in stored}
+    masks = {name: mask for name, mask in tables.shape.event_masks.items() if name in names}
     of_events = _columns_of_events(tables.shape) if masks else []
     is_turn = ["taken"] if "taken" in table.columns.names else []  # else it is no step of its environment
-    for chunks in tables.chunks(table, condition):
-        read = list(dict.fromkeys([*stored, *is_turn, *of_events])) or ["position"]  # to count the rows
-        for batch in chunks.read(condition.may_hold(chunks.known), read):
-            rows = batch.filter(batch["taken"]) if is_turn else batch
-            own = {name: rows[name] for name in stored}
-            if masks:
-                events = _events_of(tables.shape, rows)
-                own |= {name: pa.array(events & mask != 0) for name, mask in masks.items()}
-            values = [
-                own[own_names[column.name]].cast(column.type)
-                if own_names[column.name] in own
-                else pa.nulls(rows.num_rows, column.type)
-                for column in needed
-                if column.name != "run"
-            ]
-            if "run" in needed.names:
-                run = pa.repeat(pa.scalar(tables.shape.run_id), rows.num_rows)
-                values.insert(needed.get_field_index("run"), run)
-            yield pa.RecordBatch.from_arrays(values, schema=needed)
+    read = list(dict.fromkeys([*stored, *is_turn, *of_events])) or ["position"]  # to count the rows
+    for batch in tables.batches(table, condition, read):
+        rows = batch.filter(batch["taken"]) if is_turn else batch
+        own = {name: rows[name] for name in stored} | {"run": pa.repeat(run_id, rows.num_rows)}
+        if masks:
+            events = _events_of(tables.shape, rows)
+            own |= {name: pa.array(events & mask != 0) for name, mask in masks.items()}
+        values = [
+            own[name].cast(column.type) if name in own else pa.nulls(rows.num_rows, column.type)
+            for name, column in zip(names, needed, strict=True)
+        ]
+        yield pa.RecordBatch.from_arrays(values, schema=needed)
 
 
 def _columns_of_events(shape: Shape) -> list[str]:
@@ -244,11 +246,8 @@ def _events_of(shape: Shape, rows: pa.RecordBatch) -> NDArray[np.uint32]:
     assert shape.mdp is not None
     names = _columns_of_events(shape)
     kinds = [*((name, np.int64) for name in names[:4]), ("rewards", np.float64, len(names) - 4)]
-    steps = np.empty(len(rows), kinds)
-    for name in names[:4]:
-        steps[name] = rows[name]
-    steps["rewards"] = np.stack([rows[name] for name in names[4:]], axis=1)
-    return events_of(shape.mdp, steps)
+    rewards = np.stack([rows[name] for name in names[4:]], axis=1)
+    return events_of(shape.mdp, np.rec.fromarrays([*map(rows.column, names[:4]), rewards], kinds))
 
 
 def _table(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, pa.DataType | None]) -> pa.Table:

@@ -81,10 +81,12 @@ class Parser(ABC, Generic[Part]):
     """The operators and functions, for errors."""
     not_numbers: ClassVar[Mapping[str, str]] = {}
     """What an error expects in place of terms of other kinds."""
+    needed: ClassVar[str] = ""
+    """What an expression must have, for errors; empty if it may be constant."""
 
     def __init__(self, text: str) -> None:
         self.text = re.sub(r"\s", " ", text).strip()
-        self._data = self.text.encode(errors="replace")  # the parser counts bytes
+        self.is_constant = True
         if len(self.text) > self.max_length:
             raise RunnerError(
                 f"{self.what}: found {len(self.text):,} characters, expected {self.max_length:,} at most."
@@ -97,8 +99,8 @@ class Parser(ABC, Generic[Part]):
         """Return the term that a name, an attribute or a subscript stands for."""
 
     @abstractmethod
-    def fixed(self, value: float | str) -> Part:
-        """Return the term of a number, a text, or of True or False."""
+    def fixed(self, kind: str, value: float | str) -> Part:
+        """Return the term of a `NUMBER`, a `TEXT`, or a `CONDITION`, which is True or False."""
 
     @abstractmethod
     def applied(self, kind: str, operation: Operation, *parts: Part) -> Part:
@@ -110,8 +112,8 @@ class Parser(ABC, Generic[Part]):
             raise self.error(node, "found `in` or `is`, expected one of < <= > >= == !=.")
         return self.applied(CONDITION, operator, self.number(left), self.number(right))
 
-    def whole(self) -> Part:
-        """Return the term of the whole expression, a condition.
+    def whole(self, kind: str = CONDITION) -> Part:
+        """Return the term of the whole expression, a `CONDITION` or a `NUMBER`.
 
         Raises:
             RunnerError: it is none, or too large; a line marks the place.
@@ -123,11 +125,14 @@ class Parser(ABC, Generic[Part]):
             nodes = sum(1 for _ in ast.walk(tree))
             if nodes > self.max_nodes:
                 raise RunnerError(f"{self.what}: has {nodes:,} parts, expected {self.max_nodes:,} at most.")
-            return self.condition(tree)
+            term = self.condition(tree) if kind == CONDITION else self.number(tree)
         except SyntaxError as error:
             raise self.syntax_error(error) from None
         except (MemoryError, RecursionError):
             raise RunnerError(f"{self.what}: is nested too deeply.") from None
+        if self.needed and self.is_constant:
+            raise RunnerError(f"{self.what}: found {self.text}, expected {self.needed}.")
+        return term
 
     # --- errors -----------------------------------------------------------------------------------------
 
@@ -147,7 +152,8 @@ class Parser(ABC, Generic[Part]):
 
     def lines_of(self, node: ast.expr) -> str:
         """Return the lines with which an error shows the expression, and marks a node in it."""
-        return self._lines(len(self._data[: node.col_offset].decode()), len(self.text_of(node)))
+        before = self.text.encode()[: node.col_offset].decode()  # the parser counts bytes
+        return self._lines(len(before), len(self.text_of(node)))
 
     def _lines(self, start: int, length: int) -> str:
         first = max(0, start - _AROUND)
@@ -156,7 +162,7 @@ class Parser(ABC, Generic[Part]):
 
     def text_of(self, node: ast.expr) -> str:
         """Return a node's own text."""
-        return self._data[node.col_offset : node.end_col_offset].decode()
+        return ast.get_source_segment(self.text, node) or ""
 
     # --- terms ------------------------------------------------------------------------------------------
 
@@ -196,6 +202,7 @@ class Parser(ABC, Generic[Part]):
             case ast.Constant():
                 return self.constant(node)
             case ast.Name() | ast.Attribute() | ast.Subscript():
+                self.is_constant = False
                 return self.named(node)
         hint = _INSTEAD.get(type(getattr(node, "op", None)), "")
         raise self.error(node, f"found {self.text_of(node)[:60]}{hint}, {self.expected}.")
@@ -234,4 +241,37 @@ class Parser(ABC, Generic[Part]):
             raise self.error(node, f"found {self.text_of(node)}, expected a number.")
         if not isinstance(value, str) and not abs(value) <= self.max_number:
             raise self.error(node, "found a number that is too large.")
-        return self.fixed(value)
+        return self.fixed({bool: CONDITION, str: TEXT}.get(type(value), NUMBER), value)
+
+    def numbered(self, node: ast.expr, names: Sequence[str], what: str) -> int:
+        """Return the number that a number or a name stands for, among names in any spelling.
+
+        Args:
+            what: what has these names, for errors: a `state` or an `action`.
+        """
+        value = node.value if isinstance(node, ast.Constant) else None
+        if type(value) is int and value < len(names):
+            return value
+        if not isinstance(value, str):
+            raise self.error(
+                node,
+                f"found {what} {self.text_of(node)}, expected one of 0 to {len(names) - 1}, or its name.",
+            )
+        wanted = spelt(value)
+        named = [k for k, name in enumerate(names) if spelt(name) == wanted]
+        if len(named) == 1:
+            return named[0]
+        if named:
+            raise self.error(node, f"found a name of {len(named)} {what}s, expected a number.")
+        parts = names[0].count(" + ") + 1
+        hint = nearest(value, names) or nearest(" + ".join([value] * parts), names)
+        raise self.error(
+            node,
+            f"found {what} {value[:60]!r}, expected one of {len(names):,}, by number or by name, such as "
+            f"{names[0]!r}.{hint}",
+        )
+
+
+def spelt(name: str) -> str:
+    """Return a name in one spelling: `drop-off` and `drop_off`, `q[1]` and `q_1` are alike."""
+    return re.sub(r"(?:[^\w-]|_)+|(?<=\w)-(?=[a-z])", "_", name).strip("_")

@@ -15,7 +15,7 @@ from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
 from runner.cli.options import folders_option, force_option, limit_option, require_one, tags_option
-from runner.cli.output import Remark, Reply, csv_lines, json_list
+from runner.cli.output import Remark, Reply, console, csv_lines, json_list, table
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
@@ -23,6 +23,8 @@ from runner.util.extras import require
 from runner.util.humanize import counted, size
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from runner.cli.output import Part
     from runner.query.find import Found
     from runner.query.sql import QueryResult
@@ -30,6 +32,11 @@ if TYPE_CHECKING:
 _SHOWN: Final = 1000
 """The most rows of a table."""
 _SECONDS: Final = 600
+
+
+_CUT: Final = ("name", "events", "marks")
+"""Columns of hits that are cut on a narrow terminal, and left out if they are empty."""
+_LEFT: Final = ("run", "ended", *_CUT)
 
 
 _runs_option: Final = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`.")
@@ -124,7 +131,20 @@ def _left_out(answered: QueryResult | Found) -> Iterator[str]:
     """Yield the first runs that were left out, once all rows are read."""
     yield from answered.left_out[:MAX_PROBLEMS]
     if len(answered.left_out) > MAX_PROBLEMS:
-        yield f"{len(answered.left_out) - MAX_PROBLEMS:,} more runs are left out."
+        yield f"Runs are left out for {len(answered.left_out) - MAX_PROBLEMS:,} more reasons."
+
+
+def _one_line_each(grid: Grid) -> Table:
+    """Return the table of hits with a line for each; a narrow terminal cuts texts."""
+    from rich.text import Text
+
+    columns = {
+        heading: [Text(cell, no_wrap=True, overflow="ellipsis") for cell in cells]
+        for heading, *cells in zip(grid.headings, *grid.rows, strict=True)
+        if any(cells) or heading not in _CUT
+    }
+    cut = _CUT if console().is_terminal else ()
+    return table(*columns, rows=zip(*columns.values(), strict=True), left=_LEFT, shrinking=cut)
 
 
 @click.command("find", cls=Command)
@@ -185,6 +205,10 @@ def find_command(
       dualtaxi find 'ret > 15' --phase train --quiet --limit 0
     """
     require_one("as_json", "quiet")
+    if tags and mark is None:
+        raise click.UsageError(
+            "--tag needs --mark TEXT, as it is a tag of the marks; words find the tags of runs."
+        )
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query.find import find
 
@@ -192,8 +216,8 @@ def find_command(
         found = find(
             expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )
-    marked = found.mark(mark or "", tags=tags) if mark is not None or tags else None
-    text: list[Part] = [found.grid] if found.hits else []
+    marked = None if mark is None else found.mark(mark, tags=tags)
+    text: list[Part] = [_one_line_each(found.grid)] if found.hits else []
     if quiet:
         text = [
             f"{run} {of_phase} {','.join(map(str, episodes))}"

@@ -25,7 +25,7 @@ from typing import Any, Final
 from runner.errors import RunnerError, nearest
 from runner.runs.catalogue.columns import SETTING, STATUSES, TEXT_KINDS, Column, ColumnKind, field_of
 from runner.runs.catalogue.rows import SEED_SHIFT, Sql
-from runner.util.expressions import CONDITION, NUMBER, TEXT, Operation, Parser, Term
+from runner.util.expressions import CONDITION, NUMBER, Operation, Parser, Term
 
 MAX_DEPTH: Final = 16
 """How deep parentheses may be nested in SQL: SQLite's parser may have a stack of 100 entries."""
@@ -96,6 +96,7 @@ class FilterParser(Parser[FilterPart]):
     """Parses one filter."""
 
     what = "filter"
+    needed = "a field in it"
     example = 'status == "finished"'
     max_length = max_nodes = 10_000
     max_number = sys.float_info.max
@@ -125,14 +126,11 @@ class FilterParser(Parser[FilterPart]):
         super().__init__(text)
         self._now = now
         self._settings: set[tuple[str, str]] = set()
-        self._selects = False
 
     def parse(self) -> Filter:
         """Return the parsed filter."""
         if is_expression(self.text):
             condition = self.whole()
-            if not self._selects:
-                raise RunnerError(f"filter: found {self.text}, expected a field in it.")
             if max(accumulate((sign == "(") - (sign == ")") for sign in condition.sql.text)) > MAX_DEPTH:
                 raise RunnerError("filter: is nested too deeply.")
         else:
@@ -160,9 +158,8 @@ class FilterParser(Parser[FilterPart]):
             error.msg += f' (put words to search for in quotes: "{self.text}")'
         return super().syntax_error(error)
 
-    def fixed(self, value: float | str) -> FilterPart:
+    def fixed(self, kind: str, value: float | str) -> FilterPart:
         """Return a number or a text as a parameter; True and False are conditions."""
-        kind = {bool: CONDITION, str: TEXT}.get(type(value), NUMBER)
         if kind == NUMBER and not -SEED_SHIFT <= value < SEED_SHIFT:  # type: ignore[operator]
             value = float(value)
         return FilterPart(kind, Sql("?", (value,)))
@@ -227,7 +224,6 @@ class FilterParser(Parser[FilterPart]):
             column = _column(name)
         except RunnerError as error:
             raise self.error(node, f"{error} A text is put in quotes.") from None
-        self._selects = True
         if column.name.startswith(SETTING):
             path = column.name.removeprefix(SETTING)
             self._settings.add((path, self.lines_of(node)))
@@ -281,7 +277,7 @@ class FilterParser(Parser[FilterPart]):
             return self._matching(node, term, glob.escape(value))
         if kind is ColumnKind.AGE and is_equal:
             raise ValueError(kind.value)
-        first, last = map(self.fixed, _range_of(kind, value))
+        first, last = (self.fixed(NUMBER, number) for number in _range_of(kind, value))
         if is_equal:
             from_first = self.applied(CONDITION, ast.GtE, term, first)
             return self.applied(CONDITION, ast.And, from_first, self.applied(CONDITION, ast.LtE, term, last))
@@ -295,7 +291,7 @@ class FilterParser(Parser[FilterPart]):
 
     def _anywhere(self, pattern: str) -> FilterPart:
         """Return the condition that a word is in the id, the names, the tags or the note of a run."""
-        self._selects = True
+        self.is_constant = False
         return FilterPart(CONDITION, Sql("matches(words, ?)", (f"*{pattern}*",)))
 
 

@@ -181,7 +181,7 @@ async def _replay(
     catalogue: Catalogue,
     at: EpisodeRef,
     refused: RunnerError | None = None,
-    form: Mapping[str, str] = {},  # noqa: B006 - never changed
+    form: Mapping[str, str] = {},
 ) -> Response:
     """Return the page of a step of an episode.
 

@@ -26,7 +26,7 @@ from runner.query.conditions import EpisodeParser
 from runner.query.views import SelectedRuns
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from runner.util.files import EPISODES, cache_folder
+from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 
@@ -183,7 +183,7 @@ def test_sorting_and_limits(folder):
 @pytest.mark.parametrize(
     ("expression", "mark", "message"),
     [
-        ("retr < 3", "^^^^", "Did you mean 'return'"),
+        ("retr < 3", "^^^^", "Did you mean 'ret'"),
         ("any(colision)", "^^^^^^^^", "Did you mean 'collision'"),
         ('any(action == "nort + east")', "^^^^^^^^^^^^^", "Did you mean 'north + east'"),
         ("ret.taxi_3 < 1", "^^^^^^^^^^", "Did you mean"),
@@ -191,7 +191,9 @@ def test_sorting_and_limits(folder):
         ("any(any(collision))", "^^^^^^^^^^^^^^", "values of a step"),
         ("cuont(collision) > 1", "^^^^^", "Did you mean 'count'"),
         ("any(collision, within=3)", "^^^^^^^^^^^^^^^^^^^^^^^^", "within=STEPS"),
-        ("then(collision, collision, within=0)", "^" * 36, "within=STEPS"),
+        ("then(collision, collision, within=0)", "^", "found within=0, expected a whole number of steps"),
+        ("then(collision, collision, within=-1)", "^^", "found within=-1, expected a whole number of steps"),
+        ("then(collision, collision, after=3)", "^" * 35, "then() alone has within=STEPS"),
         ("seed == 3", "^^^^", "expected one of"),
         ("any(next_observation[-1] > 1)", "^^^^^^^^^^^^^^^^^^^^", "expected one of"),
         ("length >", "^", "invalid syntax"),
@@ -304,7 +306,13 @@ def test_one_episode_in_a_million(tmp_path, folder):
     for k, file in enumerate(files):
         planted = np.where((np.arange(n) == 31_415) & (k == 13), 9.5, 0.1)
         at = rows.column_names.index("max(next_observation_2)")
-        pq.write_table(rows.set_column(at, "max(next_observation_2)", pa.array(planted, pa.float32())), file)
+        made = rows.set_column(at, "max(next_observation_2)", pa.array(planted, pa.float32()))
+        for name, values in (
+            ("row", np.arange(n)),
+            ("file", np.full(n, pq.read_table(file)["file"][0].as_py())),
+        ):
+            made = made.set_column(made.column_names.index(name), name, pa.array(values))
+        pq.write_table(made, file)
     found = runner.find("any(next_observation[2] > 1)", tmp_path)
     assert [(hit.run_id, found.count) for hit in found.hits] == [("run00013", 1)]
     assert runner.find("length > 0", tmp_path, sort="ret", limit=1).count == 1_000_000
@@ -321,7 +329,9 @@ def test_the_command(folder):
     assert json.loads(invoke(expression, "--json").stdout) == json.loads(json.dumps(found.as_json()))
     text = invoke(expression)
     assert found.hits[0].run_id in text.stdout
-    assert "is left out of find" in text.stderr
+    (left_out,) = [line for line in text.stderr.splitlines() if "left out" in line]
+    assert left_out.startswith("3 runs are left out of find (")
+    assert left_out.endswith(": each because it has no collision; a filter of runs can exclude it.")
     assert found.sentence in text.stderr
 
 
@@ -332,6 +342,19 @@ def test_a_damaged_index_is_made_again(folder):
     with pytest.raises(RunnerError, match="the next search makes it again"):
         runner.find("length > 20", folder)
     assert runner.find("length > 20", folder) == before
+
+
+@pytest.mark.parametrize("name", ["x[1]", "x?", "**"])
+def test_the_cache_may_be_in_a_folder_with_signs_of_patterns(folder, tmp_path, monkeypatch, name):
+    expressions = ("length > 20", "then(action == 1, action == 0)")
+    expected = [runner.find(expression, folder, runs="pole") for expression in expressions]
+    for cache in (tmp_path / "x1", tmp_path / name):  # a pattern would match the other
+        cache.mkdir()
+        monkeypatch.setenv(CACHE_VARIABLE, str(cache))
+        monkeypatch.setattr(episode_index, "_LEAST", 1)
+        monkeypatch.setattr(episode_index, "_PACKED", 1)
+        for _ in range(2):
+            assert [runner.find(expression, folder, runs="pole") for expression in expressions] == expected
 
 
 def place_damaged_file(folder, monkeypatch, name):
@@ -420,16 +443,16 @@ def test_a_pack_that_another_search_removes_is_made_again(folder, monkeypatch):
     before = runner.find("length > 20", folder)
     monkeypatch.setattr(episode_index, "_LEAST", 1)
     monkeypatch.setattr(episode_index, "_PACKED", 1)
-    packs, removed = episode_index.EpisodeIndex.packs, []
+    packed, removed = episode_index.EpisodeIndex.packed, []
 
-    def packs_of(index, files):
-        for pack, packed in packs(index, files):
-            if not removed:
-                removed.append(pack)
-                pack.unlink()
-            yield pack, packed
+    def packed_once(index, files):
+        chosen = packed(index, files)
+        if not removed:
+            removed.append(chosen[0])
+            chosen[0].unlink()
+        return chosen
 
-    monkeypatch.setattr(episode_index.EpisodeIndex, "packs", packs_of)
+    monkeypatch.setattr(episode_index.EpisodeIndex, "packed", packed_once)
     indexes = {path: path.stat().st_mtime_ns for path in (cache_folder() / EPISODES).glob("*.parquet")}
     assert runner.find("length > 20", folder) == before
     assert {path: path.stat().st_mtime_ns for path in indexes} == indexes
@@ -467,7 +490,7 @@ def test_extras_are_searched(tmp_path):
         env.note_step(loss=9.0)
     found = runner.find("any(extra.loss > 2.4)", tmp_path, limit=None)
     assert found.count == len(expected["any(extra.loss > 2.4)"])
-    assert "the run has no steps" in found.left_out[0]
+    assert "it has no steps; `dualtaxi rerecord`" in found.left_out[0]
     with pytest.raises(RunnerError, match="Did you mean 'extra_loss'"):
         runner.find("any(extra.los > 1)", tmp_path)
     with pytest.raises(RunnerError, match=r"found extra\.word"):
@@ -564,9 +587,13 @@ def test_hits_are_marked(tmp_path, folder):
     assert sorted(mark.at for mark in marks) == sorted(f"{hit['at']}:0" for hit in hits)
     assert {mark.tags for mark in marks} == {("a", "b")}
     assert runner.find("length > 20 and success", tmp_path, limit=4).mark("odd") == 1
-    wrong = CliRunner().invoke(cli, [*words, "--tag", "no tag!"])
+    wrong = CliRunner().invoke(cli, [*words, "--mark", "odd one", "--tag", "no tag!"])
     assert wrong.exit_code == 2
-    assert "tags" in wrong.output
+    assert "found 'no tag!', expected 1 to 64 letters" in wrong.output
+    assert "regex" not in wrong.output
+    wrong = CliRunner().invoke(cli, [*words, "--tag", "odd"])
+    assert wrong.exit_code == 2
+    assert "--tag needs --mark" in wrong.output
 
 
 def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch):

@@ -15,6 +15,7 @@ import numpy as np
 import psutil
 import pytest
 from click.testing import CliRunner
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from runner.analysis.frames import step_columns
@@ -123,6 +124,24 @@ def test_a_question_about_one_episode_reads_its_chunks_alone(folder, read):
     assert [row["step"] for row in rows(folder, query)] == wanted
     assert held <= set(read)
     assert len(set(read)) <= len(held) + 2 * episodes < chunks
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_conditions_on_episodes_of_a_vector_read_few_chunks_and_lose_no_steps(tmp_path, read, mode):
+    envs = SyncVectorEnv([lambda: gymnasium.make("CartPole-v1")] * 3, autoreset_mode=AutoresetMode(mode))
+    with runner.record_vector(envs, tmp_path, chunk_steps=256) as rec:
+        rec.action_space.seed(2)
+        for t in range(600):
+            if t % 250 == 0:
+                rec.reset(seed=t)
+            rec.step(rec.action_space.sample())
+    with open_recording(rec.run.recording) as recording:
+        chunks, steps = len(recording.train.steps), np.concatenate(list(recording.train.steps.taken()))
+    for episode in (0, 1, 9, int(steps["episode"].max())):
+        read.clear()
+        answer = rows(tmp_path, f"SELECT step FROM steps WHERE episode = {episode} ORDER BY step")
+        assert [row["step"] for row in answer] == steps["step"][steps["episode"] == episode].tolist()
+        assert len(set(read)) < chunks
 
 
 @pytest.mark.parametrize("episode", [0, 1, 19, 59])
