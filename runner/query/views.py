@@ -218,7 +218,7 @@ def _batches_of(
     table = tables.shape.tables[file]
     names, run_id = [own_names[name] for name in needed.names], pa.scalar(tables.shape.run_id)
     stored = [name for name in names if name in table.columns.names]
-    masks = {name: mask for name, mask in tables.shape.event_masks.items() if name in names}
+    masks = {name: mask for name, mask in tables.shape.event_masks.items() if name in {*names} - {*stored}}
     of_events = _columns_of_events(tables.shape) if masks else []
     is_turn = ["taken"] if "taken" in table.columns.names else []  # else it is no step of its environment
     read = list(dict.fromkeys([*stored, *is_turn, *of_events])) or ["position"]  # to count the rows
