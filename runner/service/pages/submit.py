@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
 from runner.config.document import write_yaml
-from runner.config.schema import json_schema, without_references
+from runner.config.schema import branches, expected, json_schema, without_references
 from runner.errors import RunnerError
 from runner.service.api.jobs import Workers
 from runner.service.dependencies import CatalogueOf, JobsOf
@@ -40,17 +40,6 @@ discount: 0.99
 epsilon: {schedule: linear, start: 1.0, end: 0.1, over: 3000}
 evaluation: {every: 200, trials: 100}
 """
-_MAX_BOUND: Final = 10**9
-"""A larger maximum is a technical limit, which does not help a user."""
-_WORDS: Final = {
-    "integer": "whole number",
-    "number": "number",
-    "string": "text",
-    "boolean": "true or false",
-    "array": "list",
-    "object": "keys",
-    "null": "nothing",
-}
 SWEEP: Final = """\
 # Several values, several seeds each: what of it matters?
 name: which-discount
@@ -89,7 +78,8 @@ class Key(NamedTuple):
 
     name: str
     description: str
-    kind: str
+    expected: str
+    """What it takes, as in messages about it."""
     default: str
     inner: list[Key]
 
@@ -168,30 +158,8 @@ def sweep_keys() -> list[Key]:
 
 def _keys(properties: JsonView) -> Iterator[Key]:
     for name, node in properties.items():
-        options = [node, *node.get("anyOf", ()), *node.get("oneOf", ())]
         inner: Json = {}
-        for option in options:
+        for option in branches(node):
             inner |= option.get("properties", {})
         default = json.dumps(node["default"]) if "default" in node else ""
-        yield Key(name, node.get("description", ""), _kind(options), default, list(_keys(inner)))
-
-
-def _kind(options: list[JsonView]) -> str:
-    """Return the allowed values in a few words."""
-    kinds: list[str] = []
-    for option in options:
-        if "enum" in option:
-            kinds.append(", ".join(map(str, option["enum"])))
-        elif "const" in option:
-            kinds.append(str(option["const"]))
-        elif "type" in option:
-            kinds.append(_WORDS.get(str(option["type"]), str(option["type"])) + _bounds(option))
-    return " or ".join(dict.fromkeys(kinds))
-
-
-def _bounds(option: JsonView) -> str:
-    low = option.get("minimum", option.get("exclusiveMinimum"))
-    high = option.get("maximum", option.get("exclusiveMaximum"))
-    if high is not None and high <= _MAX_BOUND:
-        return f" {'' if low is None else low} to {high}"
-    return "" if low is None else f" {'above' if 'exclusiveMinimum' in option else 'from'} {low}"
+        yield Key(name, node.get("description", ""), expected(node), default, list(_keys(inner)))
