@@ -244,7 +244,7 @@ def _states_its_end(path: Path) -> bool:
 
 def _first_unreadable(recording: Recording) -> str:
     """Return a sentence that names the first message that cannot be read; empty if all can."""
-    for topic in set(schema.ROW_TOPICS) & set(recording.topics):
+    for topic in filter(recording.topics.__contains__, schema.ROW_TOPICS):
         name = schema.NUMBERED_BY[topic.message]
         number = 0
         try:
