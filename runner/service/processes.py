@@ -28,6 +28,7 @@ Result = TypeVar("Result")
 PRELOADED: Final = (
     "duckdb",
     "gymnasium",
+    "jinja2",
     "numpy.ma",
     "pygame",
     "runner.analysis.diff",
@@ -46,6 +47,7 @@ PRELOADED: Final = (
     "runner.service.fragments",
     "runner.service.jobs.worker",
     "runner.service.uploads",
+    "runner.service.preloaded",
 )
 """Modules that every process has from its start, where processes can be forked; those that are installed.
 

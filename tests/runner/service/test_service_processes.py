@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import sys
 import tempfile
 import threading
 import time
@@ -64,6 +65,16 @@ def test_closing_ends_running_calls():
     calls = [pool.submit(60, time.sleep, 600) for _ in range(3)]
     pool.close()
     assert all(isinstance(call.exception(), Busy) for call in calls)
+
+
+def is_loaded(module):
+    return module in sys.modules
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux")
+def test_a_process_has_what_kernels_need_from_its_start(pool):
+    assert pool.submit(30, is_loaded, "numba.np.arraymath").result()
+    assert not pool.submit(30, is_loaded, "scipy.linalg").result()
 
 
 def test_a_process_can_be_reused():
