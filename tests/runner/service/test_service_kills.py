@@ -35,9 +35,11 @@ CONFIG = {
     "epsilon": {"schedule": "linear", "start": 1.0, "end": 0.1, "over": 1200},
     "evaluation": {"every": 200, "trials": 200},
 }
+LONGER = {"episodes": 10_000, "recording": {"steps": "none"}}
+"""Takes half a second, which a kill cannot miss; its steps would take 230 MB."""
 SWEEP = {
     "name": "small",
-    "base": CONFIG | {"episodes": 10_000, "name": "base"},  # half a second, which a kill cannot miss
+    "base": CONFIG | LONGER | {"name": "base"},
     "strategy": "tpe",
     "trials": 8,
     "batch": 2,
