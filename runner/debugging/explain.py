@@ -33,7 +33,7 @@ from runner.execution.initial_tables import resolve_initial_q
 from runner.replay.trust import require_may_train
 from runner.runs.locking import acquired
 from runner.runs.resolve import find_run
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import Run, recordings_folder, require_trained
 from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
 from runner.util.processes import Stop
@@ -246,12 +246,13 @@ def _resolved(source: Source, recordings: Path, trust: bool) -> tuple[Side, Expe
                 raise RunNotFound(f"{error} There is no configuration of this name either.{hint}") from error
     if isinstance(source, ExperimentConfig):
         return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
-    if not source.can_train_again:
-        raise RunnerError(
-            f"run {source.run_id} was recorded from a training loop of your own, which cannot be trained "
-            f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "
-            "and where they diverge, and `dualtaxi compare` compares many."
-        )
+    require_trained(
+        source,
+        is_trained=True,
+        refusal=f"run {source.run_id} was recorded from a training loop of your own, which cannot be trained "
+        f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "
+        "and where they diverge, and `dualtaxi compare` compares many.",
+    )
     require_may_train(source.recording, source.file.config, trust)
     config = from_mapping(source.file.config)
     return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed

@@ -226,15 +226,6 @@ class Run:
         """Whether its configuration determines all of it, as the runner trained it; a loop's does not."""
         return "made_by" not in self.file.config
 
-    def require_loop(self, refusal: str) -> None:
-        """Refuse the run of a job.
-
-        Raises:
-            RunnerError: it is one; the message is `refusal`.
-        """
-        if self.can_train_again:
-            raise RunnerError(refusal)
-
     @property
     def is_stop_requested(self) -> bool:
         """Whether the loop that records it was requested to stop."""
@@ -249,7 +240,8 @@ class Run:
             RunnerError: no loop records it now.
             StorageError: its folder cannot be written.
         """
-        self.require_loop(f"run {self.run_id} is made by a job; cancel the job, or press Ctrl-C there.")
+        made_by_job = f"run {self.run_id} is made by a job; cancel the job, or press Ctrl-C there."
+        require_trained(self, is_trained=False, refusal=made_by_job)
         if self.status != "running":
             raise RunnerError(
                 f"run {self.run_id} is {self.status}; only a run that is running can be stopped."
@@ -361,6 +353,19 @@ def unless_empty(run: Run) -> Iterator[None]:
             shutil.rmtree(run.folder, ignore_errors=True)
             error.add_note(f"Nothing was recorded; the empty run {run.run_id} was removed.")
         raise
+
+
+def require_trained(run: Run, is_trained: bool, refusal: str) -> None:
+    """Refuse a run that was not trained here, or one that was.
+
+    Args:
+        is_trained: whether the run must have been trained here; else it must be a loop.
+
+    Raises:
+        RunnerError: it is the other kind; the message is `refusal`.
+    """
+    if run.can_train_again is not is_trained:
+        raise RunnerError(refusal)
 
 
 def made_by(provenance: Mapping[str, str]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from typing import Any, Final
 from runner.errors import ConfigError, RunnerError, RunNotFound
 from runner.runs.listing import run_at, run_entries, run_in
 from runner.runs.resolve import find_run
-from runner.runs.run import SHARDS_FOLDER, Run, new_run
+from runner.runs.run import SHARDS_FOLDER, Run, new_run, require_trained
 from runner.util.files import storage_errors
 from runner.util.humanize import counted, size
 from runner.util.values import JsonView
@@ -59,9 +59,8 @@ def find_joined(join: object, recordings: str | os.PathLike[str] | None) -> Run:
 
 
 def _require_open(run: Run) -> None:
-    run.require_loop(
-        f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
-    )
+    is_job = f"join: run {run.run_id} is a job, which the runner trains; expected one of runner.record."
+    require_trained(run, is_trained=False, refusal=is_job)
     if (steps := run.file.config.get("recording", {}).get("steps", "all")) != "all":
         raise RunnerError(f"join: run {run.run_id} is recorded with steps {steps!r}, expected all.")
     if is_ended(run):
