@@ -7,12 +7,10 @@ alone these hold a few hundred bytes, and their heads and index entries take as 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
-
-import numpy as np
 
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -26,7 +24,7 @@ from runner.recording.records import ReadChunk, Record, encode_chunk
 from runner.recording.rewriting import copy
 from runner.recording.schema import Topic
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Records, Unsigned
+from runner.util.arrays import Unsigned, in_blocks
 from runner.util.files import replacing
 from runner.util.packing import Packing
 
@@ -92,7 +90,7 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
             topic, steps = phase.steps.actions.topic, 0
             messages[topic.name] = 0
             most = min(packing.chunk_steps, max(1, BLOCK_BYTES // phase.steps.row_dtype.itemsize))
-            for rows in _in_blocks(phase.steps.rows() if phase.steps.are_actions else (), most):
+            for rows in in_blocks(phase.steps.rows() if phase.steps.are_actions else (), most):
                 payload = encode(schema.ACTIONS, packed(rows, recording.environments))
                 write(topic, *lone_message(topic, int(rows["log_time"][-1]), payload))
                 messages[topic.name] += 1
@@ -110,17 +108,3 @@ def _require_same(path: Path, found: Mapping[str, int], expected: Mapping[str, i
                 f"{path}: {name}: found {found.get(name, 0):,} to copy, expected {count:,}; it was altered "
                 "while it was recorded, and stays as it is."
             )
-
-
-def _in_blocks(blocks: Iterable[Records], size: int) -> Iterator[Records]:
-    """Yield rows in blocks of a size; the last may be smaller."""
-    waiting: list[Records] = []
-    for block in blocks:
-        waiting.append(block)
-        if sum(map(len, waiting)) > size:
-            rows = np.concatenate(waiting)
-            *whole, rest = np.split(rows, range(size, len(rows), size))
-            yield from whole
-            waiting = [rest]
-    if waiting:
-        yield np.concatenate(waiting)

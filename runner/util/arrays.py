@@ -1,6 +1,6 @@
 """Types of arrays that many modules handle."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -36,3 +36,17 @@ def leaves(name: str, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]
 def zeros(shape: tuple[int, ...], dtype: DType) -> Array:
     """Return zeros of a dtype that may have a shape of its own, also one without elements."""
     return np.zeros((*shape, *dtype.shape), dtype.base)
+
+
+def in_blocks(blocks: Iterable[Records], size: int) -> Iterator[Records]:
+    """Yield rows in blocks of a size; the last may be smaller."""
+    waiting: list[Records] = []
+    for block in blocks:
+        waiting.append(block)
+        if sum(map(len, waiting)) > size:
+            rows = np.concatenate(waiting)
+            *whole, rest = np.split(rows, range(size, len(rows), size))
+            yield from whole
+            waiting = [rest]
+    if waiting:
+        yield np.concatenate(waiting)

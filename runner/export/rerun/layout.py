@@ -22,19 +22,14 @@ SHARES: Final = {"grid": 4, "train": 3, "eval": 3, "picture": 3, "array": 2, "lo
 """The groups at the left of a loop, with their shares of the height; pictures share one."""
 MAX_SHOWN: Final = {**dict.fromkeys(PICTURES, MAX_MEMBERS), "array": 2, "bars": 2, "logged": 6}
 """Views of a group in the blueprint; all are sent."""
-PLOTS: Final = (
-    *(
-        (metric.heading.capitalize(), (f"train/metrics/{metric.name}", f"eval/metrics/{metric.name}"))
-        for metric in METRICS
-    ),
-    ("Collisions per episode", ("train/metrics/collisions", "eval/metrics/collisions")),
-    ("Q-table filled (%)", ("train/metrics/filled_percent",)),
-    ("Epsilon, step size", ("train/metrics/epsilon", "train/metrics/step_size")),
-    ("Rewards (% of the last steps)", ("train/metrics/reward_percent",)),
-)
-"""The views of metrics: title, and the entities whose lines it shows."""
-RESULTS: Final = len(METRICS)
-"""Number of views, the first ones, that show results of evaluations."""
+PLOTS: Final = {
+    **{metric.name: metric.heading.capitalize() for metric in METRICS},
+    "collisions": "Collisions per episode",
+    "filled_percent": "Q-table filled (%)",
+    **dict.fromkeys(("epsilon", "step_size"), "Epsilon, step size"),
+    "reward_percent": "Rewards (% of the last steps)",
+}
+"""The view of each metric that is shown, in their order; the first ones show results of evaluations."""
 Shown = rrb.View | rrb.Container
 
 
@@ -55,7 +50,7 @@ def blueprint(runs: Sequence[Writer]) -> rrb.Blueprint:
 def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
     """Return the arrangement of one job, or of several side by side."""
     last, plots = max(job.last for job in jobs), []
-    for title, _ in PLOTS:
+    for title in dict.fromkeys(PLOTS.values()):
         if shown := [job.views["plots", title] for job in jobs if ("plots", title) in job.views]:
             entities = [entity for _, of_job in shown for entity in of_job]
             plots.append(_drawn(shown[0][0], "/", entities, last))
@@ -73,7 +68,7 @@ def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
         for job in jobs
         if (grid := _group(job, "grid"))
     ]
-    rows = {"Results": plots[:RESULTS], "Training": plots[RESULTS:]}
+    rows = {"Results": plots[: len(METRICS)], "Training": plots[len(METRICS) :]}
     tabs = rrb.Tabs(*(rrb.Horizontal(*row, name=name) for name, row in rows.items() if row))
     return rrb.Vertical(rrb.Horizontal(*halves), tabs, row_shares=[7, 3]) if halves else tabs
 

@@ -13,8 +13,7 @@ from runner.analysis.diff.sections import where_in_words
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluation_after
 from runner.errors import NotInRecording
-from runner.export.rerun.selection import Request, episodes_of, evaluations_with_steps, select, time_of
-from runner.recording import schema
+from runner.export.rerun.selection import Request, evaluations_with_steps, select, time_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.recorded import ended_episode
 from runner.runs.run import Run
@@ -42,9 +41,9 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
         number, episode = step.episode, (step.episode, step.episode + 1)
         added: dict[str, Any] = {"episodes": (*request.episodes, episode)}
         if step.after is not None:
-            train, evals = (episodes_of(recording, each) for each in schema.PHASES)
-            evaluations, where = evaluations_with_steps(recording, train, evals), str(recording.path)
-            number = evaluation_after(evaluations, step.after, where).trial(step.episode, where)
+            where = str(recording.path)
+            evaluation = evaluation_after(evaluations_with_steps(recording), step.after, where)
+            number = evaluation.trial(step.episode, where)
             added = {"evaluations": (*request.evaluations, step.after), "trials": (number,)}
         steps = recording.phase(step.phase).episode(number)
         if step.t >= len(steps):

@@ -43,7 +43,10 @@ _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
 """Metrics of several lines whose view shows one phase alone."""
 
 Lines = tuple[str, Times, Array, Sequence[str]]
-"""The path of an entity, its times, the values of its lines, [rows, lines], and their names."""
+"""The path of an entity, its times, the values of its lines, [rows, lines], and their names.
+
+Without names it is one line for the phase, or one for each learner.
+"""
 
 
 def metric_tracks(run: Writer) -> Iterator[Track]:
@@ -51,12 +54,14 @@ def metric_tracks(run: Writer) -> Iterator[Track]:
     recording, evaluations = run.recording, run.recording.eval.all_metrics()
     reports = sorted([*recording.train.all_metrics(), *evaluations], key=lambda row: int(row["log_time"]))
     learners, events = [spoken(name) for name in recording.agents], list(recording.mdp.event_names)
-    for path, times, values, names in itertools.chain(
+    for path, times, values, given in itertools.chain(
         _training_lines(reports, learners),
-        _evaluation_lines(evaluations, learners, events),
+        _evaluation_lines(evaluations, events),
         _episode_lines(recording, reports, learners, events),
     ):
         phase, *_, name = path.split("/")
+        owners = [f" {learner}" for learner in learners] if values.shape[1] > 1 else [""]
+        names = given or [schema.PHASE_NAMES[phase] + owner for owner in owners]
         width = 1.2 if phase == "train" else 2.2
         colours = phase_colours(phase, len(names), run.tint)
         if name in SCHEDULES:
@@ -67,9 +72,9 @@ def metric_tracks(run: Writer) -> Iterator[Track]:
             colours = line_colours(len(names), run.tint)
         label = f"{recording.run_id} " if run.tint else ""
         static = [series_lines([label + name for name in names], colours, width)]
-        title = next((title for title, paths in PLOTS if path in paths), "")
-        view = TrackView("plots", title, options={"plot_legend": rrb.PlotLegend(visible=True)})
-        yield Track(path, times, scalars(values), static, view if title else None)
+        legend = {"plot_legend": rrb.PlotLegend(visible=True)}
+        view = TrackView("plots", PLOTS[name], options=legend) if name in PLOTS else None
+        yield Track(path, times, scalars(values), static, view)
     lines = [
         f"evaluation after {row['episode']:,} episodes: "
         + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
@@ -109,7 +114,7 @@ def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iter
     if not reports:
         return
     times = _times(reports)
-    yield "train/metrics/mean_length", times, _numbers(reports, "mean_length"), ["training"]
+    yield "train/metrics/mean_length", times, _numbers(reports, "mean_length"), ()
     filled = learners if len(learners) > 1 else ["filled"]
     yield "train/metrics/filled_percent", times, _numbers(reports, "percent_filled"), filled
     for name in SCHEDULES:
@@ -120,9 +125,7 @@ def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iter
         yield "train/metrics/reward_percent", times, np.array(shares), [f"{reward:g}" for reward in rewards]
 
 
-def _evaluation_lines(
-    evaluations: Sequence[Message], learners: Sequence[str], events: Sequence[str]
-) -> Iterator[Lines]:
+def _evaluation_lines(evaluations: Sequence[Message], events: Sequence[str]) -> Iterator[Lines]:
     """Yield the results of evaluations."""
     if not evaluations:
         return
@@ -130,8 +133,7 @@ def _evaluation_lines(
     for metric in METRICS:
         values = _numbers(evaluations, metric.field)
         if not np.isnan(values).all():
-            names = _by_learner("evaluation", learners) if metric.per_agent else ["evaluation"]
-            yield f"eval/metrics/{metric.name}", times, values, names
+            yield f"eval/metrics/{metric.name}", times, values, ()
     counts = _numbers(evaluations, "events") / _numbers(evaluations, "trials")
     if events:
         yield "eval/metrics/events", times, counts, [spoken(event) for event in events]
@@ -160,8 +162,8 @@ def _episode_lines(
     if len(some):
         means, times = sums[some] / counts[some, None], _times([reports[k] for k in some.tolist()])
         _, penalties, returns, happened = np.split(means, (1, 2, 2 + len(learners)), axis=1)
-        yield "train/metrics/mean_penalties", times, penalties, ["training"]
-        yield "train/metrics/mean_return", times, returns, _by_learner("training", learners)
+        yield "train/metrics/mean_penalties", times, penalties, ()
+        yield "train/metrics/mean_return", times, returns, ()
         yield from _shared_events("train", times, events, happened)
 
 
@@ -169,11 +171,7 @@ def _shared_events(phase: str, times: Times, events: Sequence[str], counts: Floa
     """Yield the events that concern all agents, such as collisions; `counts` is [rows, events]."""
     for k, event in enumerate(events):
         if "." not in event:
-            yield f"{phase}/metrics/{event}s", times, counts[:, [k]], [schema.PHASE_NAMES[phase]]
-
-
-def _by_learner(phase: str, learners: Sequence[str]) -> list[str]:
-    return [f"{phase} {name}" for name in learners] if len(learners) > 1 else [phase]
+            yield f"{phase}/metrics/{event}s", times, counts[:, [k]], ()
 
 
 def line_colours(count: int, tint: str | None = None) -> list[Colour]:

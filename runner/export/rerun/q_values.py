@@ -28,7 +28,7 @@ from runner.export.rerun.tracks import (
     agent_colours,
     centred,
     columns,
-    grey_text,
+    labels_alone,
     pairs,
     repeated,
     scalars,
@@ -95,7 +95,7 @@ class ValueReader:
         tables, learned = replay.empty_rows(len(steps)), replay.learner.tables
         map_rows = np.flatnonzero(is_new)
         shape = len(map_rows), len(learned.value), self._states.shape[1]
-        value, greedy = np.empty(shape, np.float32), np.empty(shape, np.int32)
+        value, greedy = np.empty(shape), np.empty(shape, np.int64)
         maps = zip(value, greedy, self._states[context[map_rows]], strict=True)
         leaps = np.flatnonzero(np.diff(trained) != stride) + 1
         for start, stop in pairwise(np.unique([0, *leaps, *map_rows, len(steps)]).tolist()):
@@ -151,10 +151,10 @@ class ValueTracks:
         bounds = rrb.VisualBounds2D(x_range=(-0.4, TABLE_WIDTH), y_range=(TABLE_TOP, float(y[-1]) + 0.9))
         name = "Q-values of this state, before the move"
         view = TrackView("values", name, rrb.Spatial2DView, {"visual_bounds": bounds})
-        words_style = rr.Points2D(points, labels=texts, colors=tints, radii=0.0, show_labels=True)
+        words_style = labels_alone(positions=points, labels=texts, colors=tints)
         style = [
             rr.LineStrips2D.from_fields(colors=agent_colours(self._agent.tolist()), radii=0.22),
-            rr.Points2D(positions, radii=0.0, show_labels=True, draw_order=40.0),
+            labels_alone(positions=positions, draw_order=40.0),
             series_lines(lines),
         ]
         self.still = [
@@ -224,8 +224,8 @@ class MapTracks:
             self._path + "/here": rr.Boxes2D.from_fields(
                 colors=[palette.rgb(palette.BAD)], radii=0.1, draw_order=50.0
             ),
-            self._path + "/stops": rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=45.0),
-            self._path + "/label": grey_text(),
+            self._path + "/stops": labels_alone(draw_order=45.0),
+            self._path + "/label": labels_alone(colors=[GREY]),
         }
         bounds = rrb.VisualBounds2D(x_range=(-0.5, width + 0.5), y_range=(-3.2, height + 0.5))
         title = f"{spoken(name)}: max Q, greedy moves"
@@ -241,8 +241,9 @@ class MapTracks:
         if not (n := len(batch.map_rows)):
             return
         times, maps = batch.at(batch.map_rows), (batch.value_maps, batch.greedy_maps)
-        values, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
+        best, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
         with np.errstate(all="ignore"):
+            values = best.astype(np.float32)
             low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
         ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
         buffers = np.ascontiguousarray(values).view(np.uint8)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from typing import Any, Final, TypeVar
@@ -31,7 +31,7 @@ from runner.export.rerun.tracks import (
 )
 from runner.recording import schema
 from runner.recording.turns import taken
-from runner.util.arrays import Records
+from runner.util.arrays import Records, in_blocks
 
 T = TypeVar("T")
 _BATCH_BYTES: Final = 64 << 20
@@ -120,7 +120,7 @@ class RunReader:
         recording, train = self._recording, episodes_of(self._recording, "train")
         plan = recording.config["evaluation"] if self._is_job else None
         trials = int(plan["trials"]) if plan else 2**63 - 1
-        for steps in self._blocks(phase, self.writer.selection.by_phase[phase]):
+        for steps in self._blocks(phase):
             if self._labels:
                 recording.mdp.check_steps(steps, str(recording.path), schema.PHASE_NAMES[phase])
             trained, episode = (steps[name].astype(np.int64) for name in ("step", "episode"))
@@ -135,19 +135,13 @@ class RunReader:
             else:
                 yield from values.batches(batch, trained, int(phase == "train"))
 
-    def _blocks(self, phase: str, spans: Sequence[range]) -> Iterator[Records]:
+    def _blocks(self, phase: str) -> Iterator[Records]:
         """Yield the steps of a phase in blocks of bounded size; values that vary in size as they are read."""
-        table, n = self._recording.phase(phase).steps, self._recording.environments
-        limit = max(1, min(MAX_ROWS * n, _BATCH_BYTES // table.row_dtype.itemsize))
-        waiting: list[Records] = []
-        for block in filter(len, map(taken, chain.from_iterable(map(table.numbered, spans)))):
-            for part in np.split(block, range(limit, len(block), limit)):
-                if waiting and (table.dtype is None or sum(map(len, waiting)) + len(part) > limit):
-                    yield np.concatenate(waiting)
-                    waiting = []
-                waiting.append(part)
-        if waiting:
-            yield np.concatenate(waiting)
+        table, spans = self._recording.phase(phase).steps, self.writer.selection.by_phase[phase]
+        limit = min(MAX_ROWS * self._recording.environments, _BATCH_BYTES // table.row_dtype.itemsize)
+        blocks = map(taken, chain.from_iterable(map(table.numbered, spans)))
+        parts = ([block] for block in blocks) if table.dtype is None else [blocks]
+        return filter(len, chain.from_iterable(in_blocks(part, max(1, limit)) for part in parts))
 
     def _notice(self, x: float, y: float) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""

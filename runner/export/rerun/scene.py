@@ -17,7 +17,7 @@ from runner.drawing.svg import VEHICLES, wall_ends
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names
 from runner.environments.scene import SceneDescription
-from runner.export.rerun.tracks import GREY, Track, TrackView, centred, pairs
+from runner.export.rerun.tracks import GREY, Track, TrackView, centred, labels_alone, pairs
 from runner.util.arrays import Ints
 
 _SPACING: Final = 0.34
@@ -166,13 +166,8 @@ def background(scene: Scene, view: TrackView) -> Iterator[Track]:
         tints, names = [(*colour, 110) for colour in colours], [mark["name"] for mark in marks]
         cells = list(corners[:, None] + square)
         parts["landmarks"] = rr.LineStrips2D(cells, colors=tints, radii=0.23, draw_order=5)
-        parts["names"] = rr.Points2D(
-            corners + np.array((0.14, 0.72)),
-            labels=names,
-            colors=colours,
-            radii=0.0,
-            show_labels=True,
-            draw_order=26,
+        parts["names"] = labels_alone(
+            positions=corners + np.array((0.14, 0.72)), labels=names, colors=colours, draw_order=26
         )
     for part, static in parts.items():
         yield Track(f"scene/{part}", static=[static], view=view)

@@ -24,7 +24,6 @@ MAX_MEMBERS: Final = 8
 """Environments of a vector that are shown in views, and drawn; the values of all are exported."""
 DEFAULT_STEPS: Final = 50_000
 """Steps at which the default selection stops growing, however long episodes are."""
-_NONE: Final[Ints] = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -64,11 +63,6 @@ class SelectedEpisodes:
     """[E]: number after that of the last step; in a vector of all environments with it."""
     ended: int
 
-    @property
-    def count(self) -> int:
-        """The number of episodes with steps."""
-        return len(self.start)
-
     def before(self, steps: Ints | int) -> Ints:
         """Return how many of the episodes had ended after these numbers of steps."""
         return np.searchsorted(self.stop[: self.ended], steps, side="right")
@@ -102,18 +96,20 @@ class Selection:
     @property
     def steps(self) -> int:
         """The number of selected steps."""
-        return sum(len(steps) for of_phase in self.by_phase.values() for steps in of_phase)
+        return sum(self.counts)
+
+    @property
+    def counts(self) -> list[int]:
+        """The number of selected steps of each phase."""
+        return [sum(map(len, spans)) for spans in self.by_phase.values()]
 
 
 def joined(spans: Iterable[range]) -> list[range]:
     """Return ranges in order; those that follow each other, or overlap, are one range."""
     whole: list[range] = []
     for span in sorted(filter(None, spans), key=lambda span: span.start):
-        if whole and span.start <= whole[-1].stop:
-            before = whole.pop()
-            whole.append(range(before.start, max(before.stop, span.stop)))
-        else:
-            whole.append(span)
+        before = whole.pop() if whole and span.start <= whole[-1].stop else span
+        whole.append(range(before.start, max(before.stop, span.stop)))
     return whole
 
 
@@ -138,14 +134,20 @@ def select(recording: Recording, request: Request) -> Selection:
     if recording.train.steps.dtype is None:
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
-    available = evaluations_with_steps(recording, train, evals)
-    numbers, where = _asked_episodes(recording, request, train.count), str(recording.path)
-    asked = {"train": numbers, "eval": np.array(request.trials, int)}
+    available, where = evaluations_with_steps(recording), str(recording.path)
     chosen = [evaluation_after(available, after, where) for after in sorted(set(request.evaluations))]
+    numbers = _asked_episodes(request, len(train.start), where)
+    asked = {"train": numbers, "eval": np.array(request.trials, int)}
     if not request.everything:
         trials = asked["eval"] if request.trials else _trials(chosen)
-        shown = {"train": train.steps_of(numbers), "eval": evals.steps_of(trials)}
-        selection.focus = _focus(recording, shown)
+        spans = train.steps_of(numbers), evals.steps_of(trials)
+        times = [
+            time_of(phase.steps.one(step))
+            for phase, shown in zip(recording.phases, spans, strict=True)
+            if shown
+            for step in (shown[0][0], shown[-1][-1])
+        ]
+        selection.focus = (min(times), max(times)) if times else None
     if request.is_default:
         numbers = np.union1d(numbers, _default_episodes(train.lengths))
     if is_job:
@@ -153,7 +155,7 @@ def select(recording: Recording, request: Request) -> Selection:
         chosen = [evaluation for evaluation in available if evaluation in chosen]
     selection.by_phase = {"train": train.steps_of(numbers), "eval": evals.steps_of(_trials(chosen))}
     if is_job:
-        _describe_job(selection, request, numbers, train.count, available, chosen)
+        _describe_job(selection, request, numbers, len(train.start), available, chosen)
         if unknown := _steps_without_values(recording, selection.by_phase["train"]):
             selection.warnings.append(
                 f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
@@ -183,16 +185,16 @@ def episodes_of(recording: Recording, phase: str) -> SelectedEpisodes:
     return SelectedEpisodes(first[:-1], first[1:], ended)
 
 
-def evaluations_with_steps(
-    recording: Recording, train: SelectedEpisodes, evals: SelectedEpisodes
-) -> list[Evaluation]:
+def evaluations_with_steps(recording: Recording) -> list[Evaluation]:
     """Return the evaluations that have steps; of a job including an incomplete one."""
     if not recording.eval.has_metrics:
         return evaluations_of(recording)
+    train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     evaluations = []
-    trials = int(recording.config["evaluation"]["trials"]) if evals.count else 1
-    for start in range(0, evals.count, trials):
-        stop = min(start + trials, evals.count)
+    count = len(evals.start)
+    trials = int(recording.config["evaluation"]["trials"]) if count else 1
+    for start in range(0, count, trials):
+        stop = min(start + trials, count)
         bounds = int(evals.start[start]), int(evals.stop[stop - 1])
         block = next(recording.eval.steps.blocks(*bounds), None)
         if block is not None:  # otherwise all of its steps were lost in a repair
@@ -208,27 +210,16 @@ def time_of(step: np.void) -> int:
 
 def _trials(evaluations: Sequence[Evaluation]) -> Ints:
     """Return the numbers of the trials of some evaluations."""
-    return np.concatenate([_NONE, *(evaluation.episodes for evaluation in evaluations)])
+    return np.concatenate([np.empty(0, np.int64), *(evaluation.episodes for evaluation in evaluations)])
 
 
-def _focus(recording: Recording, shown: Mapping[str, Sequence[range]]) -> tuple[int, int] | None:
-    """Return the times of the first and the last of some steps; None without any."""
-    times = [
-        time_of(recording.phase(phase).steps.one(step))
-        for phase, spans in shown.items()
-        if spans
-        for step in (spans[0].start, spans[-1].stop - 1)
-    ]
-    return (min(times), max(times)) if times else None
-
-
-def _asked_episodes(recording: Recording, request: Request, count: int) -> Ints:
+def _asked_episodes(request: Request, count: int, where: str) -> Ints:
     """Return the numbers of the training episodes that a request names, ascending; `count` exist."""
     if request.everything:
         return np.arange(count)
-    ranges = whole_ranges(request.episodes, count, "train", str(recording.path))
-    every = np.arange(0, count, request.every) if request.every else _NONE
-    return np.unique(np.concatenate([every, *(np.arange(start, stop) for start, stop in ranges)]))
+    ranges = [range(*bounds) for bounds in whole_ranges(request.episodes, count, "train", where)]
+    ranges.append(range(0, count if request.every else 0, request.every or 1))
+    return np.unique(np.concatenate(ranges).astype(np.int64))
 
 
 def _default_episodes(lengths: Ints, limit: int = DEFAULT_STEPS) -> Ints:
@@ -263,7 +254,7 @@ def _describe_job(
     """Put in words what is exported of a job, and what is not: training episodes and evaluations."""
     spread = f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if request.is_default and count else ""
     named = f" (after {', '.join(f'{one.after:,}' for one in evaluations)} episodes)"
-    trained, tested = (sum(map(len, spans)) for spans in selection.by_phase.values())
+    trained, tested = selection.counts
     selection.exported += [
         f"the {trained:,} steps of {len(numbers):,} of {count:,} training episodes{spread}",
         f"the {tested:,} steps of {len(evaluations):,} of {len(available):,} evaluations"
@@ -292,7 +283,7 @@ def _complete_loop(
         _select_drawn(recording, request, selection, asked)
     first = 0 if request.everything else max(0, tested - DEFAULT_STEPS)
     selection.by_phase["eval"] = joined([*selection.by_phase["eval"], range(first, tested)])
-    trained, evaluated = (sum(map(len, spans)) for spans in selection.by_phase.values())
+    trained, evaluated = selection.counts
     environments = f" in {recording.environments} environments" if recording.environments > 1 else ""
     of_evaluation = f", {evaluated:,} of {tested:,} of evaluation" if tested else ""
     selection.exported.append(f"{trained:,} of {total:,} training steps{of_evaluation}{environments}")

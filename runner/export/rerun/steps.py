@@ -22,6 +22,7 @@ from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.metrics import log_track, phase_colours, series_lines
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.tracks import (
+    GREY,
     Floats,
     Points,
     Times,
@@ -29,13 +30,13 @@ from runner.export.rerun.tracks import (
     TrackView,
     agent_colours,
     columns,
-    grey_text,
+    labels_alone,
     pairs,
     repeated,
     scalars,
     text_track,
 )
-from runner.util.arrays import Flags, Ints, Ints32, Records
+from runner.util.arrays import Flags, Ints, Records
 
 TRAIL_STEPS: Final = 5
 TITLE_Y: Final = -0.62
@@ -58,9 +59,9 @@ class Batch(NamedTuple):
     """[n, agents]: each agent's greedy action."""
     map_rows: Ints = NO_ARRAY
     """[k]: the steps that have maps."""
-    value_maps: NDArray[np.float32] = NO_ARRAY
+    value_maps: Floats = NO_ARRAY
     """[k, learners, pixels]: the greatest value in the state of each pixel; nan for no state."""
-    greedy_maps: Ints32 = NO_ARRAY
+    greedy_maps: Ints = NO_ARRAY
     """[k, learners, pixels]: the learner's greedy action there; -1 for no state."""
 
     def at(self, rows: slice | Ints | Flags) -> Times:
@@ -95,12 +96,12 @@ class StepTracks:
             fills = [palette.rgb(shape.colour or palette.agent(owner)) for shape, owner in shapes]
             radii, faded = [shape.radius for shape in scene.shapes], [(*colour, 120) for colour in colours]
             parts["grid/things"] = [
-                rr.Points2D.from_fields(radii=0.0, show_labels=True, draw_order=50.0),
+                labels_alone(draw_order=50.0),
                 rr.Boxes2D.from_fields(radii=radii, colors=fills, draw_order=40.0),
                 rr.Arrows2D.from_fields(colors=colours, radii=0.035, draw_order=45.0),
                 rr.LineStrips2D.from_fields(colors=faded, radii=0.05, draw_order=30.0),
             ]
-            parts["grid/title"] = [grey_text()]
+            parts["grid/title"] = [labels_alone(colors=[GREY])]
             goal = palette.rgb(palette.GOAL)
             parts["grid/goal"] = [rr.Boxes2D.from_fields(colors=[goal], radii=0.04, show_labels=True)]
         else:

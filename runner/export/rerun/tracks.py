@@ -198,6 +198,6 @@ def agent_colours(agents: Iterable[int]) -> list[Colour]:
     return [palette.rgb(palette.agent(i)) for i in agents]
 
 
-def grey_text() -> rr.Points2D:
-    """Return how a text without a point is drawn."""
-    return rr.Points2D.from_fields(radii=0.0, show_labels=True, colors=[GREY])
+def labels_alone(**parts: Any) -> rr.Points2D:
+    """Return points of which only the labels are drawn."""
+    return rr.Points2D.from_fields(radii=0.0, show_labels=True, **parts)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import os
-import shutil
 import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -81,21 +81,13 @@ def check_port(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
+@dataclass
 class RerunViewer:
-    """A viewer that listens on a port of loopback, and writes to a log.
+    """A viewer that listens on a port of loopback, and writes to a log."""
 
-    The options are more arguments of its command line.
-    """
-
-    def __init__(self, log: Path, port: int, *options: str) -> None:
-        self._log = log
-        self.url = f"rerun+http://{LOOPBACK}:{port}/proxy"
-        arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), *options]
-        environment = os.environ | {"RERUN_ANALYTICS": "0"}
-        with log.open("wb") as output:
-            self.process = subprocess.Popen(
-                arguments, env=environment, stdout=output, stderr=subprocess.STDOUT
-            )
+    process: subprocess.Popen[bytes]
+    log: Path
+    url: str
 
     def wait_for(self, port: int) -> None:
         """Wait until it listens on a port."""
@@ -121,7 +113,7 @@ class RerunViewer:
 
     def error(self, what: str) -> ViewerError:
         """Return an error of the viewer, with the reason as far as its output shows it."""
-        text = self._log.read_text(errors="replace")
+        text = self.log.read_text(errors="replace")
         if any(word in text for word in ("graphics adapter", "libEGL", "Vulkan", "libxkbcommon")):
             reason = f": it finds no graphics. On Debian: apt-get install {MESA_PACKAGES}"
         elif "DISPLAY is set" in text:
@@ -133,20 +125,24 @@ class RerunViewer:
 
 @contextlib.contextmanager
 def viewer(port: int, *options: str) -> Iterator[RerunViewer]:
-    """Start a viewer that ends with the block."""
+    """Start a viewer that ends with the block; the options are more arguments of its command line."""
+    arguments = [str(viewer_program()), "--bind", LOOPBACK, "--port", str(port), *options]
+    environment = os.environ | {"RERUN_ANALYTICS": "0"}
     with tempfile.TemporaryDirectory() as folder:
-        started = RerunViewer(Path(folder) / "viewer.log", port, *options)
-        process = started.process
-        try:
-            started.wait_for(port)
-            yield started
-        finally:
-            process.terminate()
+        log = Path(folder) / "viewer.log"
+        with (
+            log.open("wb") as output,
+            subprocess.Popen(arguments, env=environment, stdout=output, stderr=output) as process,
+        ):
             try:
-                process.wait(5)
-            except subprocess.TimeoutExpired:
+                started = RerunViewer(process, log, f"rerun+http://{LOOPBACK}:{port}/proxy")
+                started.wait_for(port)
+                yield started
+            finally:
+                process.terminate()
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(5)
                 process.kill()
-                process.wait()
 
 
 @contextlib.contextmanager
@@ -166,15 +162,12 @@ def screenshot(path: Path, step: int, picture: Path, size: str = "1600x900") -> 
     Raises:
         ViewerError: the viewer cannot be started, or draws nothing.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        drawn = Path(folder) / "screenshot.png"
+    with new_file(picture, True) as temporary:
         with headless(path, step, size) as client:
             time.sleep(NOTICE_SECONDS)
-            client.save_screenshot(str(drawn))
-        if not drawn.exists():
+            client.save_screenshot(str(temporary))
+        if not temporary.exists():
             raise ViewerError(f"{picture}: the Rerun viewer has not drawn it.")
-        with new_file(picture, True) as temporary:
-            shutil.copyfile(drawn, temporary)
 
 
 def open_window(path: Path, step: int, port: int) -> None:
