@@ -208,8 +208,8 @@ async def _replay(
         shown = {"problem": problem, "refused": str(refused or ""), "form": form}
         return _values(run, replace(at, t=0), branches, stage) | shown
 
-    why = refused or part
-    status = status_of(why) if isinstance(why, RunnerError) else None
+    wrong = refused or part
+    status = status_of(wrong) if isinstance(wrong, RunnerError) else None
     return RunPage(run, "replay", "run_replay.html", show, status)
 
 
