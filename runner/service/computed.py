@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from http import HTTPStatus
 from itertools import islice
 from pathlib import Path
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
 from runner.analysis import diff as differences
 from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
@@ -67,7 +68,49 @@ MAX_FILM_STEPS: Final = 5_000
 """The most steps of a film, as one film is made at a time."""
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
+AxisName = Annotated[
+    str,
+    Field(
+        max_length=1000,
+        description=f"The horizontal axis: one of {', '.join(AXES)}, or a name of logged values.",
+    ),
+]
 RecordKind = Literal["evaluations", "training", "optimality"]
+
+
+class _MetricOptions(BaseModel, frozen=True):
+    """Which metrics are shown, over which axis."""
+
+    metric: tuple[str, ...] = Field(
+        (),
+        max_length=100,
+        description="Default: all, with the first 64 names of logged values; `training.logged.NAME` for any.",
+    )
+    axis: AxisName = EPISODES.name
+    smooth: float = Field(
+        0,
+        ge=0,
+        le=100,
+        allow_inf_nan=False,
+        description="Memory of an exponential mean, in percent of the axis from start to stop; 0: none.",
+    )
+
+
+class CurveOptions(_MetricOptions, frozen=True):
+    """Which curves are shown, and what of them."""
+
+    start: float = Field(0, ge=0, allow_inf_nan=False, description="The first position.")
+    stop: float | None = Field(
+        None, ge=0, allow_inf_nan=False, description="The first position not included."
+    )
+    points: int = Field(0, ge=0, le=100_000, description="Maximum of a curve; 0: all.")
+
+
+class FigureOptions(_MetricOptions, frozen=True):
+    """What a figure of curves shows."""
+
+    log_x: bool = Field(False, description="A logarithmic horizontal axis.")
+    log_y: bool = Field(False, description="Logarithmic vertical axes.")
 
 
 @dataclass(frozen=True)
@@ -132,42 +175,27 @@ class Curves:
     """Names of logged values, the first 10,000, of which `training.logged.NAME` is a metric."""
 
 
-def curves(
-    paths: Path | Sequence[Path],
-    axis: str = EPISODES.name,
-    metrics: Sequence[str] = (),
-    start: float = 0,
-    stop: float | None = None,
-    points: int = 0,
-    lines: bool = False,
-    smooth: float = 0,
-) -> bytes:
+def curves(paths: Sequence[Path], options: CurveOptions, lines: bool = False) -> bytes:
     """Return the metrics of runs over an axis as JSON, runs that differ only in the seed as one curve.
 
-    All metrics if none are named, with the first 64 names of logged values; positions from `start` to before
-    `stop`; curves of more than `points` are thinned, 0 is no limit; `lines` adds the single runs of a curve,
-    `smooth` exponential means with a memory of this percentage of the part shown.
+    `lines` adds the single runs of a curve.
     """
     series: list[RunSeries] = []
     common: list[Axis] = []
-    for path in [paths] if isinstance(paths, Path) else paths:
+    for path in paths:
         with open_recording(path) as recording:
             own = axes_of(recording)
             common = [each for each in common if each in own] if series else own
-            series.append(read_series(recording, axis_of(axis), metrics))
-    over = series[0].axis if series else axis_of(axis)
-    if over not in common and axis not in AXES:
+            series.append(read_series(recording, axis_of(options.axis), options.metric))
+    over = series[0].axis if series else axis_of(options.axis)
+    if over not in common and options.axis not in AXES:
         common.append(over)
     groups = groups_of(series)
     shown: list[ShownCurve] = []
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
-            if not metrics or panel.metric in metrics:
-                end = panel.last if stop is None else stop
-                memory = max(end - start, 0) * smooth / 100
-                shown += [
-                    _shown_curve(panel, curve, start, stop, points, lines, memory) for curve in panel.curves
-                ]
+            if not options.metric or panel.metric in options.metric:
+                shown += [_shown_curve(panel, curve, options, lines) for curve in panel.curves]
     result = Curves(
         over.name,
         [AxisInfo(each.name, each.title, each.label) for each in common],
@@ -187,11 +215,11 @@ def run_histograms(path: Path, axis: str) -> bytes:
         return as_json({"run_id": recording.run_id, "histograms": result, "notes": notes})
 
 
-def _shown_curve(
-    panel: Panel, curve: Curve, start: float, stop: float | None, points: int, lines: bool, memory: float
-) -> ShownCurve:
-    inside = np.flatnonzero((curve.places >= start) & (curve.places < (math.inf if stop is None else stop)))
-    chosen = inside[thinned(curve.middle[inside], points)]
+def _shown_curve(panel: Panel, curve: Curve, options: CurveOptions, lines: bool) -> ShownCurve:
+    start, stop = options.start, math.inf if options.stop is None else options.stop
+    inside = np.flatnonzero((curve.places >= start) & (curve.places < stop))
+    chosen = inside[thinned(curve.middle[inside], options.points)]
+    memory = max((panel.last if options.stop is None else stop) - start, 0) * options.smooth / 100
     has_band = len(curve.runs) > 1
     return ShownCurve(
         metric=panel.metric,
@@ -324,12 +352,14 @@ def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
     return bytes(sink.getvalue())
 
 
-def plot(paths: Sequence[Path], axis: str, style: CurveStyle, metrics: Sequence[str] = ()) -> bytes:
-    """Return metrics of runs over an axis in one figure, as SVG; all of them if none are named."""
-    groups = groups_of(series_of(paths, axis_of(axis), metrics))
+def plot(paths: Sequence[Path], options: FigureOptions) -> bytes:
+    """Return metrics of runs over an axis in one figure, as SVG."""
+    metrics = options.metric
+    groups = groups_of(series_of(paths, axis_of(options.axis), metrics))
     panels = [panel for panel in panels_of(groups) if not metrics or panel.metric in metrics]
     if not panels:
         raise RunnerError(f"metric: found {', '.join(metrics)[:200]}, expected metrics that a run recorded.")
+    style = CurveStyle(smooth=options.smooth, log_x=options.log_x, log_y=options.log_y)
     return svg_file(curves_sheet(groups, panels, style))
 
 

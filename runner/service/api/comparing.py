@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Response
 from fastapi import Path as InPath
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.debugging.explanation import Explanation
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.errors import RunNotFound
-from runner.export.plots.style import CurveStyle
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.reading import (
-    SVG,
-    AxisName,
-    FirstPosition,
-    LastPosition,
-    LogX,
-    LogY,
-    Metrics,
-    Points,
-    Smooth,
-)
+from runner.service.api.reading import SVG, AxisOf
 from runner.service.catalogue import Catalogue
-from runner.service.computed import Curves
+from runner.service.computed import CurveOptions, Curves, FigureOptions
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
 from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
 from runner.service.settings import ServiceSettings
@@ -40,9 +31,24 @@ router = APIRouter(
 MAX_RUNS: Final = 1000
 MAX_SCORES: Final = 10_000
 """Characters of a table of scores."""
-Runs = Annotated[list[str], Query(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")]
+RunNames = Annotated[
+    tuple[str, ...], Field(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")
+]
 Name = Annotated[str, Query(max_length=200, description="A run: its id, the beginning of it, its name, ...")]
 Part = Annotated[str, InPath(max_length=120)]
+
+
+class CurvesOfRuns(CurveOptions, frozen=True):
+    """Which curves of which runs, and what of them."""
+
+    run: RunNames
+    lines: bool = Field(False, description="Include the single runs of each curve.")
+
+
+class FigureOfRuns(FigureOptions, frozen=True):
+    """What a figure shows of which runs."""
+
+    run: RunNames
 
 
 @router.get("/explanations", summary="The names of the explanations that `dualtaxi explain` left.")
@@ -92,21 +98,11 @@ async def diff(
 
 @router.get("/curves", response_model=Curves, summary="The curves of several runs, seeds as one curve.")
 async def curves(
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-    run: Runs,
-    metric: Metrics = None,
-    axis: AxisName = EPISODES.name,
-    start: FirstPosition = 0,
-    stop: LastPosition = None,
-    points: Points = 0,
-    lines: Annotated[bool, Query(description="Include the single runs of each curve.")] = False,
-    smooth: Smooth = 0,
+    catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[CurvesOfRuns, Query()]
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
-    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, run)]
-    options = (axis, metric or [], start, stop, points, lines, smooth)
-    return await compute.json(computed.curves, paths, *options)
+    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
+    return await compute.json(computed.curves, paths, options, options.lines)
 
 
 @router.get(
@@ -116,19 +112,11 @@ async def curves(
     summary="The curves of several runs in one figure.",
 )
 async def curves_picture(
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-    run: Runs,
-    metric: Metrics = None,
-    axis: AxisName = EPISODES.name,
-    smooth: Smooth = 0,
-    log_x: LogX = False,
-    log_y: LogY = False,
+    catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[FigureOfRuns, Query()]
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
-    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, run)]
-    style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
-    return Response(await compute(computed.plot, paths, axis, style, metric or []), media_type=SVG)
+    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
+    return Response(await compute(computed.plot, paths, options), media_type=SVG)
 
 
 @router.get(
@@ -139,13 +127,13 @@ async def curves_picture(
 async def compare(
     catalogue: CatalogueOf,
     compute: ComputationOf,
-    run: Runs,
+    run: Annotated[RunNames, Query()],
     by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
     metric: Annotated[list[str] | None, Query(max_length=100)] = None,
     moment: Annotated[
         str, Query(max_length=20, description="`last`, `best`, `area`, or a position.")
     ] = "last",
-    axis: AxisName = EPISODES.name,
+    axis: AxisOf = EPISODES.name,
     target: Annotated[
         str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `moment`.")
     ] = None,
@@ -163,7 +151,7 @@ async def compare(
     return await compute.json(computed.comparison, paths, *options)
 
 
-def found_runs(catalogue: Catalogue, names: list[str], several: bool = False) -> list[Run]:
+def found_runs(catalogue: Catalogue, names: Sequence[str], several: bool = False) -> list[Run]:
     """Return the runs of some names, their recordings restored if they are archived.
 
     With `several`, a name means all runs of that name, each once.

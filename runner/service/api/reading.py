@@ -7,13 +7,12 @@ from typing import Annotated, Final, Literal
 from fastapi import APIRouter, Path, Query, Response
 from pydantic import BaseModel
 
-from runner.analysis.axes import AXES, EPISODES
+from runner.analysis.axes import EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import ValueCounts
-from runner.export.plots.style import CurveStyle
 from runner.recording.reader import Recording
 from runner.service import computed
-from runner.service.computed import Curves, too_many
+from runner.service.computed import AxisName, CurveOptions, Curves, FigureOptions, too_many
 from runner.service.dependencies import (
     ComputationOf,
     OpenRecording,
@@ -44,37 +43,7 @@ Stop = Annotated[
 Step = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training steps.")]
 Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training episodes.")]
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
-AxisName = Annotated[
-    str,
-    Query(
-        max_length=1000,
-        description=f"The horizontal axis: one of {', '.join(AXES)}, or a name of logged values.",
-    ),
-]
-Metrics = Annotated[
-    list[str] | None,
-    Query(
-        max_length=100,
-        description="Default: all, with the first 64 names of logged values; `training.logged.NAME` for any.",
-    ),
-]
-FirstPosition = Annotated[float, Query(ge=0, allow_inf_nan=False, description="The first position.")]
-LastPosition = Annotated[
-    float | None, Query(ge=0, allow_inf_nan=False, description="The first position not included.")
-]
-Points = Annotated[int, Query(ge=0, le=100_000, description="Maximum of a curve; 0: all.")]
-Smooth = Annotated[
-    float,
-    Query(
-        ge=0,
-        le=100,
-        allow_inf_nan=False,
-        description="Memory of an exponential mean, in percent of the axis from start to stop; 0: none.",
-    ),
-]
-
-LogX = Annotated[bool, Query(description="A logarithmic horizontal axis.")]
-LogY = Annotated[bool, Query(description="Logarithmic vertical axes.")]
+AxisOf = Annotated[AxisName, Query()]
 
 
 class Histograms(BaseModel):
@@ -109,22 +78,14 @@ class Columns(BaseModel):
     "/metrics", response_model=Curves, responses=BUSY_ERRORS, summary="The curves of a run's metrics."
 )
 async def metrics(
-    run: RecordedRun,
-    compute: ComputationOf,
-    metric: Metrics = None,
-    axis: AxisName = EPISODES.name,
-    start: FirstPosition = 0,
-    stop: LastPosition = None,
-    points: Points = 0,
-    smooth: Smooth = 0,
+    run: RecordedRun, compute: ComputationOf, options: Annotated[CurveOptions, Query()]
 ) -> Response:
     """Return every metric over an axis, as plots show it.
 
     With `points`, longer curves have the lowest and the highest value of each section only, and `thinned` is
     true; `start` and `stop` select a part at full resolution.
     """
-    options = (axis, tuple(metric or ()), start, stop, points, False, smooth)
-    return await compute.json(computed.curves, run.recording, *options)
+    return await compute.json(computed.curves, [run.recording], options)
 
 
 @router.get(
@@ -133,7 +94,7 @@ async def metrics(
     responses=BUSY_ERRORS,
     summary="Histograms over training, as heat maps.",
 )
-async def histograms(run: RecordedRun, compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
+async def histograms(run: RecordedRun, compute: ComputationOf, axis: AxisOf = EPISODES.name) -> Response:
     """Return the counts of returns, lengths, actions and rewards in stretches of training."""
     return await compute.json(computed.run_histograms, run.recording, axis)
 
@@ -234,16 +195,10 @@ def steps(
     summary="Every metric in one figure.",
 )
 async def plot(
-    run: RecordedRun,
-    compute: ComputationOf,
-    axis: AxisName = EPISODES.name,
-    smooth: Smooth = 0,
-    log_x: LogX = False,
-    log_y: LogY = False,
+    run: RecordedRun, compute: ComputationOf, options: Annotated[FigureOptions, Query()]
 ) -> Response:
-    """Return the figure that `dualtaxi plot` draws."""
-    style = CurveStyle(smooth=smooth, log_x=log_x, log_y=log_y)
-    return Response(await compute(computed.plot, [run.recording], axis, style), media_type=SVG)
+    """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
+    return Response(await compute(computed.plot, [run.recording], options), media_type=SVG)
 
 
 def _stop(start: int, stop: int | None, total: int, limit: int) -> int:

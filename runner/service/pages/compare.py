@@ -23,7 +23,7 @@ from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link, places_in, step_in
 from runner.service.api.comparing import MAX_SCORES, found_runs
-from runner.service.api.reading import AxisName
+from runner.service.api.reading import AxisOf
 from runner.service.dependencies import At, CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, last_results, result_of
@@ -149,7 +149,7 @@ def overview(runs: ChosenRuns, scores: Scores = "") -> Response:
 
 @router.get("/tasks")
 async def tasks(
-    runs: ChosenRuns, compute: ComputationOf, scores: Scores = "", axis: AxisName = EPISODES.name
+    runs: ChosenRuns, compute: ComputationOf, scores: Scores = "", axis: AxisOf = EPISODES.name
 ) -> Response:
     """Return the comparison over environments by normalised scores, as a part of the page."""
     paths = [each.recording for each in runs]

@@ -31,7 +31,7 @@ from runner.runs.run import Run
 from runner.runs.shards import shards_in_words
 from runner.service import fragments
 from runner.service.api import files, runs
-from runner.service.api.reading import AxisName
+from runner.service.api.reading import AxisOf
 from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
     CatalogueOf,
@@ -183,7 +183,7 @@ async def random_policy(run: FoundRun, compute: ComputationOf) -> Response:
 
 
 @router.get("/distributions")
-async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisName = EPISODES.name) -> Response:
+async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisOf = EPISODES.name) -> Response:
     """Return the histograms of training, as a part of the run's page."""
     return HTMLResponse(await compute(fragments.distributions, run.recording, axis))
 
