@@ -238,8 +238,8 @@ def _shown_curve(panel: Panel, curve: Curve, options: CurveOptions, lines: bool)
     )
 
 
-def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> bytes:
-    """Return evaluations, reports of training or exact measures from `start` to before `stop`, as JSON."""
+def records(path: Path, kind: RecordKind, rows: range, limit: int) -> bytes:
+    """Return evaluations, reports of training or exact measures by their numbers, as JSON."""
     with open_recording(path) as recording:
         if kind == "optimality":
             everything = list(recording.table(schema.OPTIMALITY_TOPIC).decoded())
@@ -248,19 +248,19 @@ def records(path: Path, kind: RecordKind, start: int, stop: int, limit: int) -> 
         else:
             recording.require_job("a report of training", "Its metrics can be had all the same.")
             everything = [each.as_json() for each in training_records(recording)]
-        shown = everything[start:stop]
-        if len(shown) > limit:
-            raise too_many(len(shown), limit)
-        page = {"run_id": recording.run_id, "start": start, "total": len(everything), "records": shown}
+        shown = everything[rows.start : rows.stop]
+        require_few(len(shown), limit)
+        page = {"run_id": recording.run_id, "start": rows.start, "total": len(everything), "records": shown}
         return as_json(page)
 
 
-def too_many(found: int, limit: int) -> Refused:
-    """Return the error that a range is too long."""
-    return Refused(
-        HTTPStatus.UNPROCESSABLE_ENTITY,
-        f"query: found a range of {found:,} records, expected at most {limit:,}; request them in parts.",
-    )
+def require_few(found: int, limit: int) -> None:
+    """Refuse a range of more records than a response may have."""
+    if found > limit:
+        raise Refused(
+            HTTPStatus.UNPROCESSABLE_ENTITY,
+            f"query: found a range of {found:,} records, expected at most {limit:,}; request them in parts.",
+        )
 
 
 def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
@@ -332,16 +332,16 @@ def archive(run: Run, remove: bool) -> bytes:
     return as_json(archive_run(run, default_target(run.folder.parent), remove).as_json())
 
 
-def arrow(path: Path, table: str, phase: Phase, start: int, stop: int) -> bytes:
-    """Return the columns of steps or episodes from `start` to before `stop` as an Arrow stream."""
+def arrow(path: Path, table: str, phase: Phase, rows: range) -> bytes:
+    """Return the columns of steps or episodes by their numbers as an Arrow stream."""
     require("pyarrow", extra="archive", purpose="Arrow")
     import pyarrow as pa
 
     with open_recording(path) as recording:
         if table == "steps":
-            columns = step_columns(recording, phase, start=start, stop=stop)
+            columns = step_columns(recording, phase, start=rows.start, stop=rows.stop)
         else:
-            columns = episode_columns(recording, phase, start, stop)
+            columns = episode_columns(recording, phase, rows.start, rows.stop)
     arrays = {
         name: pa.array(values if values.ndim == 1 else values.tolist()) for name, values in columns.items()
     }

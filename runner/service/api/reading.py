@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from fastapi import APIRouter, Path, Query, Response
+from fastapi import APIRouter, Depends, Path, Query, Response
 from pydantic import BaseModel
 
 from runner.analysis.axes import EPISODES
@@ -12,7 +12,7 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import ValueCounts
 from runner.recording.reader import Recording
 from runner.service import computed
-from runner.service.computed import AxisName, CurveOptions, Curves, FigureOptions, too_many
+from runner.service.computed import AxisName, CurveOptions, Curves, FigureOptions, require_few
 from runner.service.dependencies import (
     ComputationOf,
     OpenRecording,
@@ -40,8 +40,14 @@ Stop = Annotated[
     int | None,
     Query(ge=0, lt=2**62, description=f"The first one not included; default: {DEFAULT_RECORDS:,} more."),
 ]
-Step = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training steps.")]
-Episode = Annotated[int | None, Query(ge=0, lt=2**62, description="After this number of training episodes.")]
+
+
+async def rows_in(start: Start = 0, stop: Stop = None) -> range:
+    """Return the numbers of the records to return."""
+    return range(start, start + DEFAULT_RECORDS if stop is None else stop)
+
+
+Rows = Annotated[range, Depends(rows_in)]
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
 AxisOf = Annotated[AxisName, Query()]
 
@@ -108,13 +114,8 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
         summary=summary,
         description=description,
     )
-    async def records(
-        run: RecordedRun, compute: ComputationOf, settings: SettingsOf, start: Start = 0, stop: Stop = None
-    ) -> Response:
-        stop = start + DEFAULT_RECORDS if stop is None else stop
-        return await compute.json(
-            computed.records, run.recording, kind, start, stop, settings.limits.page_records
-        )
+    async def records(run: RecordedRun, compute: ComputationOf, settings: SettingsOf, rows: Rows) -> Response:
+        return await compute.json(computed.records, run.recording, kind, rows, settings.limits.page_records)
 
 
 _add_records_route(
@@ -146,25 +147,20 @@ async def arrow(
     settings: SettingsOf,
     table: Literal["steps", "episodes"],
     phase: PhasePath,
-    start: Start = 0,
-    stop: Stop = None,
+    rows: Rows,
 ) -> Response:
     """Return the same columns as a stream of Arrow's IPC format."""
-    stop = start + DEFAULT_RECORDS if stop is None else stop
-    if stop - start > settings.limits.page_arrow:
-        raise too_many(stop - start, settings.limits.page_arrow)
-    body = await processes(computed.arrow, run.recording, table, phase, start, stop)
+    require_few(len(rows), settings.limits.page_arrow)
+    body = await processes(computed.arrow, run.recording, table, phase, rows)
     return Response(body, media_type=ARROW)
 
 
 @router.get("/episodes/{phase}", response_model=Columns, summary="Episodes by range.")
-def episodes(
-    recording: OpenRecording, settings: SettingsOf, phase: PhasePath, start: Start = 0, stop: Stop = None
-) -> Response:
+def episodes(recording: OpenRecording, settings: SettingsOf, phase: PhasePath, rows: Rows) -> Response:
     """Return episodes as columns: length, return of each agent, events, how it ended."""
     total = recording.phase(phase).episodes.count()
-    stop = _stop(start, stop, total, settings.limits.page_records)
-    return _columns(recording, episode_columns(recording, phase, start, stop), start, total)
+    stop = _stop(rows, total, settings.limits.page_records)
+    return _columns(recording, episode_columns(recording, phase, rows.start, stop), rows.start, total)
 
 
 @router.get("/steps/{phase}", response_model=Columns, summary="Steps by range, or of one episode.")
@@ -172,19 +168,17 @@ def steps(
     recording: OpenRecording,
     settings: SettingsOf,
     phase: PhasePath,
-    start: Start = 0,
-    stop: Stop = None,
+    rows: Rows,
     episode: Annotated[int | None, Query(ge=0, lt=2**62, description="Instead: all of this one.")] = None,
 ) -> Response:
     """Return steps as columns: state, joint action, next state, reward of each agent, ..."""
     limit = settings.limits.page_records
     total = recording.phase(phase).steps.count()
     if episode is None:
-        stop = _stop(start, stop, total, limit)
-        return _columns(recording, step_columns(recording, phase, start=start, stop=stop), start, total)
+        columns = step_columns(recording, phase, start=rows.start, stop=_stop(rows, total, limit))
+        return _columns(recording, columns, rows.start, total)
     columns = step_columns(recording, phase, episode=episode)
-    if len(columns["step"]) > limit:
-        raise too_many(len(columns["step"]), limit)
+    require_few(len(columns["step"]), limit)
     return _columns(recording, columns, int(columns["step"][0]), total)
 
 
@@ -201,11 +195,10 @@ async def plot(
     return Response(await compute(computed.plot, [run.recording], options), media_type=SVG)
 
 
-def _stop(start: int, stop: int | None, total: int, limit: int) -> int:
-    """Return the end of a range."""
-    stop = min(start + DEFAULT_RECORDS if stop is None else stop, total)
-    if stop - start > limit:
-        raise too_many(stop - start, limit)
+def _stop(rows: range, total: int, limit: int) -> int:
+    """Return the end of a range of which only some records are there."""
+    stop = min(rows.stop, total)
+    require_few(stop - rows.start, limit)
     return stop
 
 
