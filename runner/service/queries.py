@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Hashable
 from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Final, Literal
@@ -15,11 +16,9 @@ from runner.errors import RunnerError
 from runner.query.text import cell_of
 from runner.service import computed
 from runner.service.addresses import link
-from runner.service.dependencies import ProcessesOf, SettingsOf, json_response
+from runner.service.dependencies import json_response
 from runner.service.pages.rendering import Page
 from runner.service.problems import error_docs
-from runner.service.processes import ProcessPool
-from runner.service.settings import ServiceSettings
 
 MAX_PICTURES: Final = 24
 """The most hits that a page shows pictures of."""
@@ -62,9 +61,9 @@ SearchOf = Annotated[EpisodeQuestion, Query()]
     responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.SERVICE_UNAVAILABLE),
     summary="Ask the runs, and every step of them, in SQL.",
 )
-async def sql(processes: ProcessesOf, settings: SettingsOf, query: Sql, runs: Runs = "") -> Response:
+async def sql(request: Request, query: Sql, runs: Runs = "") -> Response:
     """Return the first rows that `dualtaxi sql` returns."""
-    return json_response(await _answer(processes, settings, query, runs))
+    return json_response(await _answer(request, computed.query, query, runs))
 
 
 @api.get(
@@ -75,7 +74,7 @@ async def sql(processes: ProcessesOf, settings: SettingsOf, query: Sql, runs: Ru
 )
 async def find(request: Request, search: SearchOf) -> Response:
     """Return what `dualtaxi find --json` prints."""
-    return json_response(await _found(request, search))
+    return json_response(await _answer(request, computed.find, *search.model_dump().values()))
 
 
 @pages.get("/find")
@@ -86,32 +85,22 @@ async def find_page(request: Request, search: SearchOf) -> Response:
         if search.expression.strip():
             from runner.query.find import Found  # needs the extra
 
-            found = TypeAdapter(Found).validate_json(await _found(request, search))
-            kept = link("", search.model_dump()).removeprefix("?")
+            asked = search.model_dump()
+            answer = await _answer(request, computed.find, *asked.values())
+            found, kept = TypeAdapter(Found).validate_json(answer), link("", asked).removeprefix("?")
             shown |= {"found": found, "links": [link(hit.replay, {"found": kept}) for hit in found.hits]}
     except RunnerError as error:
         shown["problem"] = error
     return Page("find.html", shown)
 
 
-async def _found(request: Request, search: EpisodeQuestion) -> bytes:
-    """Return the answer to a search, which is computed in a process with limits, or cached for seconds."""
-    state = request.app.state
-    values = *search.model_dump().values(), state.catalogue.state()
-    make = partial(state.processes, computed.find, state.settings.recordings, *values[:-1])
-    body: bytes = await state.cache.get_or_await((computed.find, *values), make)
-    return bytes(state.settings.without_folders(body.decode()).encode())
-
-
 @pages.get("/sql")
-async def sql_page(
-    processes: ProcessesOf, settings: SettingsOf, query: Sql = "", runs: Runs = ""
-) -> Response:
+async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Response:
     """Show the form, and the answer to a query."""
     shown: dict[str, object] = {"query": query, "runs": runs, "problem": "", "left_out": [], "grid": None}
     try:
         if query.strip():
-            answer = json.loads(await _answer(processes, settings, query, runs))
+            answer = json.loads(await _answer(request, computed.query, query, runs))
             rows = [tuple(map(cell_of, row)) for row in answer["rows"]]
             shown |= answer | {"grid": Grid(tuple(answer["columns"]), rows)}
     except RunnerError as error:
@@ -119,7 +108,9 @@ async def sql_page(
     return Page("sql.html", shown)
 
 
-async def _answer(processes: ProcessPool, settings: ServiceSettings, query: str, runs: str) -> bytes:
-    """Return the answer to a query, which is computed in a process with limits."""
-    answer = await processes(computed.query, settings.recordings, query, runs)
-    return settings.without_folders(answer.decode()).encode()
+async def _answer(request: Request, function: Callable[..., bytes], *asked: Hashable) -> bytes:
+    """Return the answer to a question about all runs: computed in a process with limits, or seconds old."""
+    state = request.app.state
+    make = partial(state.processes, function, state.settings.recordings, *asked)
+    answer: bytes = await state.cache.get_or_await((function, *asked, state.catalogue.state()), make)
+    return bytes(state.settings.without_folders(answer.decode()).encode())

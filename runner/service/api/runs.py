@@ -20,7 +20,6 @@ from runner.runs.catalogue.filters import parse
 from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.run import Run, label
 from runner.service import computed
-from runner.service.catalogue import Catalogue
 from runner.service.computed import as_json
 from runner.service.dependencies import (
     CacheOf,
@@ -162,7 +161,9 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
 )
 def label_run(run: WrittenRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
     """Change the labels of a run as `dualtaxi label` does, and return them."""
-    return relabelled(run, labels, catalogue)
+    now = label(run, labels.name, labels.note, labels.tag, labels.untag)
+    catalogue.changed()
+    return {"run_id": run.run_id, "name": now.name or run.file.name, "tags": list(now.tags), "note": now.note}
 
 
 class MarkSent(BaseModel):
@@ -247,10 +248,3 @@ async def archive_run(
     result = await processes(computed.archive, run, remove)
     catalogue.changed()
     return json_response(result)
-
-
-def relabelled(run: Run, labels: LabelChanges, catalogue: Catalogue) -> dict[str, object]:
-    """Change the labels of a run, and return them; errors as for `label`."""
-    now = label(run, labels.name, labels.note, labels.tag, labels.untag)
-    catalogue.changed()
-    return {"run_id": run.run_id, "name": now.name or run.file.name, "tags": list(now.tags), "note": now.note}

@@ -27,12 +27,11 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, RecentTraining, has_environment
 from runner.runs.catalogue.removal import clean, plan, remove
-from runner.runs.run import Run
+from runner.runs.run import Run, label
 from runner.runs.shards import shards_in_words
 from runner.service import fragments
 from runner.service.api import files, runs
 from runner.service.api.reading import AxisOf
-from runner.service.api.runs import LabelChanges, relabelled
 from runner.service.dependencies import (
     CatalogueOf,
     ComputationOf,
@@ -103,16 +102,11 @@ acts = APIRouter(prefix="/runs/{run}", include_in_schema=False, route_class=_Act
 
 
 @acts.post("/labels")
-def label(run: WrittenRun, form: Form, catalogue: CatalogueOf) -> Response:
+def label_run(run: WrittenRun, form: Form, catalogue: CatalogueOf) -> Response:
     """Change the labels of a run."""
     tags = form.get("tags", "").split()
-    changed = LabelChanges.model_construct(
-        name=form.get("name", "").strip(),
-        tag=tags,
-        untag=sorted(set(run.tags) - set(tags)),
-        note=form.get("note", ""),
-    )
-    relabelled(run, changed, catalogue)
+    label(run, form.get("name", "").strip(), form.get("note", ""), tags, sorted(set(run.tags) - set(tags)))
+    catalogue.changed()
     return RedirectResponse(f"/runs/{run.run_id}#labels-title", HTTPStatus.SEE_OTHER)
 
 
