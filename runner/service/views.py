@@ -121,14 +121,10 @@ def _type_of(view: View) -> type[BaseModel]:
 
 def _form_values(run: Run, view: View) -> dict[str, object]:
     """Return the texts to choose from in the form of a view, or why it has none."""
-    choices, refusal = {}, ""
-    if view.refusal is not None and run.can_train_again:
-        with open_recording(run.recording) as recording:
-            refusal = view.refusal(recording)
-    for each in view.inputs.values():
-        if each.choices is not None:
-            with open_recording(run.recording) as recording:
-                choices[each.name] = each.choices(recording)
+    with open_recording(run.recording) as recording:
+        refusal = view.refusal(recording) if view.refusal is not None and run.can_train_again else ""
+        listed = {given.name: given.choices for given in view.inputs.values()}
+        choices = {name: made(recording) for name, made in listed.items() if made is not None}
     return {"choices": choices, "refusal": refusal}
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from http import HTTPStatus
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 from fastapi import APIRouter, Path, Query, Response
-from pydantic import BaseModel
+from pydantic import create_model
 
 from runner.analysis.episodes import EXPECTED
-from runner.debugging.action_outcomes import ActionOutcome, Outcome
+from runner.debugging.action_outcomes import WhatIf
 from runner.debugging.what_if import what_if as outcomes_of
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, ReplayPart, Start, Steps
@@ -26,26 +26,8 @@ At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:30
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 
 
-class WhatIfAnswer(BaseModel):
-    """The actions at a step, and where each leads."""
-
-    run_id: str
-    at: str
-    title: str
-    state: int
-    state_in_words: str
-    tables_step: int
-    """Training steps that the tables have learned from."""
-    learners: list[str]
-    policy: str
-    epsilon: float
-    discount: float
-    recorded: Outcome
-    actions: list[ActionOutcome]
-    """Those of the highest value first."""
-    left_out: int
-    """Number of further actions, of lower value, that were not played."""
-    notes: list[str]
+_FIELDS: Any = {name: (kind, ...) for name, kind in get_type_hints(WhatIf).items() if name != "mdp"}
+WhatIfAnswer = create_model("WhatIfAnswer", __doc__=WhatIf.__doc__, **_FIELDS)
 
 
 @router.get("/what-if/{at}", response_model=WhatIfAnswer, summary="Where each joint action at a step leads.")
