@@ -41,7 +41,7 @@ CONFIG: Final[dict[str, Any]] = {
     "evaluation": {"every": 200, "trials": 100},
 }
 SWEEP: Final[dict[str, Any]] = {
-    "base": CONFIG | {"episodes": 3000, "name": "base"},
+    "base": CONFIG | {"episodes": 5000, "name": "base", "recording": {"steps": "none"}},
     "strategy": "grid",
     "parameters": {"step_size": [0.2, 0.9]},
     "seeds": [0, 1],

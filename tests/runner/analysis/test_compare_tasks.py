@@ -9,7 +9,6 @@ import gymnasium
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from scipy.stats import trim_mean
 
 import runner
 from runner.analysis.axes import STEPS
@@ -62,6 +61,8 @@ VALUES = {
 
 
 def test_aggregates_are_those_done_by_hand():
+    from scipy.stats import trim_mean  # here, as it takes a second of every worker that collects the tests
+
     result = compared(runs_of(VALUES))
     for own in result.algorithms:
         scores = np.array(

@@ -6,27 +6,12 @@ import shutil
 import traceback
 
 import pytest
-import schemathesis
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
-from schemathesis.checks import not_a_server_error
-from schemathesis.core.failures import FailureGroup
-from schemathesis.generation import GenerationMode
-from schemathesis.specs.openapi.checks import (
-    content_type_conformance,
-    response_schema_conformance,
-    status_code_conformance,
-)
 from served import Served
 
 pytestmark = pytest.mark.long
 
-CHECKS = [
-    not_a_server_error,
-    status_code_conformance,
-    content_type_conformance,
-    response_schema_conformance,
-]
 EXAMPLES = 2
 """Requests to each route: a number, not a time, so that a failure is found again when it is repeated."""
 TIMEOUT = 300
@@ -43,6 +28,9 @@ def served(recorded, tmp_path_factory):
 
 
 def test_every_response_is_documented_and_none_is_a_server_error(served):
+    import schemathesis  # here, as it takes a second of every worker that collects the tests
+    from schemathesis.core.failures import FailureGroup
+
     schema = schemathesis.openapi.from_url(f"{served.url}/api/v1/openapi.json")
     failed, tried = {}, 0
     for result in schema.get_all_operations():
@@ -60,7 +48,21 @@ def test_every_response_is_documented_and_none_is_a_server_error(served):
 
 def _cases(operation):
     """Return requests that fit the description, and such that do not."""
+    from schemathesis.generation import GenerationMode
+
     return st.one_of(*(operation.as_strategy(generation_mode=mode) for mode in GenerationMode))
+
+
+def _checks():
+    from schemathesis import checks
+    from schemathesis.specs.openapi import checks as described
+
+    return [
+        checks.not_a_server_error,
+        described.status_code_conformance,
+        described.content_type_conformance,
+        described.response_schema_conformance,
+    ]
 
 
 def _fuzz(operation, served):
@@ -78,7 +80,7 @@ def _fuzz(operation, served):
             _name_runs(case, name)
         answer = case.call(headers=served.origin, timeout=TIMEOUT)
         if len(str(answer.request.url)) <= LONGEST:
-            case.validate_response(answer, checks=CHECKS)
+            case.validate_response(answer, checks=_checks())
 
     check()
 
