@@ -289,7 +289,7 @@ def test_every_command_is_walked_or_reads_no_run():
 def test_no_command_makes_what_a_stranger_chose(name, strangers, trap, tmp_path, monkeypatch):
     (tmp_path / "policy_of_doors.py").write_text("def policy(*_):\n    return lambda observation: 0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr("runner.export.rerun.viewer.RerunViewer", None)
+    monkeypatch.setattr("runner.export.rerun.viewer.viewer", None)
     for run in ("function", "writing", "job"):
         own = shutil.copytree(strangers, tmp_path / run / "runs")
         filled = {"RUN": run, "RECORDING": str(strangers / run / "recording.mcap")}

@@ -20,7 +20,7 @@ from runner.export.encoded import encoded_picture
 from runner.export.painting import decoded, redrawn
 from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
-from runner.export.rerun.selection import MAX_MEMBERS
+from runner.export.rerun.selection import MAX_MEMBERS, time_of
 from runner.export.rerun.steps import Batch
 from runner.export.rerun.tracks import Times, Track, TrackRow, TrackView, Writer, in_tracks, scalars, times_of
 from runner.export.values import FEW, acted, number_names, observed
@@ -98,7 +98,7 @@ class LoopTracks:
         for frame in self._of_phase.frames.decoded():
             environment, _ = frame_place(frame)
             later = recording.environments - 1 - environment
-            step = max(0, _step(frame["log_time"]) - later)
+            step = max(0, time_of(frame) - later)
             if later >= 0 and (self._is_later(environment, step) or not is_each_step):
                 yield self._frame(environment, step, _picture(frame["data"]))
 
@@ -188,7 +188,9 @@ class LoopTracks:
         try:
             for number, t, pixels in redrawn(recording, phase, chosen, trust) if chosen else ():
                 if t == 0:
-                    after = [_step(time) for time in log_times_of(recording, phase, number)]
+                    after = [
+                        time // schema.STEP_NANOSECONDS for time in log_times_of(recording, phase, number)
+                    ]
                     times, place = [after[0] - 1, *after], self._of_phase.episode(number).place
                     count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
                     self._writer.stage(f"drawing {phase} episode {count}")
@@ -226,7 +228,7 @@ def logged_tracks(recording: Recording) -> Iterator[Track]:
     texts = (
         TrackRow(
             "log",
-            _step(text["log_time"]),
+            time_of(text),
             rr.TextLog(f"{text['name']}: {text['message']}", level="INFO"),
             LOG,
         )
@@ -246,12 +248,13 @@ def _named(recording: Recording) -> Iterator[TrackRow]:
     """Yield logged pictures and arrays."""
     for image in recording.table(schema.IMAGE_TOPIC).decoded():
         if data := _still(image["data"]):
-            name, view = entity_name(image["frame_id"]), rrb.Spatial2DView
-            step, shown = _step(image["log_time"]), _picture(data)
-            yield TrackRow(f"picture/{name}", step, shown, TrackView("picture", name, view))
+            name = entity_name(image["frame_id"])
+            view = TrackView("picture", name, rrb.Spatial2DView)
+            yield TrackRow(f"picture/{name}", time_of(image), _picture(data), view)
     for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
         name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
-        yield TrackRow(f"array/{name}", _step(time), tensor, TrackView("array", name, rrb.TensorView))
+        view, step = TrackView("array", name, rrb.TensorView), time // schema.STEP_NANOSECONDS
+        yield TrackRow(f"array/{name}", step, tensor, view)
 
 
 def _entity(*parts: str) -> str:
@@ -292,7 +295,3 @@ def _still(data: bytes) -> bytes:
         return image_bytes(np.asarray(decoded(data, "A film", ("WEBP",))), "png")
     except RecordingError:
         return b""
-
-
-def _step(log_time: int) -> int:
-    return log_time // schema.STEP_NANOSECONDS

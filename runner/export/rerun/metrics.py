@@ -176,10 +176,9 @@ def _shared_events(phase: str, times: Times, events: Sequence[str], counts: Floa
 
 def line_colours(count: int, tint: str | None = None) -> list[Colour]:
     """Return distinct colours for the lines of a view: shades of a tint if runs are compared, else hues."""
-    if tint is not None and count == 1:
-        return [palette.rgb(tint)]
-    if tint is None and count <= len(palette.SERIES):
-        return [palette.rgb(colour) for colour in palette.SERIES[:count]]
+    fixed = palette.SERIES if tint is None else (tint,)
+    if count <= len(fixed):
+        return [palette.rgb(colour) for colour in fixed[:count]]
     if tint is None:
         shades = [(k / count, (0.4, 0.6)[k % 2], 0.75) for k in range(count)]
     else:

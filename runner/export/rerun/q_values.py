@@ -93,23 +93,21 @@ class ValueReader:
         self._last = int(batch.times["step"][-1]), int(context[-1])
         replay = self._replay = self._replay or TableReplay(self._recording, int(trained[0]))
         tables, learned = replay.empty_rows(len(steps)), replay.learner.tables
-        map_rows = np.flatnonzero(is_new)
-        shape = len(map_rows), len(learned.value), self._states.shape[1]
-        value, greedy = np.empty(shape), np.empty(shape, np.int64)
-        maps = zip(value, greedy, self._states[context[map_rows]], strict=True)
+        map_rows, maps = np.flatnonzero(is_new), []
         leaps = np.flatnonzero(np.diff(trained) != stride) + 1
         for start, stop in pairwise(np.unique([0, *leaps, *map_rows, len(steps)]).tolist()):
             if replay.step != trained[start]:
                 replay.seek(int(trained[start]))
             if is_new[start]:
-                best, choice, states = next(maps)
-                best[:] = np.where(states < 0, np.nan, learned.value[:, states])
-                choice[:] = np.where(states < 0, -1, learned.greedy[:, states])
+                states = self._states[context[start]]
+                best, choice = learned.value[:, states], learned.greedy[:, states]
+                maps.append((np.where(states < 0, np.nan, best), np.where(states < 0, -1, choice)))
             if stride:
                 replay.apply(steps[start:stop], tables[start:stop])
             else:
                 tables[start:stop] = replay.values_in(steps["state"][start:stop])
-        return Batch(*batch[:3], *self._by_agent(tables), map_rows, value, greedy)
+        value_maps, greedy_maps = (np.array([pair[i] for pair in maps]) for i in range(2))
+        return Batch(*batch[:3], *self._by_agent(tables), map_rows, value_maps, greedy_maps)
 
     def _by_agent(self, tables: Floats) -> tuple[Floats, Ints]:
         """Return values and greedy actions by agent, of rows by learner."""
@@ -135,8 +133,8 @@ class ValueTracks:
         self._explored_bit = np.arange(agents) * (len(labels.learners) == agents)
         y = self._y = 1.0 + np.arange(len(self._agent)) + _AGENT_GAP * self._agent
         """[values]: the row of each value in the table, from top to bottom."""
-        # Of each action's number, then of its mark as greedy, then of its mark as chosen.
-        positions = [(x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y]
+        self._points = pairs((x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y)
+        """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
         words, lines, colours = [], [], agent_colours(range(agents))
         for i, names in enumerate(numbered_actions(mdp)):
             agent, rows = spoken(mdp.agents[i]), y[self._agent == i]
@@ -154,7 +152,7 @@ class ValueTracks:
         words_style = labels_alone(positions=points, labels=texts, colors=tints)
         style = [
             rr.LineStrips2D.from_fields(colors=agent_colours(self._agent.tolist()), radii=0.22),
-            labels_alone(positions=positions, draw_order=40.0),
+            labels_alone(draw_order=40.0),
             series_lines(lines),
         ]
         self.still = [
@@ -171,9 +169,9 @@ class ValueTracks:
         is_explored = batch.records["explored"][:, None] >> self._explored_bit & 1
         classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
         classes[:, :count] = labels.of_values(q)
-        rows = np.arange(n)[:, None]
-        classes[rows, count + first + batch.greedy] = labels.greedy
-        classes[rows, 2 * count + first + own] = np.where(is_explored, labels.explored, labels.exploited)
+        steps = np.arange(n)[:, None]
+        classes[steps, count + first + batch.greedy] = labels.greedy
+        classes[steps, 2 * count + first + own] = np.where(is_explored, labels.explored, labels.exploited)
         low, high = (bound.reduceat(q, first, axis=1) for bound in (np.minimum, np.maximum))
         span = high - low
         scale = np.divide(BAR_LENGTH * _BAR_FRACTION, span, out=np.zeros_like(span), where=span > 0)
@@ -183,6 +181,9 @@ class ValueTracks:
         bars[..., 1] = self._y[:, None]
         shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
         yield Track(f"{self._phase}/q", batch.times, [*scalars(q), *shown])
+        if len(rows := batch.map_rows):  # the points never change, but are cleared with the rest
+            points = repeated(self._points, len(rows))
+            yield Track(f"{self._phase}/q", batch.at(rows), columns(rr.Points2D, positions=points))
 
 
 class MapTracks:

@@ -92,22 +92,21 @@ class RunReader:
         values = ValueReader(recording, scene) if is_job and self._labels else None
         for phase, makers in self._makers.items():
             style = [series_lines(names, phase_colours(phase, len(names)))]
-            parts = ("grid", "q", "map") if is_job else ("grid",)
-            edges: dict[str, set[int]] = {part: set() for part in parts if self._labels}
+            edges: set[int] = set()
             batches = self._batches(phase, values)
             for batch in _prefetched(batches) if is_job else batches:
                 if is_job:
                     yield Track(f"{phase}/reward", batch.times, scalars(batch.records["rewards"]), style)
-                has_values = len(batch.values) > 0
-                for maker in makers[:1] if is_job and not has_values else makers:
+                are_unknown = is_job and not len(batch.values)
+                for maker in makers[:1] if are_unknown else makers:
                     yield from maker.of(batch)
-                for part in edges if has_values else [*edges][:1]:
-                    edges[part] ^= batch.edges()  # no edge where a stretch continues the one before
-            self._edges ^= edges.get("grid", set())
+                if self._labels:
+                    edges ^= batch.edges()  # no edge where a stretch continues the one before
+            self._edges ^= edges
             # A job's last step stays in view.
             last = self.writer.last if is_job else np.inf
-            for part, steps in edges.items():
-                stops = [stop for stop in sorted(steps)[1::2] if stop <= last]
+            stops = [stop for stop in sorted(edges)[1::2] if stop <= last]
+            for part in ("grid", "q", "map") if is_job else ("grid",):
                 yield from cleared(f"{phase}/{part}", stops)
         if not is_job:
             for maker, *_ in self._makers.values():

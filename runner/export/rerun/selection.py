@@ -12,6 +12,7 @@ from runner.analysis.contents import require_steps, shortcomings, whole_ranges, 
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.drawing.svg import drawing_of
 from runner.recording import schema
+from runner.recording.messages import Message
 from runner.recording.reader import Recording
 from runner.util.arrays import Ints
 from runner.util.values import Ranges
@@ -172,8 +173,8 @@ def episodes_of(recording: Recording, phase: str) -> SelectedEpisodes:
     total, records = own.steps.count() if own.steps else 0, own.episodes.array()
     begin, last = (records[name].astype(np.int64) for name in ("first_step", "last_step"))
     if n > 1:  # from the beginning of a round to the end of one
-        place = records["environment"].astype(np.int64)
-        return SelectedEpisodes(begin - place, last - place + n, len(records))
+        place, there = records["environment"].astype(np.int64), last < total
+        return SelectedEpisodes((begin - place)[there], (last - place + n)[there], int(there.sum()))
     first = np.zeros(own.episodes.count() + 1, np.int64)
     number = records["episode"].astype(np.int64).clip(max=len(first) - 2)
     first[number], first[number + 1] = begin, last + 1
@@ -203,8 +204,8 @@ def evaluations_with_steps(recording: Recording) -> list[Evaluation]:
     return evaluations
 
 
-def time_of(step: np.void) -> int:
-    """Return where a step is on the timeline."""
+def time_of(step: np.void | Message) -> int:
+    """Return where a step, or another message, is on the timeline."""
     return int(step["log_time"]) // schema.STEP_NANOSECONDS
 
 
@@ -302,10 +303,11 @@ def _select_drawn(
             continue
         lengths = episodes_of(recording, phase).lengths // n
         numbers = [np.arange(len(lengths)) if request.everything else asked[phase]]
+        places = np.zeros(len(lengths))
+        if n > 1:
+            places = recording.phase(phase).episodes.array()["environment"]
         for environment in range(shown) if request.is_default else ():
-            own = np.arange(len(lengths))
-            if n > 1:
-                own = np.flatnonzero(recording.phase(phase).episodes.array()["environment"] == environment)
+            own = np.flatnonzero(places == environment)
             numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)

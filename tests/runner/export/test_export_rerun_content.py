@@ -282,6 +282,14 @@ def static_parts(path):
     return parts
 
 
+def plots_below(root):
+    """Return the entities that each view of metrics may show, below a path."""
+    views = {title: [] for title in PLOTS.values()}
+    for name, title in PLOTS.items():
+        views[title] += [f"{root}/{phase}/metrics/{name}" for phase in TOPICS]
+    return list(views.values())
+
+
 def scalar_entities(path):
     chunks = RrdReader(str(path)).store().stream().to_chunks()
     return {
@@ -305,14 +313,14 @@ def check_lines(path, views):
 
 
 def test_lines_show_recorded_values_each_in_its_own_colour(exported):
-    check_lines(exported.path, [[f"/{path}" for path in paths] for _, paths in PLOTS])
+    check_lines(exported.path, plots_below(""))
 
 
 def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
     runs = [pictured("taxis"), pictured("rivals")]
     export(runs, Request(), tmp_path / "both.rrd")
-    views = [[f"/{run.run_id}/{path}" for run in runs for path in paths] for _, paths in PLOTS]
-    check_lines(tmp_path / "both.rrd", views)
+    below = zip(*(plots_below(f"/{run.run_id}") for run in runs), strict=True)
+    check_lines(tmp_path / "both.rrd", [[*first, *second] for first, second in below])
 
 
 def test_marks_are_in_the_log_at_their_steps(pictured, tmp_path):
