@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import glob
 import json
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from itertools import pairwise
@@ -75,9 +74,6 @@ class EpisodeIndex:
             self._files = {path.stem[:-_HEX]: path for path in written}
         self.read = set[Path]()
         """The files that were asked for, their packs, and what else is packed there."""
-        self._of_runs = defaultdict[str, list[Path]](list)
-        for stem, path in self._files.items():
-            self._of_runs[stem[:-_HEX]].append(path)
 
     def file(self, row: IndexRow, runs: SelectedRuns) -> Path:
         """Return the file of a run, which is made if it is missing.
@@ -92,9 +88,8 @@ class EpisodeIndex:
         start = f"{row['id']}-{_hash(path)}"
         stem = start + _hash([_VERSION, state.st_mtime_ns, state.st_size, state.st_ino])
         if stem not in self._files:
-            for older in self._of_runs[start]:  # a search that reads it now begins again
-                older.unlink(missing_ok=True)
-                self._files.pop(older.stem[:-_HEX], None)
+            for older in [older for older in self._files if older.startswith(start)]:
+                self._files.pop(older).unlink(missing_ok=True)  # a search that reads it now begins again
             self._files[stem] = self._make(row, runs, stem)
         self.read.add(self._files[stem])
         return self._files[stem]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import glob
-import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -36,12 +35,11 @@ from runner.query.episode_index import (
     with_steps,
 )
 from runner.query.sql import MEMORY_MB, Database, QueryFailed
-from runner.query.views import SelectedRuns
+from runner.query.views import Recordings, SelectedRuns
 from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
 from runner.runs.listing import listed_run
-from runner.runs.run import recordings_folder
 from runner.util.expressions import NUMBER
 from runner.util.humanize import UNKNOWN, counted
 from runner.util.processes import Tell
@@ -157,7 +155,7 @@ class Found:
 
 def find(
     expression: str,
-    recordings: str | os.PathLike[str] | list[Path] | tuple[Path, ...] | None = None,
+    recordings: Recordings = None,
     *,
     runs: str = "",
     phase: str | None = None,
@@ -191,37 +189,17 @@ def find(
     if are_words(condition):
         words, condition = parse(condition).condition, "True"
         chosen = chosen.also(words) if words is not None else chosen
-    folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
-    question = condition, phase, sort
     for _ in range(2):
-        with contextlib.suppress(
-            FileNotFoundError
-        ):  # another search replaced an index, as its recording grows
-            return _answer(SelectedRuns(folders, chosen, report), memory, question, expression, limit)
+        search = _Search(SelectedRuns(recordings, chosen, report), memory)
+        # a file may be missing where another search replaced an index, as its recording grows
+        with contextlib.suppress(FileNotFoundError), contextlib.closing(search.database):
+            return search.answer(expression, condition, phase, sort, limit)
     raise RunnerError("find: a recording changed while it was read; search again.")
 
 
 def are_words(expression: str) -> bool:
     """Return whether an expression is words to search for in runs, and no condition."""
     return bool(_WORDS.fullmatch(expression)) and _OF_CONDITIONS.isdisjoint(expression.split())
-
-
-def _answer(
-    runs: SelectedRuns, memory: int, question: tuple[str, str | None, str], expression: str, limit: int | None
-) -> Found:
-    search = _Search(runs, memory)
-    with contextlib.closing(search.database):
-        try:
-            search.take(*question)
-            return search.found(expression, limit)
-        except QueryFailed as error:
-            if not all(path.exists() for path in search.index.read):
-                raise FileNotFoundError from error
-            for path in search.index.read:
-                path.unlink(missing_ok=True)
-            raise RunnerError(
-                f"{error}\nThe index of these runs was removed: the next search makes it again."
-            ) from error
 
 
 _Question = tuple[str, str, dict[str, str], dict[str, str]]
@@ -247,12 +225,29 @@ class _Search:
         self.files: dict[int, Path] = {}
         """The indexes of runs, by the number of the row."""
 
-    def take(self, condition: str, phase: str | None, sort: str) -> None:
-        """Search all runs.
+    def answer(
+        self, expression: str, condition: str, phase: str | None, sort: str, limit: int | None
+    ) -> Found:
+        """Search all runs, and return the first episodes.
 
         Raises:
-            RunnerError: no run has what the expression names.
+            RunnerError: no run has what the expression names, or DuckDB fails.
+            FileNotFoundError: a file of the index was removed meanwhile.
         """
+        try:
+            self._take(condition, phase, sort)
+            return self._found(expression, limit)
+        except QueryFailed as error:
+            if not all(path.exists() for path in self.index.read):
+                raise FileNotFoundError from error
+            for path in self.index.read:
+                path.unlink(missing_ok=True)
+            raise RunnerError(
+                f"{error}\nThe index of these runs was removed: the next search makes it again."
+            ) from error
+
+    def _take(self, condition: str, phase: str | None, sort: str) -> None:
+        """Search all runs."""
         kinds: dict[str, list[int]] = {}
         for k, row in enumerate(self.runs.rows):
             try:
@@ -318,7 +313,7 @@ class _Search:
         rows = with_steps(chosen, aggregates, windows, among)
         self.database.rows(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM ({rows}) WHERE {where}")
 
-    def found(self, expression: str, limit: int | None) -> Found:
+    def _found(self, expression: str, limit: int | None) -> Found:
         """Return the first episodes, as they are sorted."""
         searched = [k for k, row in enumerate(self.runs.rows) if not self.runs.left_out.get(row["id"])]
         self.database.rows("DELETE FROM hits WHERE run NOT IN (SELECT unnest($runs))", {"runs": searched})

@@ -8,7 +8,6 @@ It cannot read files, reach the network, load extensions or write anything, and 
 from __future__ import annotations
 
 import contextlib
-import os
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -20,9 +19,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from runner.errors import RunnerError
-from runner.query.views import VIEWS, SelectedRuns
+from runner.query.views import VIEWS, Recordings, SelectedRuns
 from runner.runs.catalogue.filters import parse
-from runner.runs.run import recordings_folder
 from runner.util.extras import require
 from runner.util.processes import Tell
 from runner.util.values import finite
@@ -204,7 +202,7 @@ def _as_json(value: Any) -> Any:
 def sql(
     query: str,
     *,
-    recordings: str | os.PathLike[str] | list[Path] | tuple[Path, ...] | None = None,
+    recordings: Recordings = None,
     runs: str = "",
     timeout: float | None = None,
     memory: int = MEMORY_MB,
@@ -227,5 +225,4 @@ def sql(
         RunnerError: the query is wrong, or exceeds its time or memory.
         MissingExtra: DuckDB is not installed.
     """
-    folders = recordings if isinstance(recordings, list | tuple) else [recordings_folder(recordings)]
-    return QueryResult(query, SelectedRuns(folders, parse(runs), report), timeout, memory)
+    return QueryResult(query, SelectedRuns(recordings, parse(runs), report), timeout, memory)

@@ -7,6 +7,7 @@ column that a run does not have is null in its rows. The other views are small.
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,7 +32,7 @@ from runner.runs.catalogue.columns import COLUMNS, IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
 from runner.runs.listing import listed_run
-from runner.runs.run import Run
+from runner.runs.run import Run, recordings_folder
 from runner.util.humanize import listed
 from runner.util.processes import Tell
 from runner.util.values import flatten
@@ -59,6 +60,10 @@ _ROW: Final = ("root", "entry", "id", "name", "status")
 _REPORT_SECONDS: Final = 0.2
 
 
+Recordings = str | os.PathLike[str] | list[Path] | tuple[Path, ...] | None
+"""A folder of runs, or several; $DUALTAXI_RECORDINGS, or ./recordings, if it is None."""
+
+
 class SelectedRuns:
     """The runs that a query is about, and how far it has read them.
 
@@ -67,9 +72,11 @@ class SelectedRuns:
         report: called with how far it has read, a few times a second.
     """
 
-    def __init__(self, roots: Sequence[Path], chosen: Filter, report: Tell) -> None:
-        self._roots, self._chosen = roots, chosen
-        self.rows = look(roots, lambda index: index.select(chosen, columns=_ROW))
+    def __init__(self, recordings: Recordings, chosen: Filter, report: Tell) -> None:
+        if not isinstance(recordings, list | tuple):
+            recordings = [recordings_folder(recordings)]
+        self._roots, self._chosen = recordings, chosen
+        self.rows = look(recordings, lambda index: index.select(chosen, columns=_ROW))
         self._report, self._reported = report, time.monotonic()
         self._read_runs: set[str] = set()
         self._read_rows = 0
