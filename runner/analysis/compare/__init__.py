@@ -198,7 +198,8 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     present = {label: values for label, values in by_label.items() if values.by_seed}
     title, unit = title_of(metric)
     better = higher_is_better(metric, groups)
-    notes += uneven_ends(groups, metric, line) if moment.kind == "last" else []
+    if moment.kind == "last":
+        notes += uneven_ends(groups, metric, line)
     if moment.level is not None:
         better, title, unit = False, f"{title}: first at {moment.level:g}", moment.axis.label
         for label, values in present.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -102,10 +102,10 @@ def last_episodes(metric: str, groups: Sequence[Group]) -> str:
     return f"last {f'{counts[0]} to ' if len(counts) > 1 else ''}{counts[-1]} episodes"
 
 
-def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment) -> list[str]:
-    """Return a note on the window that a value of training averages, unless only last values are compared."""
+def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment) -> Iterator[str]:
+    """Yield a note on the window that a value of training averages, unless only last values are compared."""
     if moment.kind == "last" or not any(name.startswith("training.") for name in metrics):
-        return []
+        return
     windows: dict[str, list[str]] = {}
     for group in groups:
         run, window = group.runs[0], ""
@@ -118,15 +118,16 @@ def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment
                 window = f"stretches of {run.axis.moment(width)}"
         if window:
             windows.setdefault(window, []).append(group.label)
-    parts = "; ".join(f"{window} in {listed(labels)}" for window, labels in windows.items())
-    return [f"a value of training is the mean over a window: {parts}"] if parts else []
+    if windows:
+        parts = "; ".join(f"{window} in {listed(labels)}" for window, labels in windows.items())
+        yield f"a value of training is the mean over a window: {parts}"
 
 
-def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
-    """Return a note if groups have fewer seeds, by label, than their intervals need."""
+def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> Iterator[str]:
+    """Yield a note if groups have fewer seeds, by label, than their intervals need."""
     few = [group for group in groups if seeds[group.label] < FEW_SEEDS]
     if not few:
-        return []
+        return
     listed_groups = ", ".join(f"{group.label} ({seeds[group.label]})" for group in few)
     has_setting = any("seeds" in run.config for group in few for run in group.runs)
     more = (
@@ -134,14 +135,14 @@ def few_seeds(groups: Sequence[Group], seeds: Mapping[str, int]) -> list[str]:
         if has_setting
         else "record more, each with a seed of its own"
     )
-    return [
+    yield (
         f"fewer than {FEW_SEEDS} seeds in {listed_groups}: bootstrap intervals of so few are "
-        "too narrow (at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; " + more
-    ]
+        f"too narrow (at 4 seeds one of 95 % covers 86 % of the time), so take them as a hint; {more}"
+    )
 
 
-def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
-    """Return a note if the last evaluation is not at the same position of the axis in all groups."""
+def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> Iterator[str]:
+    """Yield a note if the last evaluation is not at the same position of the axis in all groups."""
     curves = [
         (group.label, points)
         for group in groups
@@ -150,7 +151,7 @@ def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
     ]
     last = {label: max(points) for label, points in curves}
     if len(set(last.values())) < 2:
-        return []
+        return
     axis = groups[0].axis
     ends = ", ".join(f"after {axis.moment(end)} in {label}" for label, end in last.items())
     what = "report of training" if metric.startswith("training.") else "evaluation"
@@ -158,7 +159,7 @@ def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> list[str]:
     if axis is not EPISODES:  # where runs are interpolated
         shared = {min(last.values())}
     hint = f"; the moment {max(shared):.10g} compares after as many" if shared else ""
-    return [f"the last {what} is {ends}{hint}"]
+    yield f"the last {what} is {ends}{hint}"
 
 
 def moment_of(

@@ -218,7 +218,8 @@ def share_at_least(values: Floats, thresholds: Floats) -> tuple[Floats, Floats, 
     above = (values >= thresholds[:, np.newaxis]).astype(np.float64)
     share = above.mean(axis=1)
     if len(values) < 2 or not len(thresholds):
-        return share, np.full_like(share, np.nan), np.full_like(share, np.nan)
+        nothing = np.full_like(share, np.nan)
+        return share, nothing, nothing
     return share, *_interval(above, np.mean)
 
 

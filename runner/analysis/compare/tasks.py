@@ -227,8 +227,7 @@ def _bounds(
                 f"normalise: the table has no row for {listed(lacking)}; it has {listed(list(table))}."
             )
         return {task: table[task] for task in tasks}
-    bounds = {}
-    equal = []
+    bounds, equal = {}, []
     for task in tasks:
         values = np.concatenate([by_task[task] for by_task in by_label.values()])
         low, high = float(values.min()), float(values.max())
@@ -269,11 +268,9 @@ def _result(
     """Return the statistics of an algorithm; `curves` has [seeds, positions] for each environment."""
     strata = [values[:, np.newaxis] for values in scores.values()]
     reached = [(values >= thresholds).astype(np.float64) for values in strata]
-    profile = [
-        part.tolist()
-        for part in statistics.stratified(reached, lambda drawn: np.concatenate(drawn).mean(axis=0))
-    ]
-    curve = [part.tolist() for part in statistics.stratified(curves, _iqm)]
+    profile = statistics.stratified(reached, lambda drawn: np.concatenate(drawn).mean(axis=0))
+    share, share_low, share_high = (part.tolist() for part in profile)
+    curve, curve_low, curve_high = (part.tolist() for part in statistics.stratified(curves, _iqm))
     return AlgorithmResult(
         label=label,
         seeds={task: len(values) for task, values in scores.items()},
@@ -282,12 +279,12 @@ def _result(
         median=_estimate(strata, lambda drawn: np.median([task.mean(axis=0) for task in drawn], axis=0)),
         mean=_estimate(strata, lambda drawn: np.mean([task.mean(axis=0) for task in drawn], axis=0)),
         optimality_gap=_estimate(strata, lambda drawn: 1 - np.minimum(np.concatenate(drawn), 1).mean(axis=0)),
-        profile=profile[0],
-        profile_low=profile[1],
-        profile_high=profile[2],
-        curve=curve[0],
-        curve_low=curve[1],
-        curve_high=curve[2],
+        profile=share,
+        profile_low=share_low,
+        profile_high=share_high,
+        curve=curve,
+        curve_low=curve_low,
+        curve_high=curve_high,
     )
 
 
