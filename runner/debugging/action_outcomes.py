@@ -94,12 +94,7 @@ class WhatIf:
 
     def as_json(self) -> Json:
         """Return all fields but the environment as JSON can hold them."""
-        plain = {
-            name: value for name, value in vars(self).items() if name not in ("recorded", "actions", "mdp")
-        }
-        fields: Json = finite(
-            plain | {"recorded": vars(self.recorded), "actions": [vars(action) for action in self.actions]}
-        )
+        fields: Json = finite({name: value for name, value in vars(self).items() if name != "mdp"})
         return fields
 
     @property
@@ -176,11 +171,12 @@ class WhatIf:
         parts = [
             _text(_HEAD[0] + _CELL[0] * len(columns) / 2, 20, second, bold=True),
             _text(6, _HEAD[1] - 10, first, anchor="start", bold=True),
-            *(_text(_HEAD[0] + _CELL[0] * (i + 0.5), _HEAD[1] - 10, name) for i, name in enumerate(columns)),
-            *(
-                _text(6, _HEAD[1] + _CELL[1] * (i + 0.5) + 5, name, anchor="start")
-                for i, name in enumerate(rows)
-            ),
+        ]
+        parts += [
+            _text(_HEAD[0] + _CELL[0] * (i + 0.5), _HEAD[1] - 10, name) for i, name in enumerate(columns)
+        ]
+        parts += [
+            _text(6, _HEAD[1] + _CELL[1] * (i + 0.5) + 5, name, anchor="start") for i, name in enumerate(rows)
         ]
         for row in self.actions:
             i, j = divmod(row.action, len(columns))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -16,31 +15,20 @@ from runner.planning.evaluation import joint_probabilities
 from runner.util.arrays import Floats, Records
 
 
-class Position(NamedTuple):
-    """The step of an episode from which it is played on."""
-
-    phase: Literal["train", "eval"]
-    episode: int
-    """Counted over the phase."""
-    step: int
-    """Counted over the phase."""
-    t: int
-    state: int
-    trained_episode: int
-    """The training episode at which schedules are read; that of a trial is the one after its evaluation."""
-    trained_step: int
-
-
 class Continuation:
-    """An episode played on from a moment, by the kernels that record episodes.
+    """An episode played on from a recorded step, by the kernels that record episodes.
 
-    The tables of the learner are those of the moment; they do not change.
+    The learner has the tables of that moment, which do not change. Schedules are read at a training episode
+    and a training step.
     """
 
-    def __init__(self, learner: Learner, moment: Position) -> None:
-        self._learner, self._moment = learner, moment
+    def __init__(
+        self, learner: Learner, step: Records, trained_episode: int, trained_step: int, is_trial: bool
+    ) -> None:
+        self._learner, self._step, self._is_trial = learner, step, is_trial
+        self._trained = trained_episode, trained_step
         learner.begin_evaluation()
-        rules = learner.segment_at(moment.trained_step).rules
+        rules = learner.segment_at(trained_step).rules
         self._settings = rules
         self._draws_actions = learner.algorithm.draws_actions
         # Without learning all others act alike; SARSA would expect that its next action is chosen already.
@@ -56,7 +44,7 @@ class Continuation:
     def epsilon(self) -> float:
         """The probability of exploring at the moment; 1 of random agents."""
         rules = self._settings
-        if self._moment.phase == "eval":
+        if self._is_trial:
             return 0.0 if rules.learns else 1.0
         epsilon = self._scheduled(rules.epsilon)
         return 1.0 - epsilon if rules.epsilon_exploits else epsilon
@@ -66,10 +54,8 @@ class Continuation:
         """What acts from the moment on."""
         if not self._settings.learns:
             return "random"
-        own = "greedy"
-        if self._draws_actions:
-            own = "drawn from the learned policies"
-        return own if self._moment.phase == "eval" else f"{own}, exploring with probability {self.epsilon:g}"
+        policy = "drawn from the learned policies" if self._draws_actions else "greedy"
+        return policy if self._is_trial else f"{policy}, exploring with probability {self.epsilon:g}"
 
     @property
     def policy(self) -> Floats:
@@ -93,17 +79,17 @@ class Continuation:
         The action is taken whatever the policy would choose. `steps` are step records of the phase, filled;
         `episodes` is one episode record of the phase, overwritten.
         """
-        moment, learner = self._moment, self._learner
+        learner = self._learner
         cursor = np.zeros(1, kernel.CURSOR)
         for name in ("step", "episode", "t", "state"):
-            cursor[name] = getattr(moment, name)
+            cursor[name] = self._step[name]
         tally = Tally(
             np.zeros(len(learner.agents)),
             np.zeros(len(learner.model.event_mask), np.int64),
             np.zeros(1, np.int32),
             np.zeros(1, np.int64),
         )
-        play = self._train if moment.phase == "train" else self._evaluate
+        play = self._evaluate if self._is_trial else self._train
         ends = kernel.Ends.of(episodes)
         filled, ended = play(action, cursor, tally, steps[:1], ends)
         if not ended and len(steps) > 1:
@@ -117,7 +103,7 @@ class Continuation:
     ) -> tuple[int, int]:
         learner, rules, tables = self._learner, self._rules, self._learner.tables
         if action is not None:  # greedy agents that prefer it take it
-            state, own = self._moment.state, learner.model.own_action[action]
+            state, own = int(self._step["state"]), learner.model.own_action[action]
             rules = rules._replace(epsilon=compile_schedule(0.0), epsilon_exploits=False)
             tables = tables._replace(greedy=tables.greedy.copy(), extra=tables.extra.copy())
             tables.greedy[:, state] = own
@@ -126,20 +112,21 @@ class Continuation:
                     row = tables.extra[POLICY, offset + state * width :][:width]
                     row[:] = np.arange(width) == choice
         fixed = (learner.seed, learner.model, tables, rules)
-        until = self._moment.episode + 1
+        until = int(self._step["episode"]) + 1
         filled, ended = kernel.train(cursor, *fixed, tally, steps, ends, until, NEVER, CHOSEN)
         return filled, ended
 
     def _evaluate(
         self, action: int | None, cursor: Records, tally: Tally, steps: Records, ends: kernel.Ends
     ) -> tuple[int, int]:
-        learner, moment, policy = self._learner, self._moment, self._learner.trial_actions
+        learner, policy = self._learner, self._learner.trial_actions
+        state, until = int(self._step["state"]), int(self._step["episode"]) + 1
         if action is not None:
             policy = policy.copy()
-            policy[moment.state] = action
+            policy[state] = action
         fixed = (learner.seed, learner.model, learner.tables, policy)
-        filled, ended = kernel.evaluate(cursor, *fixed, tally, steps, ends, moment.episode + 1, moment.state)
+        filled, ended = kernel.evaluate(cursor, *fixed, tally, steps, ends, until, state)
         return filled, ended
 
     def _scheduled(self, schedule: Floats) -> float:
-        return float(schedule_value(schedule, self._moment.trained_episode, self._moment.trained_step))
+        return float(schedule_value(schedule, *self._trained))

@@ -20,7 +20,7 @@ from runner.analysis.contents import ending_of, require_steps
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import opened
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
-from runner.debugging.continuation import Continuation, Position
+from runner.debugging.continuation import Continuation
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
 from runner.export.reports.playback import tabular_playback
@@ -124,19 +124,13 @@ class _Branches:
         self._recording, self._at, self._mdp = recording, at, recording.mdp
         self._number = at.number_in(recording)
         self._read_episode()
-        step = int(self._step["step"])
-        is_training = at.after is None
-        self._tables = TableReplay(recording, step if is_training else at.evaluation_in(recording).train_step)
-        moment = Position(
-            phase=at.phase,
-            episode=self._number,
-            step=step,
-            t=at.t,
-            state=int(self._step["state"]),
-            trained_episode=at.episode if at.after is None else at.after,
-            trained_step=self._tables.step,
+        trained_episode, trained_step = at.episode, int(self._step["step"])
+        if at.after is not None:
+            trained_episode, trained_step = at.after, at.evaluation_in(recording).train_step
+        self._tables = TableReplay(recording, trained_step)
+        self._playing = Continuation(
+            self._tables.learner, self._step, trained_episode, trained_step, at.after is not None
         )
-        self._playing = Continuation(self._tables.learner, moment)
 
     def _read_episode(self) -> None:
         """Read the step, what came before it, and where the episode led."""
@@ -236,12 +230,9 @@ class _Branches:
         """Return the Q-values of each joint action in a state; empty tuples where nothing is learned."""
         if not self._learns:
             return [()] * self._mdp.joint_actions
-        rows = [table[state] for table in self._tables.tables]
-        own = self._tables.learner.model.own_action
-        return [
-            tuple(float(row[action]) for row, action in zip(rows, actions, strict=True))
-            for actions in own.tolist()
-        ]
+        own = self._tables.learner.model.own_action  # [J, learners]
+        columns = [table[state, own[:, i]].tolist() for i, table in enumerate(self._tables.tables)]
+        return list(zip(*columns, strict=True))
 
     def _exact_values(self, state: int, policy: Floats) -> tuple[Floats, Floats]:
         """Return the values of each joint action under the policy, [J, learners], and the optimum, [J]."""
