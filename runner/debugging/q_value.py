@@ -130,20 +130,27 @@ class Why:
 
     def sections(self) -> list[Section]:
         """Return the value, and all parts of the sum."""
-        return [Section("The value", facts=facts_of(self)), *_parts_of(self)]
+        return [Section("The value", facts=self._facts), *_parts_of(self)]
+
+    @property
+    def _facts(self) -> dict[str, str]:
+        """The run, the state, the action and the value as text, by name."""
+        return {
+            "run": self.run_id,
+            "state": f"{self.state}: {self.state_in_words}",
+            "action": f"{self.action}: {self.action_in_words}, of {spoken(self.agent)}",
+            "value": f"{self.value:.9g} after {self.step:,} training steps",
+        }
 
     def _repr_html_(self) -> str:
-        return why_frame(self)
-
-
-def facts_of(found: Why) -> dict[str, str]:
-    """Return the run, the state, the action and the value as text, by name."""
-    return {
-        "run": found.run_id,
-        "state": f"{found.state}: {found.state_in_words}",
-        "action": f"{found.action}: {found.action_in_words}, of {spoken(found.agent)}",
-        "value": f"{found.value:.9g} after {found.step:,} training steps",
-    }
+        """Return the sum in a frame of its own; the value alone if packages are missing."""
+        try:
+            page = f"<style>{page_style()}</style><main>{partials().answer(self.sections())}</main>"
+        except MissingExtra as error:
+            facts = "; ".join(f"{name} {text}" for name, text in self._facts.items())
+            return f"<p>{escape(facts)}</p><p>{escape(str(error))}</p>"
+        title = f"Why the value of action {self.action_in_words} in state {self.state} is {self.value:.4g}"
+        return framed(title, page, HEIGHT)
 
 
 def _parts_of(found: Why) -> list[Section]:
@@ -170,11 +177,12 @@ def _parts_of(found: Why) -> list[Section]:
     off = "It equals the table's value."
     if found.total != found.value:
         off = f"It differs from the table's value by {abs(found.total - found.value):.1g}, by rounding."
-    headings = ("step", "state", "action", "reward", *columns, "steps away")
-    steps = [_step(part, cells(part)) for part in found.steps]
-    links = [EpisodeRef.parse(part.at).replay for part in found.steps]
-    listed = [Grid(headings, steps, links=links)] if steps else []
-    none = [] if steps else ["No reward adds to the value or takes from it."]
+    largest = Section("The steps that add or take most", ["No reward adds to the value or takes from it."])
+    if found.steps:
+        headings = ("step", "state", "action", "reward", *columns, "steps away")
+        links = [EpisodeRef.parse(part.at).replay for part in found.steps]
+        steps = [_step(part, cells(part)) for part in found.steps]
+        largest = Section(largest.title, [], [Grid(headings, steps, links=links)])
     episodes = [part for part in found.episodes if part.weight or part.contribution]
     without = len(found.episodes) - len(episodes)
     left_out = (
@@ -188,7 +196,7 @@ def _parts_of(found: Why) -> list[Section]:
             figure=found.picture,
             caption=KEY,
         ),
-        Section("The steps that add or take most", none, listed),
+        largest,
     ]
     if rewards:
         sections.append(Section("By reward", [], [Grid(("reward", "events", *columns), rewards)]))
@@ -206,14 +214,3 @@ def _step(part: StepPart, cells: tuple[str, str, str]) -> tuple[str, ...]:
     action = f"{part.action_in_words} ({part.explored})" if part.explored else part.action_in_words
     reward = f"{part.reward:+g}, {part.events}" if part.events else f"{part.reward:+g}"
     return part.at, f"{part.state}: {part.state_in_words}", action, reward, *cells, f"{part.distance:.1f}"
-
-
-def why_frame(found: Why) -> str:
-    """Return a Q-value as a sum in a frame of its own; the value alone if packages are missing."""
-    try:
-        page = f"<style>{page_style()}</style><main>{partials().answer(found.sections())}</main>"
-    except MissingExtra as error:
-        facts = "; ".join(f"{name} {text}" for name, text in facts_of(found).items())
-        return f"<p>{escape(facts)}</p><p>{escape(str(error))}</p>"
-    title = f"Why the value of action {found.action_in_words} in state {found.state} is {found.value:.4g}"
-    return framed(title, page, HEIGHT)

@@ -11,7 +11,7 @@ determines that. So the sum is exact: it is the value, but for the rounding of b
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,7 +39,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import last_step
 from runner.runs.run import Run
-from runner.util.arrays import Floats, Records
+from runner.util.arrays import Array, Floats, Records
 from runner.util.processes import Report
 
 POLICY_NOTE: Final = (
@@ -217,12 +217,10 @@ def _by_reward(mdp: Mdp, weights: Weights, learner: int, learners: int) -> Itera
     """Yield the parts of a Q-value by kind of reward."""
     at = np.unravel_index(np.flatnonzero(weights.outcomes), mdp.next_state.shape)
     kinds = np.stack([mdp.rewards_of(learners)[(*at, learner)], mdp.events[at]], axis=1)
-    distinct, kind_of = np.unique(kinds, axis=0, return_inverse=True)
-    sums = np.bincount(kind_of.reshape(-1), weights.outcomes[weights.outcomes != 0], minlength=len(distinct))
     parts = sorted(
         (
             RewardPart(weight, weight * reward, reward, events_in_words(mdp, int(events)))
-            for weight, (reward, events) in zip(sums.tolist(), distinct.tolist(), strict=True)
+            for (reward, events), weight in _summed(kinds, weights.outcomes[weights.outcomes != 0])
         ),
         key=lambda part: (-abs(part.contribution), -part.weight),
     )
@@ -269,10 +267,14 @@ def _moves(mdp: Mdp, outcomes: Floats, agent: str) -> Iterator[Move]:
     for number, thing in enumerate(mdp.scene["things"]):
         if thing["kind"] == "mover" and (not agent or thing.get("agent") in (None, agent)):
             cells = np.stack([mdp.scene_cells[state, number], mdp.scene_cells[next_state, number]], axis=1)
-            pairs, pair_of = np.unique(cells, axis=0, return_inverse=True)
-            sums = np.bincount(pair_of.reshape(-1), outcomes[seen_outcomes], minlength=len(pairs))
-            for (start, stop), weight in zip(pairs.tolist(), sums.tolist(), strict=True):
+            for (start, stop), weight in _summed(cells, outcomes[seen_outcomes]):
                 yield Move(number, start, stop, weight)
+
+
+def _summed(rows: Array, weights: Floats) -> Iterator[tuple[Any, float]]:
+    """Return each distinct row with the sum of its weights."""
+    distinct, row_of = np.unique(rows, axis=0, return_inverse=True)
+    return zip(distinct.tolist(), np.bincount(row_of.reshape(-1), weights).tolist(), strict=True)
 
 
 def _picture(mdp: Mdp, state: int, moves: Sequence[Move]) -> str:
