@@ -120,7 +120,32 @@ class When:
 
     def sections(self) -> list[Section]:
         """Return the result as sentences and tables: the first moment, and the intervals."""
-        return [_section_of(self)]
+        first, last = self.searched
+        sentences = [f"State {number}: {name}." for number, name in self.states]
+        if self.first is None:
+            sentences.append(f"It holds after none of the training steps {first:,} to {last:,}.")
+            rows = [(value.expression, _text(value.after)) for value in self.last.values]
+            return [Section(self.expression, sentences, [Grid(("at the end", "value"), rows)])]
+        moment = self.first
+        where = (
+            f"training step {moment.step:,}, step {moment.t:,} of episode {moment.episode:,} ({moment.at})"
+        )
+        if not self.every:
+            sentences.append(f"It holds first after {where}.")
+        else:
+            sentences.append(
+                f"It holds after {self.steps:,} of the training steps {first:,} to {last:,}, in "
+                f"{counted(self.count, 'interval')}; first after {where}."
+            )
+        if self.held_before and moment.step == first:
+            sentences.append("It held before that step too.")
+        changes = [(value.expression, _text(value.before), _text(value.after)) for value in moment.values]
+        grids = [Grid(("first", "before", "after"), changes)]
+        if self.every:
+            grids.append(_intervals_grid(self.intervals, last))
+            if len(self.intervals) < self.count:
+                sentences.append(f"The first {len(self.intervals):,} intervals are listed.")
+        return [Section(self.expression, sentences, grids, replay=moment.at.replay)]
 
     def _repr_html_(self) -> str:
         return html(self.sections())
@@ -268,38 +293,6 @@ def _step_number(recording: Recording, at: StepLike) -> int:
 
 
 # --- as text ----------------------------------------------------------------------------------------------
-
-
-def _section_of(found: When) -> Section:
-    first, last = found.searched
-    sentences = [f"State {number}: {name}." for number, name in found.states]
-    if found.first is None:
-        sentences.append(f"It holds after none of the training steps {first:,} to {last:,}.")
-        return Section(found.expression, sentences, [_values_grid("at the end", found.last, False)])
-    moment = found.first
-    where = f"training step {moment.step:,}, step {moment.t:,} of episode {moment.episode:,} ({moment.at})"
-    if not found.every:
-        sentences.append(f"It holds first after {where}.")
-    else:
-        sentences.append(
-            f"It holds after {found.steps:,} of the training steps {first:,} to {last:,}, in "
-            f"{counted(found.count, 'interval')}; first after {where}."
-        )
-    if found.held_before and found.first.step == first:
-        sentences.append("It held before that step too.")
-    grids = [_values_grid("first", found.first, True)]
-    if found.every:
-        grids.append(_intervals_grid(found.intervals, last))
-        if len(found.intervals) < found.count:
-            sentences.append(f"The first {len(found.intervals):,} intervals are listed.")
-    return Section(found.expression, sentences, grids, replay=found.first.at.replay)
-
-
-def _values_grid(heading: str, moment: WhenMoment, with_before: bool) -> Grid:
-    if not with_before:
-        return Grid((heading, "value"), [(each.expression, _text(each.after)) for each in moment.values])
-    rows = [(each.expression, _text(each.before), _text(each.after)) for each in moment.values]
-    return Grid((heading, "before", "after"), rows)
 
 
 def _intervals_grid(intervals: Sequence[Interval], last: int) -> Grid:
