@@ -1,5 +1,6 @@
 """Views and exports of installed packages: commands, routes and pages, as docs/plugins.md describes them."""
 
+import functools
 import json
 import os
 import re
@@ -15,6 +16,7 @@ from tests.runner.service.served import Served
 
 pytestmark = pytest.mark.long
 
+get = functools.partial(httpx2.get, timeout=60)
 DOCS = Path(__file__).parents[2] / "docs" / "plugins.md"
 
 
@@ -67,16 +69,16 @@ def test_an_installed_view_and_export_are_commands(environment, run, tmp_path):
 def test_an_installed_view_and_export_are_served(environment, run):
     with Served(run.folder.parent) as served:
         address = f"/runs/{run.run_id}"
-        page = httpx2.get(f"{served.url}{address}/longest?count=2").raise_for_status().text
+        page = get(f"{served.url}{address}/longest?count=2").raise_for_status().text
         assert page.count(f'href="{address}/replay/train/') == 2
-        assert f'href="{address}/longest"' in httpx2.get(f"{served.url}{address}").text
+        assert f'href="{address}/longest"' in get(f"{served.url}{address}").text
         api = f"{served.url}/api/v1{address}"
-        assert len(httpx2.get(f"{api}/longest?count=2").json()["lengths"]) == 2
-        file = httpx2.get(f"{api}/exports/lengths").raise_for_status()
+        assert len(get(f"{api}/longest?count=2").json()["lengths"]) == 2
+        file = get(f"{api}/exports/lengths").raise_for_status()
         assert len(file.text.split()) == 50
         assert file.headers["content-disposition"].endswith(".txt")
-        assert f'href="/api/v1{address}/exports/lengths"' in httpx2.get(f"{served.url}{address}/config").text
-        assert httpx2.get(f"{api}/exports/others").status_code == 404
+        assert f'href="/api/v1{address}/exports/lengths"' in get(f"{served.url}{address}/config").text
+        assert get(f"{api}/exports/others").status_code == 404
 
 
 def test_a_plugin_that_cannot_be_used_is_named(environment, run):
@@ -98,4 +100,4 @@ def test_names_that_are_shipped_stay(environment, run):
     assert "From the package" not in dualtaxi("--help")
     assert "EXPRESSION" in dualtaxi("when", "--help")
     with Served(run.folder.parent) as served:
-        httpx2.get(f"{served.url}/runs/{run.run_id}/when").raise_for_status()
+        get(f"{served.url}/runs/{run.run_id}/when").raise_for_status()
