@@ -88,7 +88,7 @@ def whole_ranges(
     """Return ranges of episodes, which must be among `count` ones, with an end in place of None."""
     whole = [(start, count if stop is None else stop) for start, stop in ranges]
     for start, stop in whole:
-        if not start < stop <= count:
+        if not 0 <= start < stop <= count:
             raise NotInRecording(
                 f"{where}: found no {schema.PHASE_NAMES[phase]} episodes {start}..{stop}; "
                 f"there are {count:,}, from 0. Ranges are of whole episodes: START..STOP, STOP not included."

@@ -138,6 +138,7 @@ def select(recording: Recording, request: Request) -> Selection:
     available, where = evaluations_with_steps(recording), str(recording.path)
     chosen = [evaluation_after(available, after, where) for after in sorted(set(request.evaluations))]
     numbers = _asked_episodes(request, len(train.start), where)
+    whole_ranges([(number, number + 1) for number in request.trials], len(evals.start), "eval", where)
     asked = {"train": numbers, "eval": np.array(request.trials, int)}
     if not request.everything:
         trials = asked["eval"] if request.trials else _trials(chosen)

@@ -65,6 +65,11 @@ class TestSelection:
         with pytest.raises(RecordingError, match=r"there are 40, from 0"):
             select(rivals, Request(episodes=ranges))
 
+    @pytest.mark.parametrize("number", [-1, 18])
+    def test_trials_that_do_not_exist(self, rivals, number):
+        with pytest.raises(RecordingError, match=r"no evaluation episodes .* there are 18, from 0"):
+            select(rivals, Request(trials=(0, number)))
+
     def test_an_evaluation_that_does_not_exist(self, rivals):
         with pytest.raises(
             RecordingError, match=r"evaluation after 7 episodes; it has 3, the nearest after 0\."
