@@ -115,8 +115,9 @@ def page(browser: webdriver.Chrome, served: str) -> Iterator[Callable[[str], web
     assert {address for address in requested if address.startswith(("http", "ws"))} <= {served}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Return a server that receives runs; not to be stopped."""
     with Served(tmp_path_factory.mktemp("server") / "runs") as started:
         yield started
 
