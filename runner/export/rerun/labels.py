@@ -21,7 +21,7 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import numbered_actions, spoken
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.tracks import Floats, Points, Track, pairs, repeated
-from runner.util.arrays import Records
+from runner.util.arrays import Ints, Records
 
 MAX_REWARDS: Final = 2_000
 MAX_T: Final = 10_000
@@ -112,22 +112,26 @@ class GridLabels:
         status = repeated(pairs([(left, y), *rewards]), len(scene.points))
         return np.concatenate((scene.points + pairs((0, rise) for rise in rises), status), axis=1)
 
+    @cached_property
+    def _of_states(self) -> Ints:
+        """[S, movers + passengers]: the labels in each state, of movers in a step without events."""
+        scene = self.scene
+        assert scene is not None
+        is_carrying = (scene.carriers[..., None] == np.array(scene.movers, np.int64)).any(axis=1)
+        movers = 2 * np.arange(len(scene.movers)) + is_carrying
+        waiting = self._waiting + np.arange(len(scene.passengers))
+        passengers = np.where(scene.carriers[:, scene.passengers] >= 0, self._riding, waiting)
+        return np.concatenate((movers * len(self._masks), passengers), axis=1)
+
     def of_steps(self, records: Records, events: NDArray[np.uint32]) -> NDArray[np.uint16]:
         """Return the label of each text in each step, [n, texts].
 
         Movers have their name and what happened to them.
         """
-        scene = self.scene
-        assert scene is not None
-        carriers = scene.carriers[records["state"]]
-        is_carrying = (carriers[..., None] == np.array(scene.movers, np.int64)).any(axis=1)
-        movers = 2 * np.arange(len(scene.movers)) + is_carrying
-        waiting = self._waiting + np.arange(len(scene.passengers))
-        labels = [
-            movers * len(self._masks) + np.searchsorted(self._masks, events)[:, None],
-            np.where(carriers[:, scene.passengers] >= 0, self._riding, waiting),
-            self._t + np.minimum(records["t"], self._longest)[:, None],
-        ]
+        assert self.scene is not None
+        things = self._of_states.take(records["state"], axis=0)
+        things[:, : len(self.scene.movers)] += np.searchsorted(self._masks, events)[:, None]
+        labels = [things, self._t + np.minimum(records["t"], self._longest)[:, None]]
         for i, first, distinct in self._rewards:
             number = np.searchsorted(distinct, records["rewards"][:, [i]])
             labels.append(first + number.clip(max=len(distinct) - 1))

@@ -95,11 +95,12 @@ class ValueReader:
         tables, learned = replay.empty_rows(len(steps)), replay.learner.tables
         map_rows, maps = np.flatnonzero(is_new), []
         leaps = np.flatnonzero(np.diff(trained) != stride) + 1
-        for start, stop in pairwise(np.unique([0, *leaps, *map_rows, len(steps)]).tolist()):
+        edges = [0, *leaps, *(map_rows if stride else ()), len(steps)]
+        for start, stop in pairwise(np.unique(edges).tolist()):
             if replay.step != trained[start]:
                 replay.seek(int(trained[start]))
-            if is_new[start]:
-                states = self._states[context[start]]
+            for row in start + np.flatnonzero(is_new[start:stop]):
+                states = self._states[context[row]]
                 best, choice = learned.value[:, states], learned.greedy[:, states]
                 maps.append((np.where(states < 0, np.nan, best), np.where(states < 0, -1, choice)))
             if stride:
