@@ -248,11 +248,11 @@ class _Search:
 
     def _take(self, condition: str, phase: str | None, sort: str) -> None:
         """Search all runs."""
-        kinds: dict[str, list[int]] = {}
+        kinds = defaultdict[str, list[int]](list)
         for k, row in enumerate(self.runs.rows):
             try:
                 self.files[k] = self.index.file(row, self.runs)
-                kinds.setdefault(kind_of(self.files[k]), []).append(k)
+                kinds[kind_of(self.files[k])].append(k)
             except RunnerError as error:
                 self.runs.left_out[row["id"]] = {"find": str(error)}
         self.index.trim()
@@ -269,7 +269,7 @@ class _Search:
                 wrong.append(error)
                 reason = error.reason if isinstance(error, NotInRun) else str(error).partition("\n")[0]
                 for k in numbers:
-                    self.runs.leave_out("find", self.runs.rows[k], reason)
+                    self.runs.left_out[self.runs.rows[k]["id"]] = {"find": reason}
             else:
                 self._ask(numbers, first, second, f" AND phase = '{phase}'" if phase else "")
         if wrong and len(wrong) == len(kinds):

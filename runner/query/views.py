@@ -117,11 +117,7 @@ class SelectedRuns:
         try:
             yield listed_run(Path(row["root"], row["entry"]), row["id"])
         except RunnerError as error:
-            self.leave_out(name, row, str(error))
-
-    def leave_out(self, name: str, row: IndexRow, reason: str) -> None:
-        """Leave a run out of a view, or of `find`."""
-        self.left_out.setdefault(row["id"], {})[name] = reason
+            self.left_out.setdefault(row["id"], {})[name] = str(error)
 
     def _count(self, row: IndexRow, rows: int) -> None:
         if self.is_stopped:

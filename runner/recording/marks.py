@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -79,14 +79,14 @@ class Marks:
 
     marks: tuple[Mark, ...] = ()
     """In the order of their steps."""
-    removed: frozenset[str] = field(default=frozenset())
+    removed: frozenset[str] = frozenset()
 
     def merged(self, more: Iterable[Mark], removed: Iterable[str] = ()) -> Marks:
         """Return these marks and more, without those that were removed on either side."""
         gone = self.removed.union(removed)
         by_id = {mark.id: mark for mark in (*self.marks, *more) if mark.id not in gone}
         order = sorted(by_id.values(), key=lambda mark: (mark.phase, mark.episode, mark.t, mark.created))
-        return replace(self, marks=tuple(order), removed=gone)
+        return Marks(tuple(order), gone)
 
     def as_json(self) -> Json:
         """Return the contents of the file."""

@@ -622,3 +622,14 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
     assert list((cache_folder() / EPISODES / "packs").iterdir())
     shutil.rmtree(tmp_path / "run00011")
     assert [found.runs for found in hits()] == [19, 19, 9]
+
+
+def test_a_number_to_sort_by_is_checked_as_a_condition_is(folder):
+    for sort, message in (
+        ("-" * 900 + "ret", ""),
+        ("ret +", "invalid syntax"),
+        ("rett", "Did you mean 'ret'"),
+    ):
+        with pytest.raises(RunnerError, match="expression: ") as error:
+            runner.find("length > 0", folder, sort=sort)
+        assert message in str(error.value)
