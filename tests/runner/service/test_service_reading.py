@@ -220,6 +220,10 @@ def test_the_replay_is_made_once_and_cached(client, recordings):
     again = client.get(f"{RUN}/replay.rrd", params={"episodes": "0:2"})
     assert again.content == first.content
     assert client.get(f"{RUN}/replay.rrd", params={"episodes": "x"}).status_code == 422
+    for trial in (10**12, 10**30, -1):
+        missing = client.get(f"{RUN}/replay.rrd", params={"trials": trial})
+        assert missing.status_code == 404
+        assert "there are 140, from 0" in missing.json()["error"]["message"]
 
 
 def test_a_damaged_recording_is_reported(client, recordings):
