@@ -173,12 +173,13 @@ def answer(
         report(done, total, RUNS)
 
     try:
-        mixtures = Mixtures(mixing, question.seeds, folder, own, report_runs)
-        if not mixtures.known(mixtures.ends):
+        mixtures = Mixtures(mixing, question.seeds, folder, own, pool, report_runs)
+        ends = (0, mixing.everything)
+        if not mixtures.known(ends):
             check_metric(question)
-        mixtures.measure(mixtures.ends, pool, _PROBES)
-        sides = [mixtures.readings(side)[0] for side in mixtures.ends]
-        game = Game(mixtures, pool, _metric_of(sides, question.metric))
+        mixtures.measure(ends, _PROBES)
+        sides = [mixtures.readings(end)[0] for end in ends]
+        game = Game(mixtures, _metric_of(sides, question.metric))
         planned(game.plan())
         players = game.players()
         settings = settings_of(game, players)
@@ -284,11 +285,11 @@ def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
     """
     shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
     candidates = [metric] if metric is not None else ["success_percent", "mean_return"]
-    default = next((name for name in candidates if name in shared), None)
-    if default is None:
-        names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
-        raise RunnerError(
-            f"metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
-            f"{nearest(metric or '', shared)}"
-        )
-    return default
+    for name in candidates:
+        if name in shared:
+            return name
+    names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
+    raise RunnerError(
+        f"metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
+        f"{nearest(metric or '', shared)}"
+    )

@@ -12,9 +12,8 @@ import numpy as np
 from runner.analysis.compare.statistics import Estimate, bootstrap_means
 from runner.debugging.explanation import ENOUGH, Interaction, Mixture, Setting
 from runner.debugging.factors import MAX_ALL
-from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures
+from runner.debugging.mixtures import Mixtures
 from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
-from runner.sweep.local import Workers
 from runner.util.arrays import Floats
 
 _START_SECONDS: Final = 10.0
@@ -36,20 +35,10 @@ class SamplingPlan:
     run_seconds: float
     """The time that one run takes of a worker; 0 if all are known."""
     workers: int
-
-    @property
-    def seconds(self) -> float:
-        """The estimated time of the whole, at least; 0 if all runs are known."""
-        return self._seconds(self.mixtures)
-
-    @property
-    def most_seconds(self) -> float:
-        """The same, at most."""
-        return self._seconds(self.most_mixtures)
-
-    def _seconds(self, mixtures: int) -> float:
-        left = mixtures * self.seeds - self.known
-        return _START_SECONDS + left * self.run_seconds / self.workers if left > 0 else 0.0
+    seconds: float
+    """The estimated time of the whole, at least; 0 if all runs are known."""
+    most_seconds: float
+    """The same, at most."""
 
 
 def mixture_bounds(settings: int) -> tuple[int, int]:
@@ -62,17 +51,19 @@ def mixture_bounds(settings: int) -> tuple[int, int]:
 class Game:
     """The values of mixtures, measured when they are needed: settings are players, mixtures coalitions."""
 
-    def __init__(self, mixtures: Mixtures, pool: Workers[Measurement, MixtureResult], metric: str) -> None:
-        self.mixing, self.metric = mixtures.mixing, metric
-        self._mixtures, self._pool = mixtures, pool
+    def __init__(self, mixtures: Mixtures, metric: str) -> None:
+        self.mixing, self.metric, self._mixtures = mixtures.mixing, metric, mixtures
         self._count = len(self.mixing.factors)
 
     def plan(self) -> SamplingPlan:
         """Return what will be trained."""
         count, mixtures, seeds = self._count, self._mixtures, len(self._mixtures.seeds)
         least, most = mixture_bounds(count)
-        available = mixtures.known(range(least)) if least == most else mixtures.in_file
-        return SamplingPlan(count, least, most, seeds, available, mixtures.seconds, max(1, self._pool.idle))
+        known = mixtures.known(range(least)) if least == most else mixtures.in_file
+        run_seconds, workers = mixtures.seconds, max(1, mixtures.workers.idle)
+        left = (number * seeds - known for number in (least, most))
+        times = [_START_SECONDS + runs * run_seconds / workers if runs > 0 else 0.0 for runs in left]
+        return SamplingPlan(count, least, most, seeds, known, run_seconds, workers, times[0], times[1])
 
     def players(self) -> list[int]:
         """Return the numbers of the settings among which the difference is shared; measure their mixtures.
@@ -82,15 +73,15 @@ class Game:
         """
         players = list(range(self._count))
         if self._count > MAX_ALL:
-            self._mixtures.measure((0, self.mixing.everything), self._pool)
+            self._mixtures.measure((0, self.mixing.everything))
             players = minimal_set(players, self._makes_enough) if self.difference.excludes_zero else []
         if len(players) <= MAX_ALL:
-            self._mixtures.measure(coalitions(players), self._pool)
+            self._mixtures.measure(coalitions(players))
         return players
 
     def _makes_enough(self, players: Sequence[int]) -> bool:
         number = sum(1 << i for i in players)
-        self._mixtures.measure([number], self._pool)
+        self._mixtures.measure([number])
         return self._part(number) >= ENOUGH
 
     def _part(self, number: int) -> float:

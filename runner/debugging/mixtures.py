@@ -145,7 +145,7 @@ def _environment_digest(mdp: Mdp) -> str:
 
 
 class Mixtures:
-    """The readings of mixtures, measured when they are needed, and kept in a folder.
+    """The readings of mixtures, measured by workers when they are needed, and kept in a folder.
 
     `report` is called several times a second with the number of runs done, and of those known to be needed.
     """
@@ -156,42 +156,48 @@ class Mixtures:
         seeds: Sequence[int],
         recordings: Path,
         folder: Path,
+        workers: Workers[Measurement, MixtureResult],
         report: Callable[[int, int], None],
     ) -> None:
-        self.mixing, self.seeds, self._recordings = mixing, tuple(seeds), recordings
-        self._path, self._report = folder / VALUES, report
+        self.mixing, self.seeds, self.workers = mixing, tuple(seeds), workers
+        self._recordings, self._path, self._report = recordings, folder / VALUES, report
         self._kept = {known.job: known for known in _kept(self._path)}
         self.in_file = sum(earlier.seed in self.seeds for earlier in self._kept.values())
         """Runs in the file that have one of the seeds, of whatever mixtures."""
-        self._found: dict[tuple[int, int], Readings] = {}
-        self._batch = 1
+        self._jobs: dict[int, list[str]] = {}
+        """Mixture to the identities of its runs, by the order of the seeds."""
         self.trained = 0
         """Runs that were trained now, not read from the file."""
-        self._seconds: dict[int, float] = {}
 
     @property
     def seconds(self) -> float:
-        """The time that a run takes of a processor, the mean over mixtures; 0 if none was trained."""
-        return sum(self._seconds.values()) / max(1, len(self._seconds))
-
-    @property
-    def ends(self) -> tuple[int, int]:
-        """The numbers of A and of B."""
-        return 0, self.mixing.everything
+        """The time that a run takes of a processor, on average; 0 if none was trained."""
+        jobs = (job for jobs in self._jobs.values() for job in jobs)
+        times = [self._kept[job].seconds for job in jobs if job in self._kept]
+        return sum(times) / max(1, len(times))
 
     def complete(self) -> list[int]:
         """Return the mixtures of which all seeds were measured."""
-        numbers = {number for number, _ in self._found}
-        return [n for n in numbers if all((n, seed) in self._found for seed in self.seeds)]
+        return [mixture for mixture in self._jobs if len(self.readings(mixture)) == len(self.seeds)]
 
     def known(self, mixtures: Sequence[int]) -> int:
         """Return the number of runs of mixtures that need not be trained."""
-        missing = sum(len(task.seeds) for task in self._tasks(mixtures, self.seeds))
-        return len(mixtures) * len(self.seeds) - missing
+        return sum(len(self.readings(mixture)) for mixture in mixtures)
 
     def readings(self, mixture: int) -> list[Readings]:
         """Return the readings of a mixture that were measured, by the order of the seeds."""
-        return [self._found[mixture, seed] for seed in self.seeds if (mixture, seed) in self._found]
+        return [self._kept[job].readings for job in self._jobs_of(mixture) if job in self._kept]
+
+    def _jobs_of(self, mixture: int) -> list[str]:
+        """Return what determines the readings of each run: its job, and the code of its environment."""
+        if mixture not in self._jobs:
+            config = self.mixing.config(mixture)
+            environment = _environment_digest(load_once(config.env.id, config.env.kwargs, config.rewards))
+            values = config.to_mapping()
+            self._jobs[mixture] = [
+                f"{identity_of(values, seed)}-{environment}-{__version__}" for seed in self.seeds
+            ]
+        return self._jobs[mixture]
 
     def values(self, mixtures: Sequence[int], metric: str) -> Floats:
         """Return the values of a metric in mixtures, [mixtures, seeds].
@@ -210,19 +216,17 @@ class Mixtures:
             rows.append(row)
         return np.array(rows, np.float64)
 
-    def measure(
-        self, mixtures: Sequence[int], workers: Workers[Measurement, MixtureResult], seeds: int | None = None
-    ) -> None:
+    def measure(self, mixtures: Sequence[int], seeds: int | None = None) -> None:
         """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet."""
         waiting = deque(self._tasks(mixtures, self.seeds[:seeds]))
         left = sum(len(task.seeds) for task in waiting)
         busy, died = 0, list[Measurement]()
         while waiting or busy:
-            while waiting and workers.idle:
-                workers.submit(waiting.popleft())
+            while waiting and self.workers.idle:
+                self.workers.submit(waiting.popleft())
                 busy += 1
             self._report(self.trained, self.trained + left)
-            for task, result in workers.collect(_WAIT_SECONDS):
+            for task, result in self.workers.collect(_WAIT_SECONDS):
                 busy -= 1
                 if result is None and task not in died:
                     died.append(task)
@@ -233,7 +237,6 @@ class Mixtures:
                     raise RunnerError(f"{self.mixing.in_words(task.mixture)}: {reason}")
                 left -= len(result.readings)
                 self.trained += len(result.readings)
-                self._seconds[task.mixture] = result.seconds
                 self._keep(task, result)
         self._report(self.trained, self.trained)
 
@@ -241,34 +244,25 @@ class Mixtures:
         """Yield tasks for what is not known."""
         batch = max(1, round(TASK_SECONDS / self.seconds)) if self.seconds else len(seeds)
         for mixture in mixtures:
-            config = self.mixing.config(mixture)
-            missing = []
-            for seed in seeds:
-                earlier = self._kept.get(self._identity(config, seed))
-                if earlier is not None:
-                    self._found[mixture, seed] = earlier.readings
-                    self._seconds.setdefault(mixture, earlier.seconds)
-                elif (mixture, seed) not in self._found:
-                    missing.append(seed)
+            missing = [
+                seed
+                for seed, job in zip(seeds, self._jobs_of(mixture), strict=False)
+                if job not in self._kept
+            ]
+            config = self.mixing.config(mixture).to_mapping() if missing else {}
             for start in range(0, len(missing), batch):
                 some = tuple(missing[start : start + batch])
-                yield Measurement(mixture, config.to_mapping(), some, str(self._recordings))
+                yield Measurement(mixture, config, some, str(self._recordings))
 
     def _keep(self, task: Measurement, measured: MixtureResult) -> None:
         """Append readings to the file: a line each, with the identity of the job."""
-        config = from_mapping(task.config)
+        jobs = dict(zip(self.seeds, self._jobs_of(task.mixture), strict=True))
         lines = []
         for seed, read in measured.readings.items():
-            self._found[task.mixture, seed] = read
-            known = _Known(self._identity(config, seed), dict(read), measured.seconds, seed)
+            known = self._kept[jobs[seed]] = _Known(jobs[seed], dict(read), measured.seconds, seed)
             lines.append(_LINES.dump_json(known).decode() + "\n")
         with storage_errors(self._path), self._path.open("a", encoding="utf-8") as file:
             file.writelines(lines)
-
-    def _identity(self, config: ExperimentConfig, seed: int) -> str:
-        """Return what determines the readings of a run: its job, and the code of its environment."""
-        environment = _environment_digest(load_once(config.env.id, config.env.kwargs, config.rewards))
-        return f"{identity_of(config.to_mapping(), seed)}-{environment}-{__version__}"
 
 
 @dataclass(frozen=True)

@@ -111,9 +111,8 @@ def explain_command(
             )
     except _Planned as stopped:
         plan = stopped.plan
-        times = {"seconds": plan.seconds, "most_seconds": plan.most_seconds}
         facts = {"settings": str(plan.settings), "runs": _in_words(plan)}
-        return Reply(dataclasses.asdict(plan) | times, [Section("What would be trained", facts=facts)])
+        return Reply(dataclasses.asdict(plan), [Section("What would be trained", facts=facts)])
     except KeyboardInterrupt:
         say("Interrupted. What was trained is kept: the same command continues.")
         raise
