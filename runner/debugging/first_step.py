@@ -28,8 +28,6 @@ from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED, Run, new_run
 from runner.util.processes import Stop
 
-Place = tuple[int, int, int]
-"""A training step: its number, its episode and its t."""
 _EPISODES: Final = (100, 1000, 10_000)
 """Training episodes in which the step is looked for, one after the other."""
 
@@ -62,14 +60,14 @@ def first_step(
         pairs.append((mixing.everything - bit, mixing.everything, others))
     limit = min(mixing.a.episodes, mixing.b.episodes)
     for before, after, what in pairs:
-        for episodes in (*(count for count in _EPISODES if count < limit), min(limit, _EPISODES[-1])):
+        for episodes in sorted({min(limit, count) for count in _EPISODES}):
             runs = []
             for part, (mixture, word) in enumerate(((before, "without"), (after, "with"))):
                 plain = {"episodes": episodes, "evaluation": None, "recording": {"console": False}}
                 job = Job(from_mapping(mixing.config(mixture).to_mapping() | plain), seed)
                 run = made.get(job.identity)
                 if run is not None and run.status != "finished":
-                    _discard(run, folder)
+                    _discard(run)
                     run = None
                 if run is None:
                     title = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{word}-{setting}")[:100]
@@ -78,34 +76,32 @@ def first_step(
                     done, total = part * episodes, 2 * episodes
                     run = run_job(job, run, lambda now: report(done + now.episode, total), stop)  # noqa: B023
                     if run.status != "finished":
-                        _discard(run, folder)
+                        _discard(run)
                         raise KeyboardInterrupt("what was trained is kept")
                 runs.append(run)
-            without, changed = runs
-            place, sentences = _difference(without, changed, what)
-            if sentences:
-                step, episode, t = place or (None, None, None)
-                return FirstStep(setting, without.run_id, changed.run_id, step, episode, t, sentences)
+            difference = _difference(runs[0], runs[1], setting, what)
+            if difference is not None:
+                return difference
             for run in runs:
-                made.pop(identity_of(run.file.config, run.seed), None)
-                _discard(run, folder)
+                _discard(run)
     sentence = (
         f"Neither alone nor last did {setting} change a step in {min(limit, _EPISODES[-1]):,} episodes."
     )
     return FirstStep(setting, "", "", None, None, None, (sentence,))
 
 
-def _discard(run: Run, folder: Path) -> None:
+def _discard(run: Run) -> None:
     """Remove a run that shows nothing; one that a user keeps, or another process uses, stays."""
     with contextlib.suppress(RunnerError):
-        remove(plan(run, folder))
+        remove(plan(run, run.folder.parent))
 
 
-def _difference(before: Run, after: Run, what: str) -> tuple[Place | None, tuple[str, ...]]:
-    """Return where two runs differ first, and what is known of it; no sentences if they do not differ."""
+def _difference(before: Run, after: Run, setting: str, what: str) -> FirstStep | None:
+    """Return where two runs differ first, and what is known of it; None if they do not differ."""
     with opened(before) as a, opened(after) as b:
         if not can_compare_steps(a, b):
-            return None, (f"{what} changes the states or actions, so that no steps can be compared.",)
+            sentence = f"{what} changes the states or actions, so that no steps can be compared."
+            return FirstStep(setting, a.run_id, b.run_id, None, None, None, (sentence,))
         divergence, sentences = training_divergence(a, b), []
         if divergence is not None and divergence.a_step is not None and divergence.b_step is not None:
             cause = find_cause(divergence, a, b)
@@ -125,10 +121,10 @@ def _difference(before: Run, after: Run, what: str) -> tuple[Place | None, tuple
                 f"{update.b:.6g} instead of {update.a:.6g}: {'; '.join(update.reasons)}.",
             )
         if not sentences:
-            return None, ()
+            return None
     step, episode, t = place
     first = (
         f"{what} first changed an update at training step {step:,}, in episode {episode:,} at t = {t} "
         f"(runs {before.run_id} without it and {after.run_id} with it, which are recorded)."
     )
-    return place, (first, *sentences)
+    return FirstStep(setting, before.run_id, after.run_id, step, episode, t, (first, *sentences))
