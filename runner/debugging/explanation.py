@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Final, Literal
 
@@ -121,6 +120,11 @@ class Explanation:
         """Runs that the result was computed from."""
         return len(self.mixtures) * len(self.seeds)
 
+    @property
+    def clear_interactions(self) -> list[Interaction]:
+        """Interactions whose interval excludes 0."""
+        return [pair for pair in self.interactions if pair.beyond.excludes_zero]
+
     def part(self, value: float) -> float:
         """Return a value as a part of the difference."""
         return value / self.difference.value if self.difference.value else float("nan")
@@ -156,14 +160,14 @@ def summary(explanation: Explanation) -> list[str]:
     if not explanation.difference.excludes_zero:
         sentences.append("The interval includes 0: there is no clear difference to explain with these seeds.")
     elif explanation.smallest is not None:
-        own = explanation.smallest
-        *others, last = own.settings
+        smallest = explanation.smallest.settings
+        *others, last = smallest
         names = f"{', '.join(others)} and {last}" if others else last
-        part = explanation.part_of(own)
+        part = explanation.part_of(explanation.smallest)
         has_interval = not math.isnan(part.low) and part.low != part.high
         interval = f" ({_percent(part.low)} to {_percent(part.high)})" if has_interval else ""
         of = f" of the {len(settings)} settings" if len(settings) > 1 else ""
-        make = "alone makes" if len(own.settings) == 1 else "together make"
+        make = "together make" if others else "alone makes"
         least = f"the smallest set{of} that makes {_percent(ENOUGH)}"
         if explanation.method == "delta debugging":
             least = (
@@ -191,9 +195,8 @@ def sections(explanation: Explanation) -> list[Section]:
     title = f"{explanation.a.name} (A) and {explanation.b.name} (B)"
     notes = [f"Note: {note}." for note in explanation.notes]
     lines = [Section(title, [*summary(explanation), *notes]), _settings_section(explanation)]
-    clear = [pair for pair in explanation.interactions if pair.beyond.excludes_zero]
     if explanation.interactions:
-        lines.append(_interactions_section(explanation, clear))
+        lines.append(_interactions_section(explanation))
     if explanation.first_step is not None:
         lines.append(Section("First step", list(explanation.first_step.sentences)))
     lines.append(_mixtures_section(explanation))
@@ -230,7 +233,8 @@ def _settings_section(explanation: Explanation) -> Section:
     return Section("Shares", [text], [Grid(headings, rows)])
 
 
-def _interactions_section(explanation: Explanation, clear: Sequence[Interaction]) -> Section:
+def _interactions_section(explanation: Explanation) -> Section:
+    clear = explanation.clear_interactions
     text = (
         "What two settings do together beyond what each does, averaged over the other settings (Shapley "
         "interaction index). Away from 0 the effect of one depends on the other."
@@ -309,11 +313,7 @@ def plots(explanation: Explanation) -> list[Plot]:
     if shares:
         title = f"Share of each setting in the difference of {explanation.metric}"
         result.append(Plot("Shares", bars_chart(title, shares).svg(), True))
-    pairs = [
-        (" x ".join(pair.settings), pair.beyond)
-        for pair in explanation.interactions
-        if pair.beyond.excludes_zero
-    ]
+    pairs = [(" x ".join(pair.settings), pair.beyond) for pair in explanation.clear_interactions]
     if pairs:
         title = f"{explanation.metric}: what two settings do together beyond what each does"
         result.append(Plot("Which need each other", bars_chart(title, pairs).svg(), True))

@@ -101,7 +101,7 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
     Raises:
         RunnerError: there is none of this name, or its file is damaged.
     """
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import TypeAdapter
 
     explanations = explanations_in(recordings)
     if name not in explanations:
@@ -113,9 +113,15 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
         if len(content) > MAX_BYTES:
             raise RunnerError(f"{path}: larger than {size(MAX_BYTES)}, expected an explanation.")
         explanation = TypeAdapter(Explanation).validate_json(content)
-    except (OSError, ValidationError) as error:
+        _check(explanation)
+    except (OSError, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise RunnerError(f"{path}: no longer describes an explanation ({reason}).") from error
+    return explanation
+
+
+def _check(explanation: Explanation) -> None:
+    """Check what the types do not say, or raise a `ValueError`."""
     numbers = [explanation.difference.value, *(value for one in explanation.mixtures for value in one.values)]
     numbers += [each.share.value for each in explanation.settings if each.share is not None]
     numbers.append(explanation.seconds)
@@ -123,13 +129,9 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
     known_settings = {each.name for each in explanation.settings}
     named = [each.settings for each in explanation.mixtures]
     named += [each.settings for each in explanation.interactions]
-    reason = ""
     if len(explanation.mixtures) < 2 or counts != {len(explanation.seeds)} or not explanation.seeds:
-        reason = "a mixture lacks values"
-    elif not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
-        reason = "a value is not finite"
-    elif not all(known_settings.issuperset(names) for names in named):
-        reason = "a setting is missing"
-    if reason:
-        raise RunnerError(f"{path}: no longer describes an explanation ({reason}).")
-    return explanation
+        raise ValueError("a mixture lacks values")
+    if not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
+        raise ValueError("a value is not finite")
+    if not all(known_settings.issuperset(names) for names in named):
+        raise ValueError("a setting is missing")

@@ -25,7 +25,6 @@ _MEASURING: Final = ("evaluation", "log", "snapshots", "recording")
 """Sections that change what is measured and recorded, and not what is learned."""
 _MIXED_INSIDE: Final = ("env", "env.kwargs", "quirks", *SECTION_OF)
 """Sections whose settings can differ one by one; the others are one setting each."""
-_ABSENT: Final = object()
 
 
 @dataclass(frozen=True)
@@ -157,11 +156,10 @@ def _mixed(a: Json, b: JsonView, paths: Sequence[str]) -> Json:
         here, there = mixed, b
         for section in sections:
             here, there = here[section], there[section]
-        value = there.get(key, _ABSENT)
-        if value is _ABSENT:
-            here.pop(key, None)
+        if key in there:
+            here[key] = there[key]
         else:
-            here[key] = value
+            here.pop(key, None)
     return mixed
 
 
