@@ -76,7 +76,11 @@ def metric_section(metric: MetricResult, profile: bool = True) -> Section:
     """Return the text of one metric, with a few points of its performance profile if that is wanted."""
     better = {True: "higher is better", False: "lower is better", None: "neither is better as such"}
     line = f", {metric.line.replace('_', ' ')}" if metric.line else ""
-    grids = [Grid(("", "n", "median", "IQM", "95 %"), [_group(group) for group in metric.groups])]
+    groups = [
+        (group.label, str(group.n), number(group.median), number(group.iqm.value), interval(group.iqm))
+        for group in metric.groups
+    ]
+    grids = [Grid(("", "n", "median", "IQM", "95 %"), groups)]
     if metric.pairs:
         word = "higher" if metric.higher_is_better is None else "better"
         count = f"{word} / equal / {'lower' if word == 'higher' else 'worse'}"
@@ -114,10 +118,6 @@ def unpaired(pairs: Sequence[PairResult]) -> list[str]:
             if numbers := [str(seed) for seed in seeds if not isinstance(seed, str)]:
                 sentences.append(f"{against} seed {listed(numbers)}, which {label} has and {other} has not")
     return sentences
-
-
-def _group(group: GroupResult) -> tuple[str, ...]:
-    return (group.label, str(group.n), number(group.median), number(group.iqm.value), interval(group.iqm))
 
 
 def _pair(pair: PairResult, together: bool) -> tuple[str, ...]:

@@ -44,8 +44,14 @@ def task_sections(comparison: TaskComparison) -> list[Section]:
     ]
     labels = [f"{result.label}, mean (seeds)" for result in comparison.algorithms]
     headings = ("environment", "score 0 at", "score 1 at", *labels)
+    pairs = (
+        f"{pair.a} scores higher than {pair.b} with a probability of {number(pair.probability.value)}, 95 % "
+        f"{interval(pair.probability)}, over {counted(len(comparison.tasks), 'environment')}."
+        for pair in comparison.improvements
+    )
+    notes = (f"Note: {note}." for note in comparison.notes)
     return [
-        Section("Algorithms", summary(comparison), [Grid(headings, rows)]),
+        Section("Algorithms", [*pairs, *notes], [Grid(headings, rows)]),
         Section(
             f"Normalised scores: {comparison.title}",
             [f"{comparison.metric}, {comparison.moment}; normalised by {comparison.normalised_by}."],
@@ -53,16 +59,6 @@ def task_sections(comparison: TaskComparison) -> list[Section]:
         ),
         Section("How to read this", [EXPLANATION]),
     ]
-
-
-def summary(comparison: TaskComparison) -> list[str]:
-    """Return a sentence for each pair of algorithms, and the notes."""
-    pairs = [
-        f"{pair.a} scores higher than {pair.b} with a probability of {number(pair.probability.value)}, 95 % "
-        f"{interval(pair.probability)}, over {counted(len(comparison.tasks), 'environment')}."
-        for pair in comparison.improvements
-    ]
-    return [*pairs, *(f"Note: {note}." for note in comparison.notes)]
 
 
 def grids(comparison: TaskComparison) -> list[Grid]:
