@@ -44,14 +44,10 @@ class Weights:
 
     value: float
     """The Q-value in the replayed table."""
-    initial: Floats
-    """[tables, S * width]: of the initial values."""
     initial_values: Floats
     """[tables, S * width]."""
-    outcomes: Floats
-    """[outcomes]: of the rewards of all steps with this outcome, an index of `Model.next_state`."""
-    episodes: Floats
-    """[stretches, 2]: of the rewards in each stretch of episodes, and what these add to the Q-value."""
+    ledger: Ledger
+    """The weights of the initial values, and of the rewards by outcome and by stretch of episodes."""
     stretch: int
     """Episodes of a stretch."""
     last_episode: int
@@ -122,10 +118,8 @@ def weights_of(recording: Recording, cell: Cell, stop: int, limit: int, report: 
                 end = first
     return Weights(
         value=float(replay.tables[cell.learner][cell.state, cell.action]),
-        initial=ledger.weights,
         initial_values=initial_values,
-        outcomes=ledger.outcomes,
-        episodes=ledger.episodes,
+        ledger=ledger,
         stretch=stretch,
         last_episode=episode,
         counted=counted,

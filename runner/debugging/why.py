@@ -18,7 +18,7 @@ import numpy as np
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import opened
 from runner.debugging.q_value import EpisodesPart, RewardPart, StepPart, ValuePart, Why
-from runner.debugging.weights import Cell, Weights, weights_of
+from runner.debugging.weights import Cell, weights_of
 from runner.drawing import svg
 from runner.drawing.svg_moves import Move, moves_map
 from runner.environments.mdp import Mdp, events_of
@@ -102,11 +102,12 @@ def why(
         names = actions_in_words(mdp) if is_joint else numbered_actions(mdp)[cell.learner]
         stop = last_step(recording) if step is None else _steps_before(recording, step)
         weights = weights_of(recording, cell, stop, limit or MAX_LIMIT, report)
-        rewarded = ValuePart(*(float(total) for total in weights.episodes.sum(axis=0)))
+        ledger = weights.ledger
+        rewarded = ValuePart(*(float(total) for total in ledger.episodes.sum(axis=0)))
         initial = ValuePart(
-            float(weights.initial.sum()), float((weights.initial * weights.initial_values).sum())
+            float(ledger.weights.sum()), float((ledger.weights * weights.initial_values).sum())
         )
-        moves = tuple(_moves(mdp, weights.outcomes, "" if is_joint else mdp.agents[cell.learner]))
+        moves = tuple(_moves(mdp, ledger.outcomes, "" if is_joint else mdp.agents[cell.learner]))
         return Why(
             run_id=recording.run_id,
             agent=recording.agents[cell.learner],
@@ -120,7 +121,7 @@ def why(
             counted=weights.counted,
             rewarded=rewarded,
             initial=initial,
-            rewards=tuple(_by_reward(mdp, weights, cell.learner, len(recording.agents))),
+            rewards=tuple(_by_reward(mdp, ledger.outcomes, cell.learner, len(recording.agents))),
             episodes=tuple(
                 EpisodesPart(
                     weight,
@@ -128,7 +129,7 @@ def why(
                     k * weights.stretch,
                     min((k + 1) * weights.stretch, weights.last_episode + 1),
                 )
-                for k, (weight, contribution) in enumerate(weights.episodes.tolist())
+                for k, (weight, contribution) in enumerate(ledger.episodes.tolist())
             ),
             steps=tuple(_steps(recording, weights.largest, cell.learner)),
             moves=moves,
@@ -213,14 +214,14 @@ def _steps_before(recording: Recording, at: EpisodeRef) -> int:
     return steps.first + at.t
 
 
-def _by_reward(mdp: Mdp, weights: Weights, learner: int, learners: int) -> Iterator[RewardPart]:
+def _by_reward(mdp: Mdp, outcomes: Floats, learner: int, learners: int) -> Iterator[RewardPart]:
     """Yield the parts of a Q-value by kind of reward."""
-    at = np.unravel_index(np.flatnonzero(weights.outcomes), mdp.next_state.shape)
+    at = np.unravel_index(np.flatnonzero(outcomes), mdp.next_state.shape)
     kinds = np.stack([mdp.rewards_of(learners)[(*at, learner)], mdp.events[at]], axis=1)
     parts = sorted(
         (
             RewardPart(weight, weight * reward, reward, events_in_words(mdp, int(events)))
-            for (reward, events), weight in _summed(kinds, weights.outcomes[weights.outcomes != 0])
+            for (reward, events), weight in _summed(kinds, outcomes[outcomes != 0])
         ),
         key=lambda part: (-abs(part.contribution), -part.weight),
     )
