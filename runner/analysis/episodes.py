@@ -26,6 +26,7 @@ from runner.util.humanize import capitalised
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording
+    from runner.recording.steps import EpisodeSteps
 
 EXPECTED_OF_TRAINING: Final = "EPISODE:T such as 120:5, or step:N, a training step by its number"
 EXPECTED: Final = (
@@ -161,6 +162,17 @@ class EpisodeRef:
         if self.after in (None, UNKNOWN_EVALUATION):
             return self.episode
         return self.evaluation_in(recording).trial(self.episode, str(recording.path))
+
+    def steps_in(self, recording: Recording, with_end: bool = False) -> EpisodeSteps:
+        """Return the steps of the episode, which must have step `t`; `with_end` allows the end, after them.
+
+        Raises:
+            NotInRecording: the episode has fewer steps.
+        """
+        steps = recording.phase(self.phase).episode(self.number_in(recording))
+        if self.t >= len(steps) + with_end:
+            raise self.no_step(recording, len(steps), self.t)
+        return steps
 
     def no_step(self, recording: Recording, steps: int, t: int, part: str = "") -> NotInRecording:
         """Return the error that the episode, or a `part` of it, has `steps` steps and thus no step `t`."""

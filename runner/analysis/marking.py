@@ -79,8 +79,5 @@ def unmark(run: Run, *ids: str) -> None:
 def _existing(recording: Recording, at: EpisodeRef) -> tuple[EpisodeRef, int]:
     """Return a reference to a step with its episode in place of a word, and the number of the episode."""
     step = at.resolved(recording)
-    number = step.number_in(recording)
-    steps = len(recording.phase(step.phase).episode(number))
-    if step.t > steps:
-        raise step.no_step(recording, steps, step.t)
-    return step, number
+    step.steps_in(recording, with_end=True)
+    return step, step.number_in(recording)

@@ -39,9 +39,7 @@ class ShownEpisode:
     def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
         require_steps(recording, "show", may_redo=True)
         self._recording, self._phase, self._number = recording, at.phase, at.number_in(recording)
-        self._length = len(recording.phase(self._phase).episode(self._number))
-        if at.t > self._length:
-            raise at.no_step(recording, self._length, at.t)
+        self._length = len(at.steps_in(recording, with_end=True))
         self._first, self._title = at.t, title
 
     def steps(self) -> Iterator[dict[str, object]]:

@@ -135,9 +135,7 @@ class _Branches:
     def _read_episode(self) -> None:
         """Read the step, what came before it, and where the episode led."""
         recording, phase, episode, t = self._recording, self._at.phase, self._number, self._at.t
-        length = len(recording.phase(phase).episode(episode))
-        if t >= length:
-            raise self._at.no_step(recording, length, t)
+        length = len(self._at.steps_in(recording))
         self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
         returns = self._returns
         for block in episode_blocks(recording, phase, episode):

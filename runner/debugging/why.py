@@ -194,11 +194,7 @@ def _step_at(recording: Recording, at: EpisodeRef | None) -> Records:
         raise ConfigError(
             "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
         )
-    phase = recording.phase(at.phase)
-    steps = phase.episode(at.number_in(recording))
-    if at.t >= len(steps):
-        raise at.no_step(recording, len(steps), at.t)
-    (block,) = steps.rows(at.t, at.t + 1)
+    (block,) = at.steps_in(recording).rows(at.t, at.t + 1)
     recording.mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
     step: Records = block[0]
     return step
@@ -208,10 +204,7 @@ def _steps_before(recording: Recording, at: EpisodeRef) -> int:
     """Return the training steps that the tables at a step have learned from."""
     if at.after is not None:
         return at.evaluation_in(recording).train_step
-    steps = recording.train.episode(at.episode)
-    if at.t > len(steps):
-        raise at.no_step(recording, len(steps), at.t)
-    return steps.first + at.t
+    return at.steps_in(recording, with_end=True).first + at.t
 
 
 def _by_reward(mdp: Mdp, outcomes: Floats, learner: int, learners: int) -> Iterator[RewardPart]:

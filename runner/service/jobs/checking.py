@@ -180,9 +180,7 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
             name, config = branch_name(run, question.name), job.config
             return CheckedJob("branch", name, 1, size, config.to_mapping(), config.seeds)
         step = at.resolved(recording)
-        length = len(recording.phase(step.phase).episode(step.number_in(recording)))
-        if step.t >= length:
-            raise step.no_step(recording, length, step.t)
+        step.steps_in(recording)
         if reason := why_not_rerun(recording):
             raise CannotRedo(reason)
         name = checked_run_name(question.name) or default_name(recording)
