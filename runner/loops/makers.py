@@ -5,7 +5,6 @@ Nothing here takes the `__dict__` of an environment, for the reason in `runner.l
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import json
 import platform
@@ -15,6 +14,7 @@ from dataclasses import replace
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Final
 
 import gymnasium
@@ -210,10 +210,9 @@ def vector_maker_of(
 def _custom_vector(base: object) -> EnvironmentMaker:
     """Return how a vector environment of its own class was made."""
     spec, top = getattr(base, "spec", None), top_package(type(base).__module__)
-    if not isinstance(spec, EnvSpec):
-        reason = f"{class_name(base)} does not state how it was made"
-        return _with_versions(EnvironmentMaker("vector"), [top], reason)
     try:
+        if not isinstance(spec, EnvSpec):
+            raise CannotBeMade(f"{class_name(base)} does not state how it was made")
         entry_point = entry_point_of(spec.vector_entry_point)
         fields: Json = {
             "id": spec.id,
@@ -311,9 +310,7 @@ def checked_make(make: object) -> str:
         )
     module, _, path = text.partition(":")
     try:
-        target = sys.modules["__main__"] if module == _main_name() else importlib.import_module(module)
-        for name in path.split("."):
-            target = getattr(target, name)
+        target = resolve_name(f"{MAIN}:{path}" if module == _main_name() else text)
     except Exception as error:  # importing a module runs any code
         raise ConfigError(f"make: {text!r} cannot be imported ({error}).") from error
     if not callable(target) or not (isinstance(make, str) or target is make):
@@ -328,17 +325,10 @@ def _main_name() -> str | None:
     main = sys.modules["__main__"]
     if (spec := getattr(main, "__spec__", None)) is not None:
         return str(spec.name)
-    path = getattr(main, "__file__", None)
-    if path is None:
-        return None
-    name = Path(path).stem
-    module_spec = importlib.util.find_spec(name) if name.isidentifier() else None
-    is_same = (
-        module_spec is not None
-        and module_spec.origin
-        and Path(module_spec.origin).resolve() == Path(path).resolve()
-    )
-    return name if is_same else None
+    path = Path(getattr(main, "__file__", None) or "")
+    spec = importlib.util.find_spec(path.stem) if path.stem.isidentifier() else None
+    is_same = spec is not None and spec.origin and Path(spec.origin).resolve() == path.resolve()
+    return path.stem if is_same else None
 
 
 def _with_versions(maker: EnvironmentMaker, tops: Sequence[str], reason: object = "") -> EnvironmentMaker:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import sys
 from collections.abc import Sequence
+from pkgutil import resolve_name
 from typing import Any, Final
 
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
@@ -82,8 +82,7 @@ def only_observes(wrapper: object) -> bool:
 def declared_wrapper_fields(spec: WrapperSpec, assumed: list[str]) -> Json:
     """Return the fields of a wrapper's specification, which has no arguments if it does not record them."""
     if spec.kwargs is None:
-        module, _, name = spec.entry_point.partition(":")
-        parameters = inspect.signature(getattr(importlib.import_module(module), name)).parameters.values()
+        parameters = inspect.signature(resolve_name(spec.entry_point)).parameters.values()
         others = [parameter for parameter in parameters if parameter.name != "env"]
         if any(other.default is other.empty for other in others if other.kind not in VARIABLE):
             raise CannotBeMade(f"the wrapper {spec.entry_point} does not record its arguments")
