@@ -27,7 +27,7 @@ from runner.errors import RecordingError, RunnerError, StorageError, truncated_m
 from runner.loops.copied_extras import CopiedExtras
 from runner.loops.description import Copied
 from runner.loops.outcomes import Outcomes
-from runner.loops.shard_sources import PHASES, Source, open_sources
+from runner.loops.shard_sources import PHASES, UNIT, Source, open_sources
 from runner.loops.step_buffer import StepBuffer
 from runner.recording import schema
 from runner.recording.layout import Layout
@@ -57,7 +57,7 @@ from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, shards_locked, shards_of
 from runner.runs.trust_marks import merge_marks
-from runner.util.arrays import Array, Floats, Records
+from runner.util.arrays import Array, Floats, Ints, Records
 from runner.util.files import storage_errors
 from runner.util.values import Json
 
@@ -172,10 +172,12 @@ class _Fold:
         self._first = first
         self._mdp = first.mdp if first.tabular else None
         self._outcomes = Outcomes(self._mdp)
-        self._units, self._evaluated = self._ordered()
+        self._units = self._ordered()
         leads = sources[0].is_placed or any(sources[0].taken.values())
         self._main = sources[0] if leads else max(sources, key=lambda source: sum(source.taken.values()))
         """The process with the clock that the run takes over."""
+        self._begun: dict[str, Records] = {}
+        """The units of each phase in their order, once they are placed, after one of zeros."""
         self._totals = {phase: sum(source.taken[phase] for source in sources) for phase in PHASES}
 
     def write(self, fresh: Path) -> Json:
@@ -262,22 +264,27 @@ class _Fold:
 
     # --- the order ------------------------------------------------------------------------------------
 
-    def _ordered(self) -> tuple[Records, tuple[Array, Array]]:
-        """Return the units of all processes in the order of the run; keys and steps of its evaluations."""
+    def _ordered(self) -> Records:
+        """Return the units of all processes in the order of the run."""
         for source in self._sources:
             for phase, units in source.units.items():
-                before = units["first"] - units["environment"]
-                others = units["position"] - before
-                if source.stops["train"]:
-                    units["key"] = self._alongside((before if phase == "train" else others) / source.n)
-                else:
-                    units["key"] = others if source.is_placed else self._alongside(before / source.n)
+                before, position = units["first"] - units["environment"], units["position"]
+                trained = before if phase == "train" else position - before
+                units["key"] = self._keys(source, position, trained, before)
         units = np.concatenate([units for source in self._sources for units in source.units.values()])
         names = ("reset", "phase", "steps", "position", "source", "key")
         columns = [units[name] if name != "steps" else units["steps"] > 0 for name in names]
-        units = units[np.lexsort(columns)]
-        evaluated = units[units["phase"] == PHASES.index("eval")]
-        return units, (evaluated["key"].copy(), np.concatenate([[0], np.cumsum(evaluated["steps"])]))
+        return units[np.lexsort(columns)]
+
+    def _keys(self, source: Source, position: Ints, trained: Ints, evaluated: Ints) -> Array:
+        """Return the training steps of the run before positions of a process.
+
+        Args:
+            position: as the process counted them, with the steps of either phase before them.
+        """
+        if source.is_placed and not source.stops["train"]:
+            return position - evaluated
+        return self._alongside((trained if source.stops["train"] else evaluated) / source.n)
 
     def _alongside(self, times: Array) -> Floats:
         """Return the training steps of the run when every process had stepped its environments so often."""
@@ -286,22 +293,6 @@ class _Fold:
             if stop := source.stops["train"]:
                 total += np.minimum(times * source.n, stop) * (source.taken["train"] / stop)
         return total
-
-    def _key_and_position(self, source: Source, position: int) -> tuple[float, int]:
-        """Return the key and the position in the run of a position that a process counted."""
-        trained, evaluated = (source.phase_steps(phase, position) for phase in PHASES)
-        if source.stops["train"]:
-            key = float(self._alongside(np.array([trained / source.n]))[0])
-        elif source.is_placed:
-            key = float(position - evaluated)
-        else:
-            key = float(self._alongside(np.array([evaluated / source.n]))[0])
-        return key, min(int(key), self._totals["train"]) + self._evaluated_by(key)
-
-    def _evaluated_by(self, key: float) -> int:
-        """Return the evaluation steps of the run in units up to a key."""
-        keys, steps = self._evaluated
-        return int(steps[np.searchsorted(keys, key, side="right")])
 
     # --- steps ----------------------------------------------------------------------------------------
 
@@ -338,16 +329,12 @@ class _Fold:
                 copied_steps += len(numbers)
                 self._report(copied_steps, total)
         active.commit()
-        for source in self._sources:
-            for phase in PHASES:  # the units of each as placed, ordered by environment
-                placed = self._units[
-                    (self._units["source"] == source.number) & (self._units["phase"] == PHASES.index(phase))
-                ]
-                source.units[phase] = placed[np.lexsort((placed["reset"], placed["environment"]))]
-        self._begun = {}
         for number, phase in enumerate(PHASES):
             units = self._units[self._units["phase"] == number]
-            self._begun[phase] = units["key"].copy(), units["new_episode"].copy()
+            self._begun[phase] = np.concatenate([np.zeros(1, UNIT), units])
+            for source in self._sources:
+                placed = units[units["source"] == source.number]
+                source.units[phase] = placed[np.lexsort((placed["reset"], placed["environment"]))]
         return sum(buffer.off_table for buffer in buffers.values())
 
     # --- messages -------------------------------------------------------------------------------------
@@ -420,17 +407,21 @@ class _Fold:
         self, source: Source, topic: Topic, position: int, fields: Message
     ) -> Iterator[tuple[int, bytes]]:
         """Yield a message that belongs to a moment: a logged number, a text, an array, a checkpoint."""
-        key, position = self._key_and_position(source, position)
+        before = [[position], *([source.phase_steps(phase, position)] for phase in PHASES)]
+        key = float(self._keys(source, *np.array(before))[0])
+        last = {
+            phase: units[np.searchsorted(units["key"][1:], key, side="right")]
+            for phase, units in self._begun.items()
+        }
+        evaluated = int(last["eval"]["new_step"] + last["eval"]["steps"])
+        trained = min(int(key), self._totals["train"])
+        position = trained + evaluated
         if topic.message == schema.LOG:
             seconds, level = position * STEP_NANOSECONDS / 1e9, log_level(fields["level"])
             yield position, encode_log(fields["message"], seconds, level, fields["name"])
         elif {"phase", "step", "episode"} <= fields.keys():
-            keys, episodes = self._begun[fields["phase"]]
-            at = int(np.searchsorted(keys, key, side="right")) - 1
-            fields["step"] = position - self._evaluated_by(key)
-            if fields["phase"] == "eval":
-                fields["step"] = self._evaluated_by(key)
-            fields["episode"] = max(int(episodes[at]), 0) if at >= 0 else 0
+            fields["step"] = evaluated if fields["phase"] == "eval" else trained
+            fields["episode"] = int(last[fields["phase"]]["new_episode"])
             yield position, encode(topic.message, fields)
         elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
             # Of a machine or a process, such as what it printed.

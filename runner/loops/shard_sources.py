@@ -30,23 +30,9 @@ from runner.util.arrays import Ints, Records
 from runner.util.files import open_regular
 
 PHASES: Final = tuple(schema.PHASES)
-UNIT: Final = np.dtype(
-    [
-        ("key", "f8"),
-        ("source", "i8"),
-        ("position", "i8"),
-        ("phase", "i8"),
-        ("environment", "i8"),
-        ("reset", "i8"),
-        ("first", "i8"),
-        ("stop", "i8"),
-        ("steps", "i8"),
-        ("new_step", "i8"),
-        ("new_position", "i8"),
-        ("new_episode", "i8"),
-        ("new_reset", "i8"),
-    ]
-)
+_NUMBERS: Final = ("source", "position", "phase", "environment", "reset", "first", "stop", "steps")
+_NEW_NUMBERS: Final = ("new_step", "new_position", "new_episode", "new_reset")
+UNIT: Final = np.dtype([("key", "f8"), *((name, "i8") for name in (*_NUMBERS, *_NEW_NUMBERS))])
 """A unit: `key` is how many training steps of the whole run it comes after; `position`, `reset`, `first` and
 `stop` (steps of the phase) are as its process counted them, `steps` is how many it took; the `new_`
 fields are its numbers in the run."""
@@ -88,25 +74,23 @@ class Source:
     def _stop(self, phase: str) -> int:
         """Return the steps of a phase, up to the first that is lost or may lack its reset."""
         tables = self.recording.phase(phase)
-        (step, _), (reset, last_reset) = map(self._first_gap, (tables.steps, tables.resets))
-        stop = min(tables.whole_steps(), step)
-        return (stop if reset == FOREVER else min(stop, last_reset)) // self.n * self.n
+        (step, _), (_, last_reset) = map(self._first_gap, (tables.steps, tables.resets))
+        return min(tables.whole_steps(), step, last_reset) // self.n * self.n
 
     def _first_gap(self, table: TopicChunks) -> tuple[int, int]:
-        """Return the number of the first message that a repair lost, `FOREVER` without one.
+        """Return the number of the first message that a repair lost, and the `step` of the last one before.
 
-        And the `step` of the last message before it.
+        Both are `FOREVER` if none was lost.
         """
-        number, last = 0, 0
         if not self.recording.lost.get(table.topic.name):
-            return FOREVER, 0
+            return FOREVER, FOREVER
+        number = last = 0
         for rows in table.rows():
             numbers = rows[schema.NUMBERED_BY[table.topic.message]]
-            after = np.flatnonzero(numbers != number + np.arange(len(rows)))
-            before = rows[: after[0]] if after.size else rows
-            number, last = number + len(before), int(before["step"][-1]) if len(before) else last
-            if after.size:
-                return number, last
+            count = int(np.append(numbers == number + np.arange(len(rows)), False).argmin())
+            number, last = number + count, int(rows["step"][count - 1]) if count else last
+            if count < len(rows):
+                break
         return number, last
 
     def _only_resets(self, phase: str) -> Ints:
