@@ -95,7 +95,7 @@ class PendingExtras:
         self._fixed_bytes = 0
         """Bytes of a step's values of one size."""
         self._held, self._held_row = 0, -1
-        """Bytes of all values of varying size, and the last row that has some."""
+        """Bytes of varying size put down since rows were last handed on, and the last row that has some."""
         self._row_bytes: dict[str, int] = {}
         """The most bytes of an environment in that row, by name."""
         self._final = dict.fromkeys(schema.PHASES, -1)
@@ -255,7 +255,7 @@ class PendingExtras:
         self, values: Mapping[str, object], lead: tuple[int, ...]
     ) -> tuple[dict[str, Description], int]:
         """Return the descriptions of the values that can be recorded, and the bytes of all of one size."""
-        described, size, names = dict[str, Description](), self._fixed_bytes, set(self._described)
+        described, size = dict[str, Description](), self._fixed_bytes
         for name, value in values.items():
             known = self._described.get(name)
             try:
@@ -263,13 +263,12 @@ class PendingExtras:
                 larger = size + _fixed_size(needed) - _fixed_size(known)
                 if larger > MAX_EXTRA_BYTES:
                     raise _too_large(name, larger)
-                if len(names | {name}) > MAX_NAMES:
+                if len({*self._described, *described, name}) > MAX_NAMES:
                     raise _too_many(name)
             except ConfigError as error:
                 self._leave_out(error)
                 continue
             described[name], size = needed, larger
-            names.add(name)
         return described, size
 
     def _column(self, name: str, description: Description) -> _Column:
@@ -280,9 +279,7 @@ class PendingExtras:
             column.fill(NOTHING)
             return _Column(None, (), frozenset(), column, self._varying_fit(name, description))
         base, shape = np.dtype(dtype.base.str), (*batch, *dtype.shape)
-        exact: set[type] = {
-            kind for kind in SCALARS if np.can_cast(kind, base) and (kind is not np.bool_ or base.kind == "b")
-        }
+        exact = {kind for kind in SCALARS if np.can_cast(kind, base)}
         exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
 
         def fit(_: int, value: object) -> Array:
@@ -345,8 +342,7 @@ class PendingExtras:
         for column in self._columns.values():
             column.values[:left] = column.values[n : n + left]
         self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
-        self._max_rows, self._held_row = self._room, self._held_row - n
-        self._held = sum(self._row_bytes.values()) * self._n if self._held_row >= 0 else 0
+        self._max_rows, self._held, self._held_row = self._room, 0, self._held_row - n
 
     def _send(self, steps: Ints, columns: Mapping[str, Array], given: Mapping[str, Flags]) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -21,7 +22,7 @@ from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logg
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
-from runner.recording.schema import STEP_NANOSECONDS, topics_of
+from runner.recording.schema import STEP_NANOSECONDS, Topic, topics_of
 from runner.runs.checkpoints import MAX_CHECKPOINTS
 from runner.runs.store import Store
 from runner.util.jsonable import as_json, exact_json, is_exact, is_packed, packed
@@ -262,13 +263,8 @@ class Messages:
                     f"frames: found {pixels.dtype} of shape {list(pixels.shape)} from render(), expected "
                     "uint8 of [height, width, 3]."
                 )
-            kind, position = self._options.frame_format, self._loop.position
-            frame = frame_id(phase, environment, is_reset)
-
-            def make() -> bytes:
-                return encode_image(image_bytes(pixels, kind), kind, position, frame)
-
-            self._recorder.submit(topics_of(phase).frames, make, position)
+            kind, frame = self._options.frame_format, frame_id(phase, environment, is_reset)
+            self._submit(topics_of(phase).frames, partial(image_bytes, pixels, kind), kind, frame)
 
     def picture(self, name: str, picture: Picture) -> None:
         """Record a picture or a film under a name, at this moment; another thread encodes it."""
@@ -276,10 +272,10 @@ class Messages:
         pillow()
         with self._loop.lock:
             if self._loop.records():
-                position = self._loop.position
+                self._submit(schema.IMAGE_TOPIC, picture.encoded, picture.format, name)
                 self.has_logged = True
 
-                def make() -> bytes:
-                    return encode_image(picture.encoded(), picture.format, position, name)
-
-                self._recorder.submit(schema.IMAGE_TOPIC, make, position)
+    def _submit(self, topic: Topic, encoded: Callable[[], bytes], kind: str, name: str) -> None:
+        """Have another thread encode a picture of this moment. The caller holds the lock."""
+        position = self._loop.position
+        self._recorder.submit(topic, lambda: encode_image(encoded(), kind, position, name), position)
