@@ -136,21 +136,24 @@ class GeneratorWatch:
     def after_reset(self, states: States, environments: Sequence[int], seeds: Sequence[int | None]) -> States:
         """Return what a reset depended on; arguments as for `before_reset`, and what that returned."""
         after: States = {}
-        drawn: dict[int, int | None] = {}
-        if self._vector is not None:
+        if self._vector is None:
+            for i in environments:
+                if i < len(self._generators):
+                    state = self._generators[i].after(states.get(i), seeds[i] if seeds else None)
+                    if state is not None:
+                        after[i] = state._replace(environment=i)
+        else:
             unseeded = [i for i in environments if not seeds or seeds[i] is None]
             self._seeded.update(set(environments).difference(unseeded))
             if unseeded:
                 generators: Any = self._vector.get_attr("_np_random")
                 self._vector = None
                 drawn = {i: seed_of(generators[i]) for i in environments if i not in self._seeded}
-        for i in environments:
-            if i < len(self._generators):
-                state = self._generators[i].after(states.get(i), seeds[i] if seeds else None)
-            else:
-                state = None if drawn.get(i) is None else ResetState(np_random_seed=drawn[i])
-            if state is not None:
-                after[i] = state._replace(environment=i)
+                after = {
+                    i: ResetState(environment=i, np_random_seed=seed)
+                    for i, seed in drawn.items()
+                    if seed is not None
+                }
         return after
 
 
