@@ -423,6 +423,43 @@ def replay(
             update.bootstrapped, update.second = bootstrapped, second
 
 
+@loop
+def read_states(tables: Tables, states: Ints32, value: Floats, greedy: Ints32) -> None:
+    """Read the highest value and the greedy action of states, [n], into [L, n]; nan and -1 for state -1."""
+    for i in range(value.shape[0]):
+        for k in range(value.shape[1]):
+            state = states[k]
+            if state < 0:
+                value[i, k] = np.nan
+                greedy[i, k] = -1
+            else:
+                value[i, k] = tables.value[i, state]
+                greedy[i, k] = tables.greedy[i, state]
+
+
+@loop
+def replay_probed(
+    seed: np.uint64,
+    model: Model,
+    tables: Tables,
+    rules: Rules,
+    steps: Records,
+    rows: Floats,
+    before: Ints,
+    states: Ints32,
+    value: Floats,
+    greedy: Ints32,
+) -> None:
+    """Replay steps, and read the states of row k of `states` before step `before[k]`; they ascend."""
+    at = 0
+    for k in range(len(steps)):
+        while at < len(before) and before[at] == k:
+            read_states(tables, states[at], value[at], greedy[at])
+            at += 1
+        _read_rows(model, tables, rows, k, steps[k].state)
+        relearn(seed, model, tables, rules, steps[k], 0)
+
+
 @numba.njit(cache=True)
 def fill_random(q: Floats, seed: np.uint64, low: float, high: float) -> None:
     """Fill the tables with draws, uniform in [low, high)."""

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.environments.mdp import Mdp
@@ -18,11 +19,29 @@ from runner.learning import kernel
 from runner.learning.learner import Learner, NamedTables
 from runner.learning.ledger import UPDATE
 from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
-from runner.util.arrays import Array, Floats, Records
+from runner.util.arrays import Array, Floats, Ints, Ints32, Records
 from runner.util.values import JsonView
 
 NO_ROWS: Final = np.empty((0, 0, 0))
 NO_UPDATES: Final = np.empty(0, UPDATE)
+
+
+class StateProbe(NamedTuple):
+    """Values and greedy actions of some states, read before some of the steps of a block."""
+
+    before: Ints
+    """[k]: rows of the block, ascending."""
+    states: Ints32
+    """[k, n]: the states that are read before each of these rows; -1 for none."""
+    value: NDArray[np.float32]
+    """[k, learners, n]: filled with the highest value of each state; nan for none."""
+    greedy: Ints32
+    """[k, learners, n]: filled with the greedy action in each state; -1 for none."""
+
+    def between(self, start: int, stop: int) -> StateProbe:
+        """Return the part of the probe for rows `start` to `stop` of the block, as a block of their own."""
+        part = slice(*np.searchsorted(self.before, (start, stop)))
+        return StateProbe(self.before[part] - start, self.states[part], self.value[part], self.greedy[part])
 
 
 class Trace(NamedTuple):
@@ -84,6 +103,7 @@ class StepReplay:
         self,
         steps: Records,
         rows: Floats = NO_ROWS,
+        probe: StateProbe | None = None,
         trace: Trace | None = None,
     ) -> None:
         """Apply the updates of the training steps that follow.
@@ -92,14 +112,19 @@ class StepReplay:
             steps: a block of records; the first is step number `self.step`.
             rows: filled with each learner's values of a step's state before its update, [steps, learners,
                 most actions]; empty if they are not needed.
-            trace: filled with what decides the weights of the updates.
+            probe: states to look at on the way.
+            trace: filled with what decides the weights of the updates; not together with `probe`.
         """
+        if probe is not None:
+            _check_probe(probe, self._mdp)
         for segment, part in self._segments(steps):
             what = (*segment, rows[part])
-            if trace is None:
+            if trace is not None:
+                kernel.replay(*what, trace.updates[part], trace.learner)
+            elif probe is None:
                 kernel.replay(*what, NO_UPDATES, 0)
             else:
-                kernel.replay(*what, trace.updates[part], trace.learner)
+                kernel.replay_probed(*what, *probe.between(part.start, part.stop))
 
     def begin_watch(self, watch: Watch) -> WatchedValues:
         """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""
@@ -175,8 +200,20 @@ class StepReplay:
             rows[:, i, : table.shape[1]] = table[states]
         return rows
 
+    def read(self, probe: StateProbe) -> None:
+        """Fill a probe with the values and greedy actions as they are now, for all of its rows."""
+        _check_probe(probe, self._mdp)
+        for k in range(len(probe.states)):
+            kernel.read_states(self.learner.tables, probe.states[k], probe.value[k], probe.greedy[k])
+
     def _lost(self, next_step: int) -> RecordingError:
         return RecordingError(
             f"{self._where}: training steps {self.step} to {next_step - 1} were lost, so the Q-tables after "
             "them are unknown until the next snapshot; `dualtaxi resume` retrains the run."
         )
+
+
+def _check_probe(probe: StateProbe, mdp: Mdp) -> None:
+    """Refuse states that the tables do not have: compiled code would read outside of them."""
+    if probe.states.size and not -1 <= probe.states.min() <= probe.states.max() < mdp.states:
+        raise IndexError(f"found states up to {probe.states.max()}, expected less than {mdp.states}.")

@@ -35,6 +35,7 @@ from runner.export.rerun.tracks import (
     text_track,
 )
 from runner.recording.reader import Recording
+from runner.replay.step_replay import StateProbe
 from runner.replay.tables import TableReplay, are_within, known_steps
 from runner.util.arrays import Ints
 
@@ -92,23 +93,22 @@ class ValueReader:
         is_new |= steps["t"] == 0
         self._last = int(batch.times["step"][-1]), int(context[-1])
         replay = self._replay = self._replay or TableReplay(self._recording, int(trained[0]))
-        tables, learned = replay.empty_rows(len(steps)), replay.learner.tables
-        map_rows, maps = np.flatnonzero(is_new), []
-        leaps = np.flatnonzero(np.diff(trained) != stride) + 1
-        edges = [0, *leaps, *(map_rows if stride else ()), len(steps)]
-        for start, stop in pairwise(np.unique(edges).tolist()):
+        tables = replay.empty_rows(len(steps))
+        map_rows = np.flatnonzero(is_new)
+        shape = len(map_rows), len(self._recording.agents), self._states.shape[1]
+        maps = np.empty(shape, np.float32), np.empty(shape, np.int32)
+        probe = StateProbe(map_rows, self._states[context[map_rows]], *maps)
+        edges = [0, *np.flatnonzero(np.diff(trained) != stride) + 1, len(steps)]
+        for start, stop in pairwise(edges):
             if replay.step != trained[start]:
                 replay.seek(int(trained[start]))
-            for row in start + np.flatnonzero(is_new[start:stop]):
-                states = self._states[context[row]]
-                best, choice = learned.value[:, states], learned.greedy[:, states]
-                maps.append((np.where(states < 0, np.nan, best), np.where(states < 0, -1, choice)))
+            own = probe.between(start, stop)
             if stride:
-                replay.apply(steps[start:stop], tables[start:stop])
+                replay.apply(steps[start:stop], tables[start:stop], own)
             else:
+                replay.read(own)
                 tables[start:stop] = replay.values_in(steps["state"][start:stop])
-        value_maps, greedy_maps = (np.array([pair[i] for pair in maps]) for i in range(2))
-        return Batch(*batch[:3], *self._by_agent(tables), map_rows, value_maps, greedy_maps)
+        return Batch(*batch[:3], *self._by_agent(tables), map_rows, *maps)
 
     def _by_agent(self, tables: Floats) -> tuple[Floats, Ints]:
         """Return values and greedy actions by agent, of rows by learner."""
@@ -243,9 +243,8 @@ class MapTracks:
         if not (n := len(batch.map_rows)):
             return
         times, maps = batch.at(batch.map_rows), (batch.value_maps, batch.greedy_maps)
-        best, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
+        values, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
         with np.errstate(all="ignore"):
-            values = best.astype(np.float32)
             low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
         ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
         buffers = np.ascontiguousarray(values).view(np.uint8)

@@ -36,7 +36,7 @@ from runner.export.rerun.tracks import (
     scalars,
     text_track,
 )
-from runner.util.arrays import Flags, Ints, Records
+from runner.util.arrays import Flags, Ints, Ints32, Records
 
 TRAIL_STEPS: Final = 5
 TITLE_Y: Final = -0.62
@@ -59,9 +59,9 @@ class Batch(NamedTuple):
     """[n, agents]: each agent's greedy action."""
     map_rows: Ints = NO_ARRAY
     """[k]: the steps that have maps."""
-    value_maps: Floats = NO_ARRAY
+    value_maps: NDArray[np.float32] = NO_ARRAY
     """[k, learners, pixels]: the greatest value in the state of each pixel; nan for no state."""
-    greedy_maps: Ints = NO_ARRAY
+    greedy_maps: Ints32 = NO_ARRAY
     """[k, learners, pixels]: the learner's greedy action there; -1 for no state."""
 
     def at(self, rows: slice | Ints | Flags) -> Times:
