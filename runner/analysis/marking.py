@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import opened
-from runner.errors import RunnerError
+from runner.errors import NotInRecording, RunnerError
 from runner.recording.labels import check_tags
 from runner.recording.marks import MAX_MARK_TEXT, Mark, Marks, change_marks
 from runner.recording.reader import Recording
@@ -59,7 +59,7 @@ def unmark(run: Run, *ids: str) -> None:
     """Remove marks of a run by their ids; merging brings none of them back.
 
     Raises:
-        RunnerError: the run has no such mark.
+        NotInRecording: the run has no such mark.
         StorageError: the run's folder cannot be written.
     """
     run.require_folder()
@@ -67,7 +67,7 @@ def unmark(run: Run, *ids: str) -> None:
     def change(marks: Marks) -> Marks:
         known = [each.id for each in marks.marks]
         if missing := [name for name in ids if name not in known]:
-            raise RunnerError(
+            raise NotInRecording(
                 f"run {run.run_id}: found no mark {missing[0]!r}, expected one of: "
                 f"{', '.join(known) or 'none'}."
             )

@@ -32,8 +32,8 @@ if TYPE_CHECKING:  # imported when something is drawn
 SHRUNK: Final = 10
 """Minimum characters of a shrinking column."""
 
-UNBOUNDED: Final = 1000
-"""Width without a terminal."""
+UNBOUNDED: Final = 1 << 16
+"""Width without a terminal: more than the longest line of a run's output."""
 
 
 def echo(text: object, err: bool = False, nl: bool = True) -> None:

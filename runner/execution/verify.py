@@ -263,7 +263,8 @@ def _check_content(recording: Recording, installed: bool, report: Report, trust:
             for topic, places in recording.lost.items()
             for first, end in places
         )
-        finding = f"{recording.path}: {holes}: lost in a repair. `dualtaxi resume` retrains the job."
+        again = " `dualtaxi resume` retrains the job." if recording.can_train_again else ""
+        finding = f"{recording.path}: {holes}: lost in a repair.{again}"
         return replace(verification, verdict="damaged", finding=finding)
     if unfolded := recording.result.unfolded:
         processes = [f"{name or 'the process that began it'}: {what}" for name, what in unfolded.items()]

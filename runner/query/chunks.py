@@ -139,6 +139,10 @@ def opened_tables(run: Run) -> Iterator[RunTables]:
     """
     if run.status != "archived":
         with open_recording(run.recording) as recording:
+            if run.status == "finished" != recording.status:
+                raise RecordingError(
+                    f"{run.recording}: is cut off, though its run is finished; `dualtaxi verify` says where."
+                )
             batches = Batches(recording)
             yield RunTables(
                 batches.shape,

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import glob
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -127,10 +128,12 @@ class EpisodeIndex:
             other.unlink(missing_ok=True)
         return [*chosen, *loose]
 
-    def _write(self, path: Path, rows: str, options: str) -> None:
+    def _write(self, path: Path, rows: str, options: str, check: Callable[[], None] = lambda: None) -> None:
+        """Write rows into a file, unless `check` raises an error when all are there."""
         with storage_errors(path), replacing(path) as fresh:
             options = f"FORMAT parquet, COMPRESSION zstd, {options}"
             self._database.rows(f"COPY ({rows}) TO {literal(fresh)} ({options})")
+            check()
 
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""
@@ -139,10 +142,6 @@ class EpisodeIndex:
         _check(row, runs)
         run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
         with open_recording(run.recording) as recording:
-            if row["status"] == "finished" != recording.status:
-                raise RecordingError(
-                    f"{run.recording}: is cut off, though its run is finished; `dualtaxi verify` says where."
-                )
             shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
             actions = _names_of_actions(shape, recording)
@@ -165,8 +164,8 @@ class EpisodeIndex:
             rows = with_steps(rows, aggregates, {})
         facts = json.dumps(asdict(Facts([*plain, *aggregates], actions)))
         path = self.folder / f"{stem}{_hash(facts)}.parquet"
-        self._write(path, f"FROM ({rows}) ORDER BY row", f"KV_METADATA {{facts: {literal(facts)}}}")
-        _check(row, runs)
+        options = f"KV_METADATA {{facts: {literal(facts)}}}"
+        self._write(path, f"FROM ({rows}) ORDER BY row", options, partial(_check, row, runs))
         return path
 
 

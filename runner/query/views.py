@@ -26,14 +26,14 @@ from runner.archive import layout
 from runner.archive.columns import Shape
 from runner.archive.places import opened
 from runner.environments.mdp import events_of
-from runner.errors import NotInRecording, RunnerError
+from runner.errors import NotInRecording, RecordingError, RunnerError
 from runner.recording.marks import read_marks
 from runner.runs.catalogue.columns import COLUMNS, IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
 from runner.runs.listing import listed_run
 from runner.runs.run import Run, recordings_folder
-from runner.util.humanize import listed
+from runner.util.humanize import counted, listed
 from runner.util.processes import Tell
 from runner.util.values import flatten
 
@@ -209,10 +209,16 @@ class SelectedRuns:
         from runner.query.chunks import opened_tables  # imports pandas
 
         for k in condition.may_hold([{"run": (row["id"], row["id"])} for row in rows]):
+            read = 0
             with self.reading(name, rows[k]) as run, opened_tables(run) as tables:
-                for batch in _batches_of(tables, TABLES[name], own_names, needed, condition):
-                    self._count(rows[k], batch.num_rows)
-                    yield batch
+                try:
+                    for batch in _batches_of(tables, TABLES[name], own_names, needed, condition):
+                        self._count(rows[k], batch.num_rows)
+                        yield batch
+                        read += batch.num_rows
+                except RunnerError as error:
+                    rest = f" {counted(read, 'row')} before the damage had been read." if read else ""
+                    raise RecordingError(f"{error}{rest}") from error
 
 
 def _batches_of(

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field, create_model
 
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed, fragments
@@ -18,7 +18,7 @@ from runner.service.addresses import link
 from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
 from runner.service.pages.frame import RunPage, StatusName, installed_names
-from runner.service.problems import RUN_ERRORS, error_docs, filled, media_docs
+from runner.service.problems import RUN_ERRORS, error_docs, filled, media_docs, status_of
 from runner.views import VIEWS, view_named
 from runner.views.view import Given, Input, View
 
@@ -87,7 +87,8 @@ def _add_routes(view: View) -> None:
             asked = {name: text for name, text in form.items() if text}
             live = link(f"/runs/{run.run_id}/{view.name}/part", asked | {"status": run.status})
         shown = {"view": view, "form": form, "body": body.decode(), "problem": problem, "live": live}
-        return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view))
+        status = status_of(problem) if isinstance(problem, RecordingError) else None
+        return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
 
 
 async def _computed(

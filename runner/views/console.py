@@ -17,6 +17,10 @@ if TYPE_CHECKING:
 
 _BOTH: Final = "both"
 _STREAMS: Final = (_BOTH, "stdout", "stderr")
+_NONE: Final = (
+    "No output was recorded. What the runner itself prints is never recorded, and nothing is if `console` "
+    "is off."
+)
 
 
 @dataclass(frozen=True)
@@ -35,17 +39,19 @@ class Output:
     def sections(self) -> list[Section]:
         """Return a table of the lines."""
         if not self.lines:
-            return [Section("Output", ["No line was found." if self.total else "No output was recorded."])]
+            return [Section("Output", ["No line was found." if self.total else _NONE])]
         sentence = counted(self.found, "line")
         if self.found > len(self.lines):
             sentence = f"The last {len(self.lines):,} of {sentence}"
         if self.found < self.total:
             sentence += f" found, of {self.total:,}"
-        rows = [(duration(line.seconds), f"{line.position:,}", line.text) for line in self.lines]
         streams = [line.stream or "note" for line in self.lines]
-        return [
-            Section("Output", [f"{sentence}."], [Grid(("time", "step", "output"), rows, streams=streams)])
+        rows = [
+            (duration(line.seconds), f"{line.position:,}", stream, line.text)
+            for line, stream in zip(self.lines, streams, strict=True)
         ]
+        grid = Grid(("time", "step", "stream", "output"), rows, streams=streams)
+        return [Section("Output", [f"{sentence}."], [grid])]
 
 
 def console(

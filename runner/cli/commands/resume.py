@@ -61,7 +61,7 @@ def resume_command(
     from runner.execution.resume import is_finished, resume
 
     was_finished = is_finished(run)
-    if not was_finished and run.status != "running":
+    if not was_finished and run.status != "running" and run.can_train_again:
         _announce(run)
     with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
         run = resume(run, accept_changes, report, interrupt, trust)

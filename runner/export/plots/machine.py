@@ -23,7 +23,7 @@ _SIZES: Final = {
     "memory_bytes": "Memory of the process, largest",
     "host_memory_total": "Memory of the machine",
     "gpu_memory_bytes": "GPU memory, largest",
-    "disk_free_bytes": "Disk, free at the end",
+    "disk_free_bytes": "Disk, free at the last sample",
 }
 
 

@@ -89,7 +89,7 @@ async def list_runs(
     return Response(await cache.get_or_make(key, make), media_type="application/json")
 
 
-class LabelChanges(BaseModel):
+class LabelChanges(BaseModel, extra="forbid"):
     """Changes to the labels of a run; what is omitted stays."""
 
     name: Annotated[
@@ -166,7 +166,7 @@ def label_run(run: WrittenRun, labels: LabelChanges, catalogue: CatalogueOf) -> 
     return {"run_id": run.run_id, "name": now.name or run.file.name, "tags": list(now.tags), "note": now.note}
 
 
-class MarkSent(BaseModel):
+class MarkSent(BaseModel, extra="forbid"):
     """A mark to set."""
 
     at: Annotated[str, Field(max_length=60, description="The step, such as `812:57`.")]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
+from types import MappingProxyType
 from typing import Any, Final, Literal
 
 from fastapi import APIRouter, Request, Response
@@ -45,7 +46,7 @@ from runner.service.dependencies import (
 )
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import RunPage, StatusName, environment_of, last_results, result_of
-from runner.service.pages.rendering import Form, Page, viewer_of
+from runner.service.pages.rendering import Form, Page, form_of, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
 from runner.util.values import Json
@@ -93,7 +94,7 @@ class _Act(APIRoute):
                 return await handle(request)
             except RunnerError as error:
                 run = await run_in_threadpool(request.app.state.catalogue.find, request.path_params["run"])
-                return _overview(request, run, error)
+                return _overview(request, run, error, await form_of(request))
 
         return act
 
@@ -199,14 +200,20 @@ def evaluations(run: RecordedRun, recording: OpenRecording) -> Response:
     return RunPage(run, "evaluations", "run_evaluations.html", values)
 
 
-def _overview(request: Request, run: Run, problem: RunnerError | None = None) -> Response:
-    """Return the first page of a run; `problem` is why a request was refused."""
+def _overview(
+    request: Request,
+    run: Run,
+    problem: RunnerError | None = None,
+    form: Mapping[str, str] = MappingProxyType({}),
+) -> Response:
+    """Return the first page of a run; `problem` is why a request was refused, `form` what it sent."""
 
     def values() -> dict[str, object]:
         settings = request.app.state.settings
         return {
             "status": _status(run, request.app.state.jobs, settings),
             "problem": problem,
+            "form": form,
             "max_note": MAX_NOTE,
             "removal": plan(run, settings.recordings[0]) if viewer_of(request).can_write else None,
             "film_endings": tuple(FORMATS),

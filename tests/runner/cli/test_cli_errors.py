@@ -97,9 +97,11 @@ def test_parent_folders_of_output_are_created(recorded, tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of the system")
 @pytest.mark.parametrize(
-    ("limit", "value", "expected"), [("RLIMIT_AS", 300 << 20, "memory"), ("RLIMIT_NOFILE", 8, "open files")]
+    ("limit", "value", "name", "expected"),
+    [("RLIMIT_AS", 300 << 20, "quick", "memory"), ("RLIMIT_NOFILE", 8, "cart", "open files")],
 )
-def test_a_limit_of_the_system_is_an_error_without_a_traceback(tmp_path, limit, value, expected):
+def test_a_limit_of_the_system_is_an_error_without_a_traceback(tmp_path, limit, value, name, expected):
+    runner.run("quick", overrides=["episodes=2", "evaluation=null"], recordings=tmp_path)
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="cart") as rec:
         rec.reset(seed=0)
         rec.step(0)
@@ -107,7 +109,7 @@ def test_a_limit_of_the_system_is_an_error_without_a_traceback(tmp_path, limit, 
         "import resource, sys; from runner.cli import main; sys.argv[0] = 'dualtaxi';"
         f"resource.setrlimit(resource.{limit}, ({value}, {value})); main()"
     )
-    words = ["verify", rec.run.run_id, "--recordings", str(tmp_path)]
+    words = ["verify", name, "--recordings", str(tmp_path)]
     done = subprocess.run(
         [sys.executable, "-c", code, *words], capture_output=True, text=True, check=False, timeout=120
     )

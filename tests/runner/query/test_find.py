@@ -226,6 +226,34 @@ def test_a_run_that_cannot_be_searched_is_named(folder, tmp_path):
     assert runner.find("count(collision) > 1", runs, runs="bare").count  # from the index alone
 
 
+@pytest.mark.parametrize("expression", ["0/0 > 2", "0/0 == 0/0", "any(t/t > 2)", "1/0 - 1/0 > 0"])
+def test_nan_compares_as_false(folder, expression):
+    assert not runner.find(expression, folder).count
+
+
+def test_a_run_that_is_damaged_in_its_steps_is_left_out_each_time(tmp_path):
+    run = make_run(tmp_path, TAXIS)
+    with open_recording(run.recording) as recording:
+        entry = recording.train.steps.entry(len(recording.train.steps) - 1)
+    with run.recording.open("r+b") as stream:
+        stream.seek(entry.offset + entry.length // 2)
+        stream.write(b"damage")
+    for _ in range(2):
+        found = runner.find("length > 0", tmp_path)
+        assert not found.count
+        assert found.left_out[0].startswith(f"run {run.run_id} is left out of find: ")
+
+
+def test_a_finished_run_whose_recording_is_cut_off_is_left_out(tmp_path):
+    run = make_run(tmp_path, TAXIS)
+    os.truncate(run.recording, run.recording.stat().st_size // 2)
+    assert "is cut off, though its run is finished" in runner.find("length > 0", tmp_path).left_out[0]
+    for view in ("episodes", "steps"):
+        result = runner.sql(f"SELECT count(*) AS n FROM {view}", recordings=tmp_path)
+        assert result.arrow().to_pylist() == [{"n": 0}]
+        assert "is cut off, though its run is finished" in result.left_out[0]
+
+
 def test_a_recording_that_changed_is_read_again(tmp_path):
     first, second = (make_run(tmp_path / name, TAXIS | {"episodes": n}) for name, n in (("a", 20), ("b", 40)))
     assert runner.find("length > 0", tmp_path / "a", phase="train").count == 20

@@ -285,6 +285,7 @@ def test_damaged_runs_and_runs_without_steps_are_named(folder, tmp_path):
     left_out = "\n".join(result.left_out)
     for run in (taxis, lake, find_run("stepless", copied)):
         assert f"run {run.run_id} is left out of steps: " in left_out
+    assert "rows before the damage had been read." in left_out
     output = command(copied, "SELECT count(*) FROM steps").stderr
     assert taxis.run_id in output
     assert "it has no steps" in output

@@ -45,6 +45,7 @@ def test_labels_are_changed_by_a_form(client):
     answer = client.post("/runs/renamed/labels", data=fields | {"tags": "$$"}, headers=ACCEPT_HTML)
     assert answer.status_code == 400
     assert "expected 1 to 64 letters" in answer.text
+    assert 'value="$$"' in answer.text  # what was typed stays in the form
 
 
 def test_mistakes_are_shown_at_their_lines(client):

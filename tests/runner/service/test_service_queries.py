@@ -138,7 +138,7 @@ def test_marks_are_set_listed_and_removed(client, recordings):
     assert client.post(path, json={"at": "3:99999"}).status_code == 404
     assert client.post(path, json={"at": "x"}).status_code == 400
     assert client.delete(f"{path}/{mark['mark']}").json()["marks"] == []
-    assert client.delete(f"{path}/{mark['mark']}").status_code == 400
+    assert client.delete(f"{path}/{mark['mark']}").status_code == 404
 
 
 @pytest.mark.parametrize(
