@@ -11,7 +11,6 @@ import numpy as np
 from runner.analysis.contents import require_steps, shortcomings, whole_ranges, why_no_steps
 from runner.analysis.evaluations import Evaluation, evaluation_after, evaluations_of
 from runner.drawing.svg import drawing_of
-from runner.errors import NotInRecording
 from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.reader import Recording
@@ -139,9 +138,7 @@ def select(recording: Recording, request: Request) -> Selection:
     available, where = evaluations_with_steps(recording), str(recording.path)
     chosen = [evaluation_after(available, after, where) for after in sorted(set(request.evaluations))]
     numbers = _asked_episodes(request, len(train.start), where)
-    trials_there = range(len(evals.start))
-    if (missing := next((trial for trial in request.trials if trial not in trials_there), None)) is not None:
-        raise NotInRecording(f"{where}: has no trial {missing:,}; there are {len(trials_there):,}, from 0.")
+    whole_ranges([(number, number + 1) for number in request.trials], len(evals.start), "eval", where)
     asked = {"train": numbers, "eval": np.array(request.trials, int)}
     if not request.everything:
         trials = asked["eval"] if request.trials else _trials(chosen)
