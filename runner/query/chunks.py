@@ -205,18 +205,23 @@ def _times_of(chunks: TopicChunks) -> tuple[Ints, Ints]:
 def _episodes_of_steps(phase: Phase, starts: Ints, ends: Ints) -> dict[str, tuple[Ints, Ints]]:
     """Return the first and the last episode of chunks of steps, as an episode has the time of its last step.
 
-    Environments that take turns count their own episodes. Nothing is known where a repair lost episodes.
+    Environments that take turns count their own episodes. A chunk after the last episode may be of any later
+    one, as of a run that was killed. Nothing is known where a repair lost episodes.
     """
     if phase.episodes.lost:
         return {}
     turns = phase.steps.environments if phase.steps.have_turns else 1
-    ended: list[list[Ints]] = [[np.zeros(0, np.int64)] for _ in range(turns)]
+    blocks: list[list[Ints]] = [[np.zeros(0, np.int64)] for _ in range(turns)]
     for block in phase.episodes.rows():
-        for k, times in enumerate(ended):
+        for k, own in enumerate(blocks):
             mine = block[block["environment"] == k] if turns > 1 else block
-            times.append(mine["log_time"].astype(np.int64))
-    counts = [[np.searchsorted(times, at) for times in map(np.concatenate, ended)] for at in (starts, ends)]
-    return {"episode": (np.min(counts[0], axis=0), np.max(counts[1], axis=0))}
+            own.append(mine["log_time"].astype(np.int64))
+    first, last = [], []
+    for ended in map(np.concatenate, blocks):
+        after = np.searchsorted(ended, ends)
+        first.append(np.searchsorted(ended, starts))
+        last.append(np.where(after < len(ended), after, np.iinfo(np.int64).max))
+    return {"episode": (np.min(first, axis=0), np.max(last, axis=0))}
 
 
 # --- archives ---------------------------------------------------------------------------------------------

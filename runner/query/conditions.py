@@ -28,7 +28,7 @@ AGGREGATES: Final[dict[Any, tuple[str, str]]] = {
     "then": ("coalesce(bool_or({0.sql} AND {1.sql}), FALSE)", "({0.high} AND {1.high} AND NULL)"),
     "min": ("min({0.sql})", "{0.low}"),
     "max": ("max({0.sql})", "{0.high}"),
-    "sum": ("sum({0.sql})", "NULL"),
+    "sum": ("nullif(sum({0.sql}), 'NaN')", "NULL"),
     "first": ("arg_min({0.sql}, step)", "NULL"),
     "last": ("arg_max({0.sql}, step)", "NULL"),
 }
@@ -209,8 +209,8 @@ class EpisodeParser(Parser[Part]):
             if not (within.isdecimal() and 0 < int(within) <= _MAX_WITHIN):
                 raise self.error(
                     option.value,
-                    f"found within={within}, expected a whole number of steps from 1; D comes after C in "
-                    "then(C, D), so C and D at one step are any(C and D).",
+                    f"found within={within}, expected a whole number of steps from 1 to {_MAX_WITHIN:,}; D "
+                    "comes after C in then(C, D), so C and D at one step are any(C and D).",
                 )
         if self._is_inside or len(node.args) != 1 + (name == "then"):
             raise self.error(

@@ -22,7 +22,7 @@ from typing import Final
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.marking import mark_steps
 from runner.analysis.sections import Grid
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.query.conditions import ENDS, EpisodeParser, Facts, NotInRun
 from runner.query.episode_index import (
     EpisodeIndex,
@@ -253,7 +253,7 @@ class _Search:
             try:
                 self.files[k] = self.index.file(row, self.runs)
                 kinds[kind_of(self.files[k])].append(k)
-            except RunnerError as error:
+            except (RecordingError, StorageError, RunNotFound, QueryFailed) as error:
                 self.runs.left_out[row["id"]] = {"find": str(error)}
         self.index.trim()
         self.database.rows(

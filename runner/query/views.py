@@ -217,7 +217,7 @@ class SelectedRuns:
                         yield batch
                         read += batch.num_rows
                 except RunnerError as error:
-                    rest = f" {counted(read, 'row')} before the damage had been read." if read else ""
+                    rest = f" The {counted(read, 'row')} before the damage were read." if read else ""
                     raise RecordingError(f"{error}{rest}") from error
 
 
@@ -227,7 +227,8 @@ def _batches_of(
     table = tables.shape.tables[file]
     names, run_id = [own_names[name] for name in needed.names], pa.scalar(tables.shape.run_id)
     stored = [name for name in names if name in table.columns.names]
-    masks = {name: mask for name, mask in tables.shape.event_masks.items() if name in {*names} - {*stored}}
+    unknown = {*names} - {*stored, "run"} if file == layout.STEPS else set[str]()
+    masks = {name: mask for name, mask in tables.shape.event_masks.items() if name in unknown}
     of_events = _columns_of_events(tables.shape) if masks else []
     is_turn = ["taken"] if "taken" in table.columns.names else []  # else it is no step of its environment
     read = list(dict.fromkeys([*stored, *is_turn, *of_events])) or ["position"]  # to count the rows

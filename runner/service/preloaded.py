@@ -5,9 +5,12 @@ A process needs them for its first kernel, even for one from the cache; loading 
 
 from __future__ import annotations
 
+import contextlib
+
 from numba.core.registry import cpu_target
 
 import runner.learning  # noqa: F401 - keeps SciPy out of them
 
-cpu_target.typing_context.refresh()
-cpu_target.target_context.refresh()
+with contextlib.suppress(AttributeError):  # internals of Numba, which may change
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()

@@ -219,7 +219,7 @@ def _in_words(detail: ErrorDetails) -> str:
 
 
 async def _disconnected(request: Request, error: Exception) -> Response:  # noqa: ARG001
-    body = ErrorBody(message="the connection was closed before the body was complete.")
+    body = ErrorBody(message="the client closed the connection.")
     return json_error(HTTPStatus.BAD_REQUEST, body)
 
 

@@ -150,12 +150,15 @@ class ProcessPool:
         """
         doing = _Doing()
         future = self._submit(lambda child: doing.by(child).call(function, self._seconds, *args, **keywords))
+        waiting = asyncio.wrap_future(future)
         try:
-            return await asyncio.wrap_future(future)
+            return await asyncio.shield(waiting)
         except asyncio.CancelledError:
-            if not future.done():
+            if not future.cancel():
                 doing.stop()
-                asyncio.get_running_loop().call_later(_STOP_SECONDS, doing.kill)
+                if not (await asyncio.wait({waiting}, timeout=_STOP_SECONDS))[0]:
+                    doing.kill()
+            waiting.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody asks
             raise
 
     def submit(

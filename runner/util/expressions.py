@@ -258,7 +258,8 @@ class Parser(ABC, Generic[Part]):
                 f"found {what} {self.text_of(node)}, expected one of 0 to {len(names) - 1}, or its name.",
             )
         wanted = spelt(value)
-        named = [k for k, name in enumerate(names) if spelt(name) == wanted]
+        named = [k for k, name in enumerate(names) if name == value]
+        named = named or [k for k, name in enumerate(names) if spelt(name) == wanted]
         if len(named) == 1:
             return named[0]
         if named:

@@ -324,7 +324,8 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str]) -> None:
     global _pipe_to_parent  # noqa: PLW0603 - one pipe for the whole process
     _pipe_to_parent = pipe
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent to act on
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())  # temporary files are removed
+    # Temporary files are removed. A call in compiled code ends first: who stops it kills it after a while.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     _limit_memory(memory_bytes)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while True:

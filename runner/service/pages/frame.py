@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Annotated, Final
@@ -55,8 +56,8 @@ class RunHead:
     tags: tuple[str, ...]
     note: str
     tabs: tuple[tuple[str, str], ...]
-    lacking: tuple[str, ...]
-    """The tabs that it does not have for want of Q-tables."""
+    lacking: Mapping[str, str]
+    """The tabs that it does not have, and what they need."""
 
 
 class RunPage(Page):
@@ -72,12 +73,10 @@ def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_episodes = has_environment(run.file.config)
     has_tables = run.can_train_again or _has_recorded_tables(run)
-    needs = {"tables": has_tables, "training": run.can_train_again}
-    of_tables = {"learned": has_tables} | {
-        view.name: needs[view.needs] for view in VIEWS.values() if view.needs
-    }
+    met = {"": True, "tables": has_tables, "training": run.can_train_again}
+    needs = {"learned": "tables"} | {view.name: view.needs for view in VIEWS.values()}
     has_tab = {
-        **of_tables,
+        **{name: met[need] for name, need in needs.items()},
         "replay": has_episodes,
         "episodes": has_episodes,
         "evaluations": has_episodes,
@@ -97,7 +96,11 @@ def head_of(run: Run) -> RunHead:
             *(tab for tab in TABS if has_tab.get(tab[0], True)),
             *((name, view_named(name).title) for name in installed_names()),
         ),
-        lacking=tuple(name for name, has in of_tables.items() if not has),
+        lacking={
+            name: "Q-tables" if not has_tables else "training that the runner can repeat"
+            for name, need in needs.items()
+            if not met[need]
+        },
     )
 
 

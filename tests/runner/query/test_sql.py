@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -142,6 +143,15 @@ def test_conditions_on_episodes_of_a_vector_read_few_chunks_and_lose_no_steps(tm
         answer = rows(tmp_path, f"SELECT step FROM steps WHERE episode = {episode} ORDER BY step")
         assert [row["step"] for row in answer] == steps["step"][steps["episode"] == episode].tolist()
         assert len(set(read)) < chunks
+    rec.run.update(status="interrupted")
+    size = rec.run.recording.stat().st_size
+    for part in (0.8, 0.6, 0.4, 0.3):  # it may end with steps whose episodes were lost
+        os.truncate(rec.run.recording, int(part * size))
+        with open_recording(rec.run.recording) as recording:
+            there = np.concatenate([block["episode"] for block in recording.train.steps.taken()])
+        least = int(there.max()) - 1
+        (answer,) = rows(tmp_path, f"SELECT count(*) AS n FROM steps WHERE episode >= {least}")
+        assert answer["n"] == (there >= least).sum()
 
 
 @pytest.mark.parametrize("episode", [0, 1, 19, 59])
@@ -285,7 +295,7 @@ def test_damaged_runs_and_runs_without_steps_are_named(folder, tmp_path):
     left_out = "\n".join(result.left_out)
     for run in (taxis, lake, find_run("stepless", copied)):
         assert f"run {run.run_id} is left out of steps: " in left_out
-    assert "rows before the damage had been read." in left_out
+    assert "rows before the damage were read." in left_out
     output = command(copied, "SELECT count(*) FROM steps").stderr
     assert taxis.run_id in output
     assert "it has no steps" in output
