@@ -248,7 +248,7 @@ def _batches_of_archive(
                     {"run": (run_id, run_id)}
                     | {name: (s.min, s.max) for name, s in facts.items() if s is not None and s.has_min_max}
                 )
-            for batch in file.iter_batches(_ROWS, condition.may_hold(known), list(names)):
+            for batch in file.iter_batches(_ROWS, row_groups=condition.may_hold(known), columns=list(names)):
                 yield batch.select(names)
     except (pa.ArrowException, OverflowError) as error:
         raise RecordingError(f"{where}: cannot be read as a table ({error}).") from error
