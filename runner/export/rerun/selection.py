@@ -59,10 +59,11 @@ class SelectedEpisodes:
     """The steps of each episode of a phase; the last episode may not have ended."""
 
     start: Ints
-    """[E]: number of the first step within the phase; in a vector that of all environments with it."""
+    """[E]: first step of each episode, counted over the phase (in a vector, over all environments)."""
     stop: Ints
-    """[E]: number after that of the last step; in a vector of all environments with it."""
+    """[E]: first step after each episode, counted in the same way."""
     ended: int
+    """How many of the episodes ended."""
 
     def before(self, steps: Ints | int) -> Ints:
         """Return how many of the episodes had ended after these numbers of steps."""
@@ -306,7 +307,7 @@ def _select_drawn(
         numbers = [np.arange(len(lengths)) if request.everything else asked[phase]]
         places = np.zeros(len(lengths))
         if n > 1:
-            places = recording.phase(phase).episodes.array()["environment"]
+            places = recording.phase(phase).episodes.array(0, len(lengths))["environment"]
         for environment in range(shown) if request.is_default else ():
             own = np.flatnonzero(places == environment)
             numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
