@@ -1,6 +1,6 @@
 """SQL over the recorded runs, by DuckDB: a query reads the views of some runs, and nothing else.
 
-    runner.sql("SELECT config, seed, avg(mean_return) FROM runs GROUP BY ALL").pandas()
+    runner.sql("SELECT config, avg(success_percent), avg(mean_return) FROM runs GROUP BY ALL").pandas()
 
 It cannot read files, reach the network, load extensions or write anything, and has limits of time and memory.
 """

@@ -74,7 +74,7 @@ def sql_command(
     from reading the rest, and --runs from opening other runs. A query reads no files and writes nothing.
 
     Examples:
-      dualtaxi sql 'SELECT config, seed, avg(mean_return) FROM runs GROUP BY ALL'
+      dualtaxi sql 'SELECT config, avg(success_percent), avg(mean_return) FROM runs GROUP BY ALL'
       dualtaxi sql 'SELECT run, max(length) FROM episodes GROUP BY run' --runs 'age < "7d"'
       dualtaxi sql 'SELECT state, action, count(*) FROM steps GROUP BY ALL' --parquet visits.parquet
     """
