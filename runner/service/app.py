@@ -14,7 +14,7 @@ from typing import Final
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.routing import BaseRoute
@@ -28,7 +28,7 @@ from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
 from runner.service.pictures import PictureStreams
-from runner.service.problems import add_error_handlers, error_docs
+from runner.service.problems import add_error_handlers, error_docs, known_query
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
@@ -113,10 +113,9 @@ def _routes() -> list[BaseRoute]:
         HTTPStatus.TOO_MANY_REQUESTS,
         HTTPStatus.INSUFFICIENT_STORAGE,
     )
-    for part in (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads):
-        whole.include_router(part.router, prefix=API, responses=general)
-    for router in (views.api, queries.api):
-        whole.include_router(router, prefix=API, responses=general)
+    parts = (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads)
+    for router in (*(part.router for part in parts), views.api, queries.api):
+        whole.include_router(router, prefix=API, responses=general, dependencies=[Depends(known_query)])
     for router in (health, login.router, views.pages, queries.pages, pages.router):
         whole.include_router(router)
     return whole.routes

@@ -6,12 +6,15 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Final, TypeVar
 
 from fastapi import FastAPI, Request
+from fastapi.dependencies.utils import get_flat_params
 from fastapi.exceptions import RequestValidationError
+from fastapi.params import Header
+from fastapi.params import Path as InPath
 from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -31,6 +34,7 @@ from runner.errors import (
     RunNotFound,
     StorageError,
     full_message,
+    nearest,
 )
 from runner.service.errors import EXPECTED, RequestError
 from runner.service.logs import LOG
@@ -195,12 +199,28 @@ def filled(kind: type[Question], fields: Mapping[str, object]) -> Question:
 
 def _as_config_error(error: ValidationError | RequestValidationError) -> ConfigError:
     """Return the error with what is wrong in a request, each with the parameter or field."""
-    problems = [
-        ConfigProblem(".".join(map(str, detail["loc"])), 0, 0, _in_words(detail)) for detail in error.errors()
-    ]
-    return ConfigError(
-        "; ".join(f"{problem.path}: {problem.message}" for problem in problems), tuple(problems)
-    )
+    return _wrong((".".join(map(str, detail["loc"])), _in_words(detail)) for detail in error.errors())
+
+
+def _wrong(messages: Iterable[tuple[str, str]]) -> ConfigError:
+    """Return the error of parameters or fields, each with a message."""
+    problems = tuple(ConfigProblem(path, 0, 0, message) for path, message in messages)
+    return ConfigError("; ".join(f"{problem.path}: {problem.message}" for problem in problems), problems)
+
+
+async def known_query(request: Request) -> None:
+    """Refuse a query with parameters that the route does not have: a mistyped one would be ignored.
+
+    Raises:
+        ConfigError: there are some; the message has the nearest name of each, or all names.
+    """
+    fields = get_flat_params(request.scope["route"].dependant) if request.query_params else []
+    known = [field.alias for field in fields if not isinstance(field.field_info, InPath | Header)]
+    hint = f" Known: {', '.join(known) or 'none'}"
+    if unknown := [name for name in request.query_params if name not in known]:
+        raise _wrong(
+            (f"query.{name}", f"unknown parameter.{nearest(name, known) or hint}") for name in unknown
+        )
 
 
 def _in_words(detail: ErrorDetails) -> str:
