@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from runner.client import jobs, pull, uploads
 from runner.client.connection import Connection
-from runner.client.jobs import RemoteJob
+from runner.client.jobs import JobsPage, JobStatus
 
 
 class Client(Connection):
@@ -22,7 +22,7 @@ class Client(Connection):
     pull = pull.pull
     push = uploads.push
 
-    def submit(self, text: str, source: str = "job.yaml", workers: int | None = None) -> RemoteJob:
+    def submit(self, text: str, source: str = "job.yaml", workers: int | None = None) -> JobStatus:
         """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.
 
         A sweep holds that many `workers` of the server while it is running, all of them by default.
@@ -32,22 +32,21 @@ class Client(Connection):
         """
         params = {"source": source} | ({} if workers is None else {"workers": workers})
         options = {"params": params, "content": text.encode()}
-        return RemoteJob.from_json(self.request_object("POST", "/jobs", **options))
+        return self.request_record(JobStatus, "POST", "/jobs", **options)
 
-    def job(self, number: int) -> RemoteJob:
+    def job(self, number: int) -> JobStatus:
         """Return a job; errors as for `request`."""
-        return RemoteJob.from_json(self.request_object("GET", f"/jobs/{number}"))
+        return self.request_record(JobStatus, "GET", f"/jobs/{number}")
 
-    def jobs(self, limit: int = 50, offset: int = 0) -> list[RemoteJob]:
+    def jobs(self, limit: int = 50, offset: int = 0) -> list[JobStatus]:
         """Return jobs, the newest first; errors as for `request`."""
-        page = self.request_object("GET", "/jobs", params={"limit": limit, "offset": offset})
-        return [RemoteJob.from_json(job) for job in page["jobs"]]
+        return self.request_record(JobsPage, "GET", "/jobs", params={"limit": limit, "offset": offset}).jobs
 
-    def cancel(self, number: int) -> RemoteJob:
+    def cancel(self, number: int) -> JobStatus:
         """Cancel a job; what it has recorded stays. Errors as for `request`."""
-        return RemoteJob.from_json(self.request_object("POST", f"/jobs/{number}/cancel"))
+        return self.request_record(JobStatus, "POST", f"/jobs/{number}/cancel")
 
-    def resume(self, number: int, accept_changes: bool = False) -> RemoteJob:
+    def resume(self, number: int, accept_changes: bool = False) -> JobStatus:
         """Resume a failed or cancelled job; errors as for `request`."""
         options = {"params": {"accept_changes": accept_changes}}
-        return RemoteJob.from_json(self.request_object("POST", f"/jobs/{number}/resume", **options))
+        return self.request_record(JobStatus, "POST", f"/jobs/{number}/resume", **options)

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import TypeAdapter
 
@@ -19,6 +19,7 @@ from runner.util.values import Json, JsonView
 if TYPE_CHECKING:
     from runner.client.connection import Connection
 
+JobState = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
 OVER: Final = ("finished", "failed", "cancelled")
 """The states of a job in which nothing more happens unless a user resumes it."""
 
@@ -60,15 +61,15 @@ class RunProgress:
 
     run_id: str
     seed: int
-    run: int
+    run: int = 1
     """The place of the run among those of the job, from 1."""
-    runs: int
-    episode: int
-    episodes: int
+    runs: int = 1
+    episode: int = 0
+    episodes: int = 0
     """Training episodes of the run; 0 of an episode that is played on, whose steps are counted."""
-    train_steps: int
-    eval_steps: int
-    bytes: int
+    train_steps: int = 0
+    eval_steps: int = 0
+    bytes: int = 0
     """Size of its recording."""
     last_evaluation: dict[str, object] | None = None
     """Its episode, and the value of each metric by name; None before the first."""
@@ -106,11 +107,11 @@ class SweepProgress:
 
     done: int
     runs: int
-    running: int
-    pruned: int
-    failed: int
-    bytes: int
-    best: BestTrial | None
+    running: int = 0
+    pruned: int = 0
+    failed: int = 0
+    bytes: int = 0
+    best: BestTrial | None = None
 
     @property
     def share(self) -> float:
@@ -189,42 +190,64 @@ class JobEvent:
 
 
 @dataclass(frozen=True)
-class RemoteJob:
-    """A job on a server."""
+class RunOfJob:
+    """A run that a job has started."""
+
+    seed: int
+    run_id: str
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """A job on a server. Times are in UTC, as ISO 8601; empty if they have not come."""
 
     number: int
     kind: str
     name: str
-    state: str
+    state: JobState
     runs: int
     """Its number of runs."""
     workers: int
     """How many workers of the server it holds while it is running."""
+    created: str
+    started: str
+    ended: str
     error: str
     progress: JobProgress | None
     """Its progress, if it is running and its worker has reported any."""
-    begun: dict[int, str]
-    """The ids of started runs by seed; empty for a sweep, whose runs have the tag sweep=NAME."""
+    begun: list[RunOfJob]
+    """Its started runs; empty for a sweep, whose runs have the tag sweep=NAME."""
 
     @property
     def is_over(self) -> bool:
         """Whether nothing more happens unless a user resumes it."""
         return self.state in OVER
 
-    @classmethod
-    def from_json(cls, response: JsonView) -> RemoteJob:
-        """Return the job in a response.
 
-        Raises:
-            RunnerError: there is none in it.
-        """
-        try:
-            begun = {run["seed"]: run["run_id"] for run in response["begun"]}
-            return TypeAdapter(cls).validate_python({**response, "begun": begun})
-        except (KeyError, TypeError, ValueError) as error:
-            raise RunnerError(
-                "found an unexpected response, expected a job; is it a dualtaxi server?"
-            ) from error
+@dataclass(frozen=True)
+class QueueStatus:
+    """The state of a queue."""
+
+    workers: int
+    """How many processes may train at once."""
+    running: int
+    queued: int
+    free_bytes: int
+    """Free space on the disk of the recordings."""
+    waiting_for: str
+    """Why no further job is started although there is a worker; empty if one would be."""
+
+
+@dataclass(frozen=True)
+class JobsPage:
+    """Some of the jobs, the newest first."""
+
+    jobs: list[JobStatus]
+    total: int
+    """The number of matching jobs."""
+    offset: int
+    limit: int
+    queue: QueueStatus
 
 
 def watch(client: Connection, number: int) -> Iterator[JobEvent]:
@@ -248,7 +271,7 @@ def watch(client: Connection, number: int) -> Iterator[JobEvent]:
                 for event in parse_events(response.iter_lines()):
                     last = event.id or last
                     yield event
-            if RemoteJob.from_json(client.request_object("GET", f"/jobs/{number}")).is_over:
+            if client.request_record(JobStatus, "GET", f"/jobs/{number}").is_over:
                 return
             time.sleep(FIRST_PAUSE)
         except ServerUnavailable as error:

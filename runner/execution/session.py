@@ -44,7 +44,7 @@ from runner.util.arrays import Records
 from runner.util.processes import Stop
 from runner.util.values import Json
 
-REPORT_SECONDS: Final = 0.1
+REPORT_SECONDS: Final = 0.2
 
 
 @dataclass
@@ -246,7 +246,6 @@ class Session:
         if plan.exact:
             self._measure_exactly(metrics)
         self._log(f"evaluation after {episode} episodes: {metrics['success_percent']:.1f} % success")
-        self._report_progress(now=True)
         return True
 
     def _measure(self, topic: schema.Topic, metrics: Message) -> None:
@@ -275,6 +274,7 @@ class Session:
         message = encode_log(text, steps * schema.STEP_NANOSECONDS / 1e9, level)
         if self.recorder.message(schema.LOG_TOPIC, message):
             self._progress.log.append(text)
+        self._report_progress(now=True)
 
     def _report_progress(self, now: bool = False) -> None:
         """Report the progress, at most once in `REPORT_SECONDS` unless `now`."""

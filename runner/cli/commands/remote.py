@@ -25,7 +25,7 @@ from runner.util.values import Json
 if TYPE_CHECKING:
     from runner.client.client import Client
     from runner.client.connection import Report
-    from runner.client.jobs import RemoteJob
+    from runner.client.jobs import JobStatus
     from runner.client.uploads import UploadStatus
 
     Upload = Callable[[Report], dict[str, object]]
@@ -250,7 +250,7 @@ def jobs(limit: int = limit_option(20), server: Server = server_options) -> Repl
     left = ("kind", "name", "state", "progress")
     listed = table("job", *left, "runs", "workers", rows=rows, left=left, shrinking=("name",))
     nothing = Remark("No jobs yet. `dualtaxi remote submit FILE` submits one.")
-    return Reply({"jobs": [_job_as_json(job) for job in newest]}, [listed if newest else nothing])
+    return Reply({"jobs": [dataclasses.asdict(job) for job in newest]}, [listed if newest else nothing])
 
 
 @remote_command.command("watch")
@@ -294,7 +294,7 @@ def resume(
         return _reply(client.resume(number, accept_changes))
 
 
-def _watched(client: Client, number: int) -> RemoteJob:
+def _watched(client: Client, number: int) -> JobStatus:
     """Print the events of a job on stderr until it is over, and return it."""
     from runner.client.jobs import LogEvent, StateEvent
 
@@ -307,15 +307,9 @@ def _watched(client: Client, number: int) -> RemoteJob:
     return client.job(number)
 
 
-def _reply(job: RemoteJob, must_finish: bool = False) -> Reply:
-    runs = "\n".join(f"{run_id}  seed {seed}" for seed, run_id in job.begun.items())
+def _reply(job: JobStatus, must_finish: bool = False) -> Reply:
+    runs = "\n".join(f"{run.run_id}  seed {run.seed}" for run in job.begun)
     title = f"{job.number}  {job.name}, {job.state}"
     rows = {"job": title, "runs": runs or UNKNOWN, "error": job.error}
     is_well = job.state == "finished" or not must_finish
-    return Reply(_job_as_json(job), [rows], exit_code=ExitCode.OK if is_well else ExitCode.DIFFERENT)
-
-
-def _job_as_json(job: RemoteJob) -> dict[str, object]:
-    """Return a job with the keys of the HTTP API."""
-    begun = [{"seed": seed, "run_id": run_id} for seed, run_id in job.begun.items()]
-    return dataclasses.asdict(job) | {"begun": begun}
+    return Reply(dataclasses.asdict(job), [rows], exit_code=ExitCode.OK if is_well else ExitCode.DIFFERENT)

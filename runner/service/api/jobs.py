@@ -12,14 +12,14 @@ from typing import Annotated, Final
 from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from runner.client.jobs import JobEvent, JobProgress
+from runner.client.jobs import JobEvent, JobsPage, JobState, JobStatus
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused, expecting
 from runner.service.jobs.checking import DEFAULT_SOURCE
-from runner.service.jobs.queue import JobQueue, QueueStatus
-from runner.service.jobs.store import CheckedJob, Kind, QueuedJob, State
+from runner.service.jobs.queue import JobQueue
+from runner.service.jobs.store import JobEstimate, QueuedJob
 from runner.service.problems import error_docs, media_docs
 
 POLL_SECONDS: Final = 0.25
@@ -31,49 +31,6 @@ RETRY_MILLISECONDS: Final = 1000
 MAX_WATCHERS: Final = 200
 
 router = APIRouter(tags=["jobs"])
-
-
-class RunOfJob(BaseModel):
-    """A run that a job has started."""
-
-    seed: int
-    run_id: str
-
-
-class JobResponse(BaseModel):
-    """A job and its progress."""
-
-    number: int
-    kind: Kind
-    name: str
-    state: State
-    runs: int = Field(description="Its number of runs.")
-    workers: int = Field(description="The workers that it holds while it is running.")
-    created: str
-    started: str
-    ended: str
-    error: str
-    progress: JobProgress | None = Field(description="As last reported by its worker, while it is running.")
-    begun: list[RunOfJob] = Field(description="Started runs; those of a sweep have the tag sweep=NAME.")
-
-
-class JobsPage(BaseModel):
-    """Some of the jobs, the newest first."""
-
-    jobs: list[JobResponse]
-    total: int = Field(description="The number of matching jobs.")
-    offset: int
-    limit: int
-    queue: QueueStatus
-
-
-class CheckResponse(BaseModel):
-    """The meaning of a text that was checked, but not submitted."""
-
-    kind: Kind
-    name: str
-    runs: int
-    bytes: int = Field(description="The estimated size of its recordings; 0 if unknown.")
 
 
 Number = Annotated[int, Path(ge=1, lt=2**31, description="The number of a job.")]
@@ -119,7 +76,6 @@ Text = Annotated[str, Depends(text_of)]
 @router.post(
     "/jobs",
     status_code=HTTPStatus.CREATED,
-    response_model=JobResponse,
     responses=error_docs(HTTPStatus.CONFLICT),
     openapi_extra=_YAML,
     summary="Submit a configuration or a sweep.",
@@ -131,7 +87,7 @@ async def submit(
     request: Request,
     source: Source = DEFAULT_SOURCE,
     workers: Workers = None,
-) -> JobResponse:
+) -> JobStatus:
     """Check the text, and queue it; each mistake is reported with its line and key."""
     checked = await jobs.checker.check(text, source)  # may take long, so no thread waits for it
     return created(await run_sync(jobs.add, text, checked, workers), request, response)
@@ -139,26 +95,25 @@ async def submit(
 
 @router.post(
     "/jobs/check",
-    response_model=CheckResponse,
     openapi_extra=_YAML,
     summary="Check a configuration or a sweep.",
 )
-async def check(jobs: JobsOf, text: Text, source: Source = DEFAULT_SOURCE) -> CheckedJob:
+async def check(jobs: JobsOf, text: Text, source: Source = DEFAULT_SOURCE) -> JobEstimate:
     """Check the text without queueing it."""
     return await jobs.checker.check(text, source)
 
 
-@router.get("/jobs", response_model=JobsPage, summary="List the jobs, the newest first.")
+@router.get("/jobs", summary="List the jobs, the newest first.")
 def list_jobs(
     jobs: JobsOf,
-    state: Annotated[list[State] | None, Query(description="Only those in one of these states.")] = None,
+    state: Annotated[list[JobState] | None, Query(description="Only those in one of these states.")] = None,
     limit: Annotated[int, Query(ge=0, le=1000)] = 50,
     offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
 ) -> JobsPage:
     """List the jobs, and return the state of the queue."""
     matching = [job for job in reversed(jobs.store.jobs()) if not state or job.state in state]
     return JobsPage(
-        jobs=[job_response(job) for job in matching[offset : offset + limit]],
+        jobs=[job.status() for job in matching[offset : offset + limit]],
         total=len(matching),
         offset=offset,
         limit=limit,
@@ -168,13 +123,12 @@ def list_jobs(
 
 @router.get(
     "/jobs/{number}",
-    response_model=JobResponse,
     responses=error_docs(HTTPStatus.NOT_FOUND),
     summary="One job.",
 )
-def one(jobs: JobsOf, number: Number) -> JobResponse:
+def one(jobs: JobsOf, number: Number) -> JobStatus:
     """Return a job."""
-    return job_response(jobs.store.job(number))
+    return jobs.store.job(number).status()
 
 
 @router.get(
@@ -190,18 +144,16 @@ def submitted(jobs: JobsOf, number: Number) -> Response:
 
 @router.post(
     "/jobs/{number}/cancel",
-    response_model=JobResponse,
     responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Cancel a job; what it has recorded is kept.",
 )
-def cancel(jobs: JobsOf, number: Number) -> JobResponse:
+def cancel(jobs: JobsOf, number: Number) -> JobStatus:
     """Cancel a job; its worker closes its recording."""
-    return job_response(jobs.cancel(number))
+    return jobs.cancel(number).status()
 
 
 @router.post(
     "/jobs/{number}/resume",
-    response_model=JobResponse,
     responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Resume a job that failed or was cancelled.",
 )
@@ -211,9 +163,9 @@ def resume(
     accept_changes: Annotated[
         bool, Query(description="Resume runs that were started by other code.")
     ] = False,
-) -> JobResponse:
+) -> JobStatus:
     """Queue a job again: it continues where it stopped, and ends as if it never had."""
-    return job_response(jobs.resume(number, accept_changes))
+    return jobs.resume(number, accept_changes).status()
 
 
 @router.get(
@@ -285,14 +237,7 @@ def _as_text(event: JobEvent) -> str:
     return f"{head}event: {event.kind}\ndata: {json.dumps(event.as_json(), ensure_ascii=False)}\n\n"
 
 
-def created(job: QueuedJob, request: Request, response: Response) -> JobResponse:
+def created(job: QueuedJob, request: Request, response: Response) -> JobStatus:
     """Return the response about a new job, with its address in the header `location`."""
     response.headers["location"] = f"{request.app.url_path_for('list_jobs')}/{job.number}"
-    return job_response(job)
-
-
-def job_response(job: QueuedJob) -> JobResponse:
-    """Return the response about a job."""
-    begun = [{"seed": seed, "run_id": run_id} for seed, run_id in job.started_runs.items()]
-    progress = job.progress if job.state == "running" else None
-    return JobResponse.model_validate(vars(job) | {"progress": progress, "begun": begun})
+    return job.status()

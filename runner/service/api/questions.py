@@ -7,9 +7,10 @@ from http import HTTPStatus
 from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
 
+from runner.client.jobs import JobStatus
 from runner.config.document import write_yaml
 from runner.runs.run import Run
-from runner.service.api.jobs import JobResponse, created
+from runner.service.api.jobs import created
 from runner.service.dependencies import JobsOf, RecordedRun, require_written
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
@@ -23,12 +24,11 @@ router = APIRouter(tags=["jobs"], responses=RUN_ERRORS)
 @router.post(
     "/runs/{run}/branch",
     status_code=HTTPStatus.CREATED,
-    response_model=JobResponse,
     summary="Branch the training of a run: another action at a step, or other settings from it on.",
 )
 async def branch(
     run: RecordedRun, jobs: JobsOf, sent: BranchQuestion, request: Request, response: Response
-) -> JobResponse:
+) -> JobStatus:
     """Queue a branch of training, as `dualtaxi branch` records it; of a run that was trained here."""
     job = await queue_branch(run, jobs, sent)
     return created(job, request, response)
@@ -37,10 +37,9 @@ async def branch(
 @router.post(
     "/explanations",
     status_code=HTTPStatus.CREATED,
-    response_model=JobResponse,
     summary="Find which settings make the difference between two runs or configurations.",
 )
-async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, response: Response) -> JobResponse:
+async def explain(jobs: JobsOf, sent: ExplainQuestion, request: Request, response: Response) -> JobStatus:
     """Queue an explanation, as `dualtaxi explain` computes it."""
     job = await queue_explanation(jobs, sent)
     return created(job, request, response)

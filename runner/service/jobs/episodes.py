@@ -25,18 +25,7 @@ def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
     def report(steps: int) -> None:
         if channel.stop():
             raise KeyboardInterrupt
-        progress = RunProgress(
-            run_id=run_id,
-            seed=seed,
-            run=1,
-            runs=1,
-            episode=0,
-            episodes=0,
-            train_steps=steps,
-            eval_steps=0,
-            bytes=0,
-        )
-        channel.send(progress)
+        channel.send(RunProgress(run_id, seed, train_steps=steps))
 
     if not (spec.recordings / run_id).is_dir():
         task = EpisodeBranch(

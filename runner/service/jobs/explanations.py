@@ -87,7 +87,7 @@ def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
 
     def report(done: int, total: int, what: str) -> None:
         if what == RUNS:
-            channel.send(SweepProgress(done, total, 0, 0, 0, 0, None))
+            channel.send(SweepProgress(done, total))
         elif what not in stages:
             stages.add(what)
             channel.send(LogEvent(LINES[what]))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from runner.client.jobs import LogEvent
+from runner.client.jobs import LogEvent, QueueStatus
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
 from runner.service.errors import JobStateConflict
@@ -14,20 +13,6 @@ from runner.service.jobs.checking import JobChecker
 from runner.service.jobs.store import CheckedJob, JobStore, QueuedJob, now
 from runner.service.jobs.workers import WorkerPool
 from runner.util.humanize import size
-
-
-@dataclass(frozen=True)
-class QueueStatus:
-    """The state of the queue."""
-
-    workers: int
-    """How many processes may train at once."""
-    running: int
-    queued: int
-    free_bytes: int
-    """Free space on the disk of the recordings."""
-    waiting_for: str
-    """Why no further job is started although there is a worker; empty if one would be."""
 
 
 class JobQueue:

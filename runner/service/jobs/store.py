@@ -23,7 +23,17 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import TypeAdapter
 
-from runner.client.jobs import OVER, JobEvent, JobProgress, LogEvent, RunEvent, StateEvent
+from runner.client.jobs import (
+    OVER,
+    JobEvent,
+    JobProgress,
+    JobState,
+    JobStatus,
+    LogEvent,
+    RunEvent,
+    RunOfJob,
+    StateEvent,
+)
 from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
@@ -35,7 +45,6 @@ if TYPE_CHECKING:
     from filelock import FileLock
 
 Kind = Literal["config", "sweep", "branch", "episode", "explain"]
-State = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
 
 FOLDER: Final = ".jobs"
 LOCK_FILE: Final = f"{FOLDER}/queue.lock"
@@ -51,14 +60,20 @@ EVENTS_PER_READ: Final = 2000
 
 
 @dataclass(frozen=True)
-class CheckedJob:
-    """The meaning of a submitted text, or of a question about runs."""
+class JobEstimate:
+    """What a submitted text, or a question about runs, will make."""
 
     kind: Kind
     name: str
     runs: int
     bytes: int
     """The estimated size of its recordings; 0 if unknown."""
+
+
+@dataclass(frozen=True)
+class CheckedJob(JobEstimate):
+    """The meaning of a submitted text, or of a question about runs."""
+
     values: dict[str, object]
     """The configuration, the sweep or the question, every value present."""
     seeds: tuple[int, ...] = ()
@@ -78,7 +93,7 @@ class QueuedJob:
     created: str
     workers: int = 1
     """How many workers it holds while it is running."""
-    state: State = "queued"
+    state: JobState = "queued"
     started: str = ""
     ended: str = ""
     error: str = ""
@@ -107,8 +122,15 @@ class QueuedJob:
         """The ids of its started runs by seed."""
         return dict(sorted(islice(self.run_ids.items(), self.begun)))
 
+    def status(self) -> JobStatus:
+        """Return the job as clients see it."""
+        progress = self.progress if self.state == "running" else None
+        begun = [RunOfJob(*run) for run in self.started_runs.items()]
+        return _STATUS.validate_python(vars(self) | {"progress": progress, "begun": begun})
+
 
 _STORED: Final = TypeAdapter(QueuedJob)
+_STATUS: Final = TypeAdapter(JobStatus)
 
 
 class JobStore:

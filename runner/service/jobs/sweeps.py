@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import time
+from collections.abc import Callable
 from functools import partial
 
 from runner.client.jobs import BestTrial, LogEvent, SweepProgress
 from runner.errors import RunnerError
 from runner.service.jobs.channel import (
     OTHER_OWNER_SECONDS,
-    REPORT_SECONDS,
     JobChannel,
     JobSpec,
     until_free,
@@ -20,6 +18,7 @@ from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.running import SweepStatus
 from runner.sweep.whole import run_whole_sweep
+from runner.util.values import finite
 
 
 def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
@@ -30,7 +29,6 @@ def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
 def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
     sweep, recordings = from_values(spec.values()), spec.recordings
     wait_for_owners(state.runs_of(sweep.name, recordings).values(), channel.stop)
-    reporter = _SweepReporter(channel)
     _, status = run_whole_sweep(
         sweep,
         recordings,
@@ -40,39 +38,28 @@ def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
         retry_failed=spec.job.retry,
         accept_changes=spec.job.accept_changes,
         stop=channel.stop,
-        report=reporter.report,
+        report=_reporter(channel),
     )
-    reporter.send(status)
     if status.stopped:
         raise RunnerError(f"stopped: {status.stopped}")
     if status.failed:
         raise RunnerError(f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
 
 
-class _SweepReporter:
-    """Sends a sweep's progress a few times a second, and each trial that is the best one yet."""
+def _reporter(channel: JobChannel) -> Callable[[SweepStatus], None]:
+    """Return the function that sends a sweep's progress, and each trial that is the best one yet."""
+    last = -1
 
-    def __init__(self, channel: JobChannel) -> None:
-        self._channel = channel
-        self._sent, self._best = 0.0, -1
-
-    def report(self, status: SweepStatus) -> None:
-        """Accept the sweep's progress."""
-        if time.monotonic() - self._sent >= REPORT_SECONDS:
-            self._sent = time.monotonic()
-            self.send(status)
-
-    def send(self, status: SweepStatus) -> None:
-        """Send the sweep's progress."""
+    def report(status: SweepStatus) -> None:
+        nonlocal last
         best, shown = status.best, None
         if best is not None:
-            if best.number != self._best:
-                self._best = best.number
-                self._channel.send(LogEvent(f"trial {best.number} is the best so far: {best.value:g}"))
+            if best.number != last:
+                last = best.number
+                channel.send(LogEvent(f"trial {best.number} is the best so far: {best.value:g}"))
             # A level that was never reached is infinite or None; JSON has no infinity.
-            value = best.value if best.value is not None and math.isfinite(best.value) else None
-            shown = BestTrial(best.number, value, best.values)
-        progress = SweepProgress(
+            shown = BestTrial(best.number, finite(best.value), best.values)
+        event = SweepProgress(
             done=status.done,
             runs=status.runs,
             running=status.running,
@@ -81,4 +68,6 @@ class _SweepReporter:
             bytes=status.bytes,
             best=shown,
         )
-        self._channel.send(progress)
+        channel.send(event)
+
+    return report

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-import time
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Final
@@ -16,11 +15,11 @@ from runner.config.job import Job
 from runner.errors import RunnerError, full_message
 from runner.execution.branching import train_branch
 from runner.execution.resume import resume
-from runner.execution.session import Progress, evaluation_brief, run_job
+from runner.execution.session import Progress, Report, evaluation_brief, run_job
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.run import Run, create_run
-from runner.service.jobs.channel import REPORT_SECONDS, JobChannel, JobSpec, wait_for_owners
+from runner.service.jobs.channel import JobChannel, JobSpec, wait_for_owners
 from runner.service.jobs.cluster import do_on_cluster
 from runner.service.jobs.episodes import parent_in, run_episode_job
 from runner.service.jobs.explanations import run_explain_job
@@ -93,20 +92,19 @@ def run_seed(spec: JobSpec, channel: JobChannel, config: ExperimentConfig, seed:
         return run.status
     if run is not None:
         wait_for_owners([run], channel.stop)
-        reporter = Reporter(channel, run.run_id, config, seed)
-        run = resume(run, spec.job.accept_changes, reporter.report, channel.stop)
+        report = _reporter(channel, run.run_id, config, seed)
+        run = resume(run, spec.job.accept_changes, report, channel.stop)
     else:
         job = Job(config, seed)
         parent = parent_in(spec, job.config.branches[-1].run) if spec.job.kind == "branch" else None
         run = create_run(spec.recordings, config, seed, spec.job.name, spec.job.run_ids[seed], parent)
-        reporter = Reporter(channel, run.run_id, config, seed)
-        reporter.report(Progress(config.episodes))  # the next one follows when training begins
+        report = _reporter(channel, run.run_id, config, seed)
+        report(Progress(config.episodes))  # the next one follows when training begins
         if parent is None:
-            run = run_job(job, run, reporter.report, channel.stop)
+            run = run_job(job, run, report, channel.stop)
         else:
             with open_recording(parent.recording) as recording:
-                run = train_branch(recording, job, run, reporter.report, channel.stop)
-    reporter.end()
+                run = train_branch(recording, job, run, report, channel.stop)
     return run.status
 
 
@@ -118,35 +116,20 @@ def _existing_run(folder: Path) -> Run | None:
     return None
 
 
-class Reporter:
-    """Sends a run's progress, a few times a second, and each line of its log."""
+def _reporter(channel: JobChannel, run_id: str, config: ExperimentConfig, seed: int) -> Report:
+    """Return the function that sends the progress of a run, and each line of its log."""
+    sent = 0
 
-    def __init__(self, channel: JobChannel, run_id: str, config: ExperimentConfig, seed: int) -> None:
-        self._channel = channel
-        self._run_id, self._seed, self._seeds = run_id, seed, config.seeds
-        self._sent, self._logged = 0.0, 0
-        self._progress: Progress | None = None
-        channel.send(RunEvent(run_id, seed))
-
-    def report(self, progress: Progress) -> None:
-        """Accept the run's progress."""
-        self._progress = progress
-        if time.monotonic() - self._sent >= REPORT_SECONDS:
-            self._sent = time.monotonic()
-            self.end()
-
-    def end(self) -> None:
-        """Send what has not been sent yet."""
-        if (progress := self._progress) is None:
-            return
-        for text in progress.log[self._logged :]:
-            self._channel.send(LogEvent(text[:MAX_TEXT], self._run_id, self._seed))
-        self._logged = len(progress.log)
-        sent = RunProgress(
-            run_id=self._run_id,
-            seed=self._seed,
-            run=self._seeds.index(self._seed) + 1,
-            runs=len(self._seeds),
+    def report(progress: Progress) -> None:
+        nonlocal sent
+        for text in progress.log[sent:]:
+            channel.send(LogEvent(text[:MAX_TEXT], run_id, seed))
+        sent = len(progress.log)
+        event = RunProgress(
+            run_id,
+            seed,
+            run=config.seeds.index(seed) + 1,
+            runs=len(config.seeds),
             episode=progress.episode,
             episodes=progress.episodes,
             train_steps=progress.train_steps,
@@ -154,4 +137,7 @@ class Reporter:
             bytes=progress.bytes_written,
             last_evaluation=evaluation_brief(progress.evaluations[-1]) if progress.evaluations else None,
         )
-        self._channel.send(sent)
+        channel.send(event)
+
+    channel.send(RunEvent(run_id, seed))
+    return report

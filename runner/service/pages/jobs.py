@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query, Response
 
 from runner.debugging.explanation_files import explanations_in
 from runner.service.addresses import Paging
-from runner.service.api.jobs import Number, job_response
+from runner.service.api.jobs import Number
 from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
@@ -48,7 +48,7 @@ def job(jobs: JobsOf, number: Number) -> Response:
     is_answered = own_job.kind == "explain" and own_job.is_over
     answers = explanations_in(jobs.recordings) if is_answered else []
     values = {
-        "job": job_response(own_job),
+        "job": own_job.status(),
         "log": events,
         "place": place,  # the id of the last event in the log
         "submitted": jobs.store.submitted(number),
@@ -77,7 +77,7 @@ def _rows(jobs: JobQueue, number: int) -> dict[str, object]:
     """Return a page of the table of jobs."""
     newest_first = list(reversed(jobs.store.jobs()))
     return {
-        "jobs": [job_response(job) for job in newest_first[(number - 1) * ROWS : number * ROWS]],
+        "jobs": [job.status() for job in newest_first[(number - 1) * ROWS : number * ROWS]],
         "status": jobs.status(),
         "is_active": any(job.state in ("queued", "running") for job in newest_first),
         "paging": Paging(number, len(newest_first), ROWS, "/queue"),

@@ -19,7 +19,6 @@ from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
 from runner.service import sweep_fragments
 from runner.service.addresses import link
-from runner.service.api.jobs import job_response
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
 from runner.service.pages.rendering import Page, message_of
@@ -93,7 +92,7 @@ async def sweep(
             "name": name,
             "runs": state.runs,
             "runs_address": link("/runs", query),
-            "job": job_response(own[-1]) if own else None,
+            "job": own[-1].status() if own else None,
             "parts": parts,
         }
 

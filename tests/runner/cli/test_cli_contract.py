@@ -20,7 +20,7 @@ import runner
 from runner.cli import cli
 from runner.cli.commands import remote
 from runner.cli.parameter_types import RunName
-from runner.client.jobs import RemoteJob
+from runner.client.jobs import JobStatus, RunOfJob
 from runner.errors import ExitCode
 from runner.recording.rewriting import rewrite
 from runner.runs.resolve import find_run
@@ -105,7 +105,7 @@ WORDS = {
 """What is typed after a command; nothing for the others."""
 HOSTILE = "a\x1b]0;owned\x1b\\\x9b31m\x7f\u202eb"
 """Sets the title of a terminal, begins a red text, and turns the direction of writing."""
-JOB = RemoteJob(1, "config", "tiny", "finished", 1, 1, "", None, {3: "k3v9m2xq"})
+JOB = JobStatus(1, "config", "tiny", "finished", 1, 1, "", "", "", "", None, [RunOfJob(3, "k3v9m2xq")])
 
 
 def always_left(content, *spaces):

@@ -14,7 +14,7 @@ from submitted import ENDLESS, ICY
 from runner.cli import cli
 from runner.client.client import Client
 from runner.client.connection import ServerError
-from runner.client.jobs import BestTrial, JobEvent, LogEvent, RemoteJob, SweepProgress, parse_events
+from runner.client.jobs import BestTrial, JobEvent, LogEvent, SweepProgress, parse_events
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
 
@@ -69,7 +69,7 @@ def test_jobs_are_submitted_listed_cancelled_and_resumed(tmp_path):
         assert last.kind == "state"
         assert last.data.state == "finished"
         done = client.job(second.number)
-        assert sorted(done.begun.values()) == sorted(
+        assert sorted(run.run_id for run in done.begun) == sorted(
             run.run_id for run in list_runs(tmp_path) if run.status == "finished"
         )
         assert client.resume(first.number).state == "queued"
@@ -83,11 +83,6 @@ def test_events_are_parsed_without_an_incomplete_last_one():
     lines = ["retry: 1000", "", ": still here", "", "id: 7", "event: log", 'data: {"text": "a: b"}', ""]
     cut_off = ["id: 9", "event: state", 'data: {"sta']
     assert list(parse_events([*lines, *cut_off])) == [JobEvent(LogEvent("a: b"), "7")]
-
-
-def test_a_response_without_a_job_is_reported():
-    with pytest.raises(RunnerError, match="found an unexpected response"):
-        RemoteJob.from_json({"number": 1})
 
 
 @pytest.mark.parametrize(
