@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from pydantic import ValidationError
@@ -12,7 +13,7 @@ from runner.config.document import Document, Place, Problem
 from runner.config.model import SECTION_OF
 from runner.config.schema import Schema, choices_of, expected, keys_of, schema_at
 from runner.config.values import REFUSED, Path, value_at
-from runner.errors import ConfigError, ConfigProblem, nearest, shortened
+from runner.errors import ConfigError, ConfigProblem, RunnerError, nearest, shortened
 
 _LONGEST = 60
 _MOST = 200
@@ -87,6 +88,15 @@ def refuse(problems: Sequence[Problem], document: Document) -> ConfigError:
         for place, problem in placed[:_MOST]
     )
     return ConfigError("\n".join(lines), tuple(located))
+
+
+@contextlib.contextmanager
+def problems_at(key: Path, document: Document, *kinds: type[RunnerError]) -> Iterator[None]:
+    """Raise an error of these kinds in the block as a problem of a key, with its line."""
+    try:
+        yield
+    except kinds as error:
+        raise refuse([Problem(key, str(error))], document) from None
 
 
 def found(value: object) -> str:  # noqa: PLR0911 - one line a kind

@@ -133,14 +133,18 @@ def ask(
     seeds: int,
     recordings: Path,
     trust: bool = False,
+    require: Callable[[ExperimentConfig], None] = lambda _: None,
 ) -> Question:
-    """Return what is to be explained; arguments and errors as for `explain`."""
+    """Return what is to be explained; arguments and errors as for `explain`.
+
+    `require` is called with each configuration before anything is read that it names; it may refuse.
+    """
     if not 1 <= seeds <= MAX_SEEDS:
         raise RunnerError(f"seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
     if at is not None and at < 1:
         raise RunnerError(f"at: found {at}, expected a number of training episodes from 1 on.")
     (side_a, config_a, first), (side_b, config_b, other) = (
-        _resolved(source, recordings, trust) for source in (a, b)
+        _resolved(source, recordings, trust, require) for source in (a, b)
     )
     mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
     notes = list(mixing.notes)
@@ -222,7 +226,9 @@ def answer(
         lock.release()
 
 
-def _resolved(source: Source, recordings: Path, trust: bool) -> tuple[Side, ExperimentConfig, int]:
+def _resolved(
+    source: Source, recordings: Path, trust: bool, require: Callable[[ExperimentConfig], None]
+) -> tuple[Side, ExperimentConfig, int]:
     """Return a name, the configuration and the seed of a run or a configuration.
 
     Raises:
@@ -246,6 +252,7 @@ def _resolved(source: Source, recordings: Path, trust: bool) -> tuple[Side, Expe
                 )
                 raise RunNotFound(f"{error} There is no configuration of this name either.{hint}") from error
     if isinstance(source, ExperimentConfig):
+        require(source)
         return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
     require_trained(
         source,
@@ -256,6 +263,7 @@ def _resolved(source: Source, recordings: Path, trust: bool) -> tuple[Side, Expe
     )
     require_may_train(source.recording, source.file.config, trust)
     config = from_mapping(source.file.config)
+    require(config)
     return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
 
 

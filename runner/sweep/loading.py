@@ -15,7 +15,7 @@ from runner.config import ConfigError, ExperimentConfig, load
 from runner.config.document import Document, Place, Problem, read_yaml, write_yaml
 from runner.config.loading import experiment_in, put, read_text
 from runner.config.model import SECTION_OF
-from runner.config.problems import found, problems_in, refuse
+from runner.config.problems import found, problems_at, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
 from runner.errors import CannotRedo, EnvironmentNotUsable
@@ -26,7 +26,7 @@ MAX_NAME: Final = 50
 _LEARNERS: Final = {"mode", "tables", "rewards"}
 _MAX_COMBINATIONS: Final = 64
 """Maximum number of combinations tried to find values that are valid together."""
-Require = Callable[[str, Mapping[str, object]], None]
+Require = Callable[[ExperimentConfig], None]
 
 
 def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
@@ -44,10 +44,13 @@ def from_text(text: str, source: str, require: Require = lambda *_: None) -> Swe
     """Return the sweep that the text of a file describes, which cannot name another file as its base.
 
     `source` is the file's name, for messages and as the default name of the sweep; errors as of `load_sweep`.
-    `require` is called with the id and the arguments of each environment, before it is made; it may refuse.
+    `require` is called with the base, and with experiments before their environments are made; it may refuse.
     """
     document = read_yaml(text, source)
-    return _with_checked_parameters(_sweep(document, None, Path(source).stem, None), document, require)
+    sweep = _sweep(document, None, Path(source).stem, None)
+    with problems_at(("base",), document, CannotRedo, ConfigError):
+        require(sweep.base)
+    return _with_checked_parameters(sweep, document, require)
 
 
 def from_values(values: Mapping[str, object]) -> Sweep:
@@ -164,13 +167,19 @@ def _places(places: Mapping[tuple[str, ...], Place], key: str) -> dict[tuple[str
 
 def _with_checked_parameters(sweep: Sweep, document: Document, require: Require = lambda *_: None) -> Sweep:
     """Return the sweep; try every bound and choice of each parameter, with values of the others that fit."""
+    from runner.environments.loading import load_mdp
+
     errors = []
     for path, parameter in sweep.file.parameters.items():
         for number, sample in enumerate(_samples(parameter)):
             try:
                 experiment = _valid_experiment(sweep, path, sample, document)
-                if number == 0 or path.split(".")[0] == "env":
-                    _check_environment(experiment, path, document, require)
+                if number == 0 or path.split(".")[0] in ("env", "initial_q"):
+                    with problems_at(
+                        ("parameters", path), document, CannotRedo, ConfigError, EnvironmentNotUsable
+                    ):
+                        require(experiment)
+                        load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)
             except ConfigError as error:
                 errors.append(error)
     if errors:
@@ -212,13 +221,3 @@ def _experiment(sweep: Sweep, values: Mapping[str, object], document: Document) 
         ],
     )
     return experiment_in(within, (), sweep.name, named_by=repr(sweep.name))
-
-
-def _check_environment(experiment: ExperimentConfig, path: str, document: Document, require: Require) -> None:
-    from runner.environments.loading import load_mdp
-
-    try:
-        require(experiment.env.id, experiment.env.kwargs)
-        load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)
-    except (CannotRedo, EnvironmentNotUsable) as error:
-        raise refuse([Problem(("parameters", path), str(error))], document) from None

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, ParamSpec
 
@@ -17,7 +17,8 @@ from runner.analysis.episodes import EpisodeRef
 from runner.config import ExperimentConfig, from_mapping, from_text
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import MAX_BYTES
-from runner.config.problems import refuse
+from runner.config.problems import problems_at, refuse
+from runner.config.sections import RunTable
 from runner.environments.gym_types import Space
 from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
@@ -78,35 +79,25 @@ def check(text: str, source: str, recordings: Path) -> CheckedJob:
 
 def _check_config(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
     config = from_text(text, source)
-    _refuse_paths({("initial_q",): document.value.get("initial_q")}, document)
-    with _problems_at(("env",), document):
+    with problems_at(("env",), document, RunnerError):
         require_listed(config.env.id, config.env.kwargs)
         load_mdp(config.env.id, config.env.kwargs, config.rewards)
-    with _problems_at(("initial_q",), document):
+    with problems_at(("initial_q",), document, RunnerError):
+        refuse_path(config)
         config = resolve_initial_q(config, recordings)
     limit, seeds = step_limit(config), len(config.seeds)
     size = estimate(config, limit).typical_bytes * seeds if limit else 0
     return CheckedJob("config", config.name, seeds, size, config.to_mapping(), config.seeds)
 
 
-@contextlib.contextmanager
-def _problems_at(key: tuple[str, ...], document: Document) -> Iterator[None]:
-    """Raise an error of the block as a problem of a key, with its line."""
-    try:
-        yield
-    except RunnerError as error:
-        raise refuse([Problem(key, str(error))], document) from None
-
-
 def _check_sweep(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
     require_optuna()
-    sweep = sweep_from_text(text, source, require_listed)
-    base, parameters = document.value["base"], document.value["parameters"]
-    starts: dict[tuple[str | int, ...], object] = {("base", "initial_q"): base.get("initial_q")}
-    for path, choices in parameters.items():
-        if path.split(".")[0] == "initial_q" and isinstance(choices, list):
-            starts |= {("parameters", path, i): choice for i, choice in enumerate(choices)}
-    _refuse_paths(starts, document)
+
+    def require(experiment: ExperimentConfig) -> None:
+        require_listed(experiment.env.id, experiment.env.kwargs)
+        refuse_path(experiment)
+
+    sweep = sweep_from_text(text, source, require)
     values, runs = sweep.to_mapping(), Search(sweep).trials * len(sweep.seeds)
     if sweep.name in sweeps_in(recordings):
         before = state.read_sweep(sweep.name, recordings).to_mapping()
@@ -116,16 +107,11 @@ def _check_sweep(text: str, source: str, document: Document, recordings: Path) -
     return CheckedJob("sweep", sweep.name, runs, 0, values)
 
 
-def _refuse_paths(starts: Mapping[tuple[str | int, ...], object], document: Document) -> None:
+def refuse_path(config: ExperimentConfig) -> None:
     """Refuse an initial Q-table that is named by the path of its recording."""
-    problems = []
-    for where, start in starts.items():
-        run = start.get("run") if isinstance(start, Mapping) else start
-        if isinstance(run, str) and is_path(run):
-            place = (*where, "run") if isinstance(start, Mapping) else where
-            problems.append(Problem(place, f"found the path {run!r}, expected the id or name of a run here"))
-    if problems:
-        raise refuse(problems, document)
+    start = config.initial_q
+    if isinstance(start, RunTable) and is_path(start.run):
+        raise ConfigError(f"initial_q: found the path {start.run!r}, expected the id or name of a run here.")
 
 
 def is_path(name: str) -> bool:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -11,7 +9,6 @@ from typing import Final
 from pydantic import BaseModel, Field
 
 from runner.client.jobs import LogEvent, SweepProgress
-from runner.config.shipped import shipped
 from runner.debugging.explain import (
     DEFAULT_SEEDS,
     EPISODES,
@@ -24,10 +21,9 @@ from runner.debugging.explain import (
 )
 from runner.debugging.explanation import summary
 from runner.debugging.mixtures import Measurement, MixtureResult
-from runner.errors import ConfigError, RunNotFound
-from runner.runs.resolve import find_run
+from runner.errors import ConfigError
 from runner.service.jobs.channel import JobChannel, JobSpec, until_free
-from runner.service.jobs.checking import MAX_RUNS, is_path
+from runner.service.jobs.checking import MAX_RUNS, is_path, refuse_path
 from runner.service.jobs.store import CheckedJob
 from runner.sweep.cluster import worker_pool
 from runner.sweep.local import Workers
@@ -58,7 +54,6 @@ def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
             raise ConfigError(
                 f"{name}: found the path {source!r}, expected a run here or a shipped configuration."
             )
-        _refuse_initial_path(source, recordings)
     question = _question(given, recordings)
     check_metric(question)
     runs = question.mixtures[1] * given.seeds
@@ -66,18 +61,6 @@ def check_explanation(given: ExplainQuestion, recordings: Path) -> CheckedJob:
         raise ConfigError(f"seeds: makes {runs:,} runs, expected at most {MAX_RUNS:,} in a job.")
     sides = {"a": question.a.run_id or question.a.name, "b": question.b.run_id or question.b.name}
     return CheckedJob("explain", question.name, runs, 0, given.model_dump() | sides)
-
-
-def _refuse_initial_path(source: str, recordings: Path) -> None:
-    """Refuse a run whose configuration names a recording by its path, before that is read."""
-    experiment = shipped().get(source)
-    if experiment is not None and experiment.kind == "experiment":
-        return  # it is meant, not a run of this name
-    with contextlib.suppress(RunNotFound):  # reported later
-        start = find_run(source, recordings).file.config.get("initial_q")
-        run = start.get("run") if isinstance(start, Mapping) else None
-        if isinstance(run, str) and is_path(run):
-            raise ConfigError(f"initial_q: found the path {run!r}, expected the id of a run here.")
 
 
 def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
@@ -105,4 +88,12 @@ def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
 
 
 def _question(given: ExplainQuestion, recordings: Path) -> Question:
-    return ask(given.a, given.b, metric=given.metric, at=given.at, seeds=given.seeds, recordings=recordings)
+    return ask(
+        given.a,
+        given.b,
+        metric=given.metric,
+        at=given.at,
+        seeds=given.seeds,
+        recordings=recordings,
+        require=refuse_path,
+    )
