@@ -28,7 +28,7 @@ from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
 from runner.service.pictures import PictureStreams
-from runner.service.problems import add_error_handlers, error_docs, known_query
+from runner.service.problems import ERROR_DOCS, add_error_handlers, known_query
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
@@ -102,20 +102,9 @@ def create_app(settings: ServiceSettings) -> FastAPI:
 def _routes() -> list[BaseRoute]:
     """Return the routes of every application of this process: FastAPI takes half a second to analyse them."""
     whole = APIRouter()
-    general = error_docs(
-        HTTPStatus.BAD_REQUEST,
-        HTTPStatus.UNAUTHORIZED,
-        HTTPStatus.FORBIDDEN,
-        HTTPStatus.REQUEST_TIMEOUT,
-        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-        HTTPStatus.MISDIRECTED_REQUEST,
-        HTTPStatus.UNPROCESSABLE_ENTITY,
-        HTTPStatus.TOO_MANY_REQUESTS,
-        HTTPStatus.INSUFFICIENT_STORAGE,
-    )
     parts = (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads)
     for router in (*(part.router for part in parts), views.api, queries.api):
-        whole.include_router(router, prefix=API, responses=general, dependencies=[Depends(known_query)])
+        whole.include_router(router, prefix=API, responses=ERROR_DOCS, dependencies=[Depends(known_query)])
     for router in (health, login.router, views.pages, queries.pages, pages.router):
         whole.include_router(router)
     return whole.routes

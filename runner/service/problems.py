@@ -103,15 +103,25 @@ class ErrorResponse(BaseModel):
     error: ErrorBody
 
 
-def error_docs(*statuses: HTTPStatus) -> dict[int | str, dict[str, object]]:
-    """Return the OpenAPI documentation of a route's errors."""
-    return {int(status): {"model": ErrorResponse, "description": status.phrase} for status in statuses}
-
-
-RUN_ERRORS: Final = error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
-"""The errors of every route of a run."""
-BUSY_ERRORS: Final = error_docs(HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.NOT_IMPLEMENTED)
-"""Further errors of work in a child process."""
+ERROR_DOCS: Final[dict[int | str, dict[str, object]]] = {
+    int(status): {"model": ErrorResponse, "description": status.phrase}
+    for status in (
+        HTTPStatus.BAD_REQUEST,
+        HTTPStatus.UNAUTHORIZED,
+        HTTPStatus.FORBIDDEN,
+        HTTPStatus.NOT_FOUND,
+        HTTPStatus.REQUEST_TIMEOUT,
+        HTTPStatus.CONFLICT,
+        HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+        HTTPStatus.MISDIRECTED_REQUEST,
+        HTTPStatus.UNPROCESSABLE_ENTITY,
+        HTTPStatus.TOO_MANY_REQUESTS,
+        HTTPStatus.NOT_IMPLEMENTED,
+        HTTPStatus.SERVICE_UNAVAILABLE,
+        HTTPStatus.INSUFFICIENT_STORAGE,
+    )
+}
+"""The OpenAPI documentation of the errors of every route of the API."""
 
 
 def media_docs(*media: str) -> dict[int | str, dict[str, object]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Hashable
 from functools import partial
-from http import HTTPStatus
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
@@ -18,7 +17,6 @@ from runner.service import computed
 from runner.service.addresses import link
 from runner.service.dependencies import json_response
 from runner.service.pages.rendering import Page
-from runner.service.problems import error_docs
 
 MAX_PICTURES: Final = 24
 """The most hits that a page shows pictures of."""
@@ -58,7 +56,6 @@ SearchOf = Annotated[EpisodeQuestion, Query()]
 @api.get(
     "/sql",
     response_model=QueryResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.SERVICE_UNAVAILABLE),
     summary="Ask the runs, and every step of them, in SQL.",
 )
 async def sql(request: Request, query: Sql, runs: Runs = "") -> Response:
@@ -69,7 +66,6 @@ async def sql(request: Request, query: Sql, runs: Runs = "") -> Response:
 @api.get(
     "/find",
     response_model=dict[str, object],
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.SERVICE_UNAVAILABLE),
     summary="Find the episodes of all runs that match an expression.",
 )
 async def find(request: Request, search: SearchOf) -> Response:

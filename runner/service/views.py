@@ -18,14 +18,13 @@ from runner.service.addresses import link
 from runner.service.api.replay import OCTETS
 from runner.service.dependencies import Computation, ComputationOf, RecordedRun
 from runner.service.pages.frame import RunPage, StatusName, installed_names
-from runner.service.problems import RUN_ERRORS, error_docs, filled, media_docs, status_of
+from runner.service.problems import filled, media_docs, status_of
 from runner.views import VIEWS, view_named
 from runner.views.view import Given, Input, View
 
 api = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
-    responses=RUN_ERRORS | error_docs(HTTPStatus.SERVICE_UNAVAILABLE),
 )
 pages = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 

@@ -20,13 +20,12 @@ from runner.service.api.reading import SVG, AxisOf
 from runner.service.catalogue import Catalogue
 from runner.service.computed import CurveOptions, Curves, FigureOptions
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
-from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
+from runner.service.problems import media_docs
 from runner.service.settings import ServiceSettings
 from runner.util.values import finite
 
 router = APIRouter(
     tags=["comparing"],
-    responses=RUN_ERRORS | BUSY_ERRORS,
 )
 MAX_RUNS: Final = 1000
 MAX_SCORES: Final = 10_000

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from http import HTTPStatus
 from typing import Annotated, Any, get_type_hints
 
 from fastapi import APIRouter, Path, Query, Response
@@ -14,12 +13,10 @@ from runner.debugging.what_if import what_if as outcomes_of
 from runner.service import computed, fragments
 from runner.service.api.replay import STEPS, ReplayPart, Start, Steps
 from runner.service.dependencies import ComputationOf, RecordedRun
-from runner.service.problems import RUN_ERRORS, error_docs
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
-    responses=RUN_ERRORS | error_docs(HTTPStatus.SERVICE_UNAVAILABLE),
 )
 MAX_ACTIONS = 1000
 At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]

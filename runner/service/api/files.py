@@ -31,7 +31,6 @@ from runner.service.dependencies import (
     recording_state,
 )
 from runner.service.errors import Refused
-from runner.service.problems import BUSY_ERRORS, RUN_ERRORS
 from runner.service.tokens import Digest
 from runner.util.plugins import EXPORTS, plugin_names
 from runner.util.processes import CallFailed
@@ -40,7 +39,6 @@ from runner.util.values import Ranges, ranges_in
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["files"],
-    responses=RUN_ERRORS,
 )
 MEDIA: Final = "application/octet-stream"
 DRAW_SECONDS: Final = 120.0
@@ -117,7 +115,7 @@ def checkpoint(
 @router.get(
     "/replay.rrd",
     response_class=Response,
-    responses=FILE | BUSY_ERRORS,
+    responses=FILE,
     summary="The run for the Rerun viewer, made on demand.",
 )
 async def replay(
@@ -154,17 +152,13 @@ async def replay(
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
 
 
-@router.get(
-    "/report.html", response_class=Response, responses=FILE | BUSY_ERRORS, summary="The report of the run."
-)
+@router.get("/report.html", response_class=Response, responses=FILE, summary="The report of the run.")
 async def report(run: RecordedRun, compute: ComputationOf) -> Response:
     """Return what `dualtaxi report` writes, as a download."""
     return attachment(await compute(computed.report, run.recording), f"{run.file_stem}.html")
 
 
-@router.post(
-    "/film", response_class=Response, responses=FILE | BUSY_ERRORS, summary="A film of an episode of the run."
-)
+@router.post("/film", response_class=Response, responses=FILE, summary="A film of an episode of the run.")
 async def film(
     run: RecordedRun,
     compute: ComputationOf,
@@ -179,7 +173,7 @@ async def film(
 @router.get(
     "/exports/{name}",
     response_class=Response,
-    responses=FILE | BUSY_ERRORS,
+    responses=FILE,
     summary="The run as an export of an installed package writes it.",
 )
 async def installed(

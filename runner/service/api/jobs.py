@@ -20,7 +20,7 @@ from runner.service.errors import JobNotFound, Refused, expecting
 from runner.service.jobs.checking import DEFAULT_SOURCE
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import JobEstimate, QueuedJob
-from runner.service.problems import error_docs, media_docs
+from runner.service.problems import media_docs
 
 POLL_SECONDS: Final = 0.25
 """Time between two looks for new events."""
@@ -76,7 +76,6 @@ Text = Annotated[str, Depends(text_of)]
 @router.post(
     "/jobs",
     status_code=HTTPStatus.CREATED,
-    responses=error_docs(HTTPStatus.CONFLICT),
     openapi_extra=_YAML,
     summary="Submit a configuration or a sweep.",
 )
@@ -123,7 +122,6 @@ def list_jobs(
 
 @router.get(
     "/jobs/{number}",
-    responses=error_docs(HTTPStatus.NOT_FOUND),
     summary="One job.",
 )
 def one(jobs: JobsOf, number: Number) -> JobStatus:
@@ -134,7 +132,7 @@ def one(jobs: JobsOf, number: Number) -> JobStatus:
 @router.get(
     "/jobs/{number}/submitted",
     response_class=Response,
-    responses=media_docs("text/plain") | error_docs(HTTPStatus.NOT_FOUND),
+    responses=media_docs("text/plain"),
     summary="The text of a job, as it was submitted.",
 )
 def submitted(jobs: JobsOf, number: Number) -> Response:
@@ -144,7 +142,6 @@ def submitted(jobs: JobsOf, number: Number) -> Response:
 
 @router.post(
     "/jobs/{number}/cancel",
-    responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Cancel a job; what it has recorded is kept.",
 )
 def cancel(jobs: JobsOf, number: Number) -> JobStatus:
@@ -154,7 +151,6 @@ def cancel(jobs: JobsOf, number: Number) -> JobStatus:
 
 @router.post(
     "/jobs/{number}/resume",
-    responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Resume a job that failed or was cancelled.",
 )
 def resume(
@@ -172,7 +168,6 @@ def resume(
     "/jobs/{number}/events",
     response_class=StreamingResponse,
     responses={
-        **error_docs(HTTPStatus.NOT_FOUND),
         200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}},
         204: {"description": "The job is over, and all its events were sent."},
     },

@@ -16,9 +16,8 @@ from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob, QueuedJob
-from runner.service.problems import RUN_ERRORS
 
-router = APIRouter(tags=["jobs"], responses=RUN_ERRORS)
+router = APIRouter(tags=["jobs"])
 
 
 @router.post(

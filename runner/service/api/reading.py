@@ -21,13 +21,12 @@ from runner.service.dependencies import (
     SettingsOf,
     json_response,
 )
-from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
+from runner.service.problems import media_docs
 from runner.util.arrays import Array
 
 router = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
-    responses=RUN_ERRORS,
 )
 ARROW: Final = "application/vnd.apache.arrow.stream"
 OCTETS: Final = "application/octet-stream"
@@ -80,9 +79,7 @@ class Columns(BaseModel):
     columns: dict[str, list[object]]
 
 
-@router.get(
-    "/metrics", response_model=Curves, responses=BUSY_ERRORS, summary="The curves of a run's metrics."
-)
+@router.get("/metrics", response_model=Curves, summary="The curves of a run's metrics.")
 async def metrics(
     run: RecordedRun, compute: ComputationOf, options: Annotated[CurveOptions, Query()]
 ) -> Response:
@@ -97,7 +94,6 @@ async def metrics(
 @router.get(
     "/histograms",
     response_model=Histograms,
-    responses=BUSY_ERRORS,
     summary="Histograms over training, as heat maps.",
 )
 async def histograms(run: RecordedRun, compute: ComputationOf, axis: AxisOf = EPISODES.name) -> Response:
@@ -110,7 +106,6 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
         f"/{kind}",
         name=kind,
         response_model=RecordsPage,
-        responses=BUSY_ERRORS,
         summary=summary,
         description=description,
     )
@@ -138,7 +133,7 @@ _add_records_route(
 @router.get(
     "/{table}/{phase}.arrow",
     response_class=Response,
-    responses=media_docs(ARROW) | BUSY_ERRORS,
+    responses=media_docs(ARROW),
     summary="Steps or episodes by range, as Arrow.",
 )
 async def arrow(
@@ -185,7 +180,7 @@ def steps(
 @router.get(
     "/plot.svg",
     response_class=Response,
-    responses=media_docs(SVG) | BUSY_ERRORS,
+    responses=media_docs(SVG),
     summary="Every metric in one figure.",
 )
 async def plot(

@@ -30,13 +30,12 @@ from runner.service.dependencies import (
     recording_state,
 )
 from runner.service.pictures import Block, Make, PictureStreams
-from runner.service.problems import BUSY_ERRORS, RUN_ERRORS, media_docs
+from runner.service.problems import media_docs
 from runner.util import __version__
 
 router = APIRouter(
     prefix="/runs/{run}/replay",
     tags=["reading"],
-    responses=RUN_ERRORS | BUSY_ERRORS,
 )
 
 STEPS: Final = 500

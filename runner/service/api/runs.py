@@ -32,7 +32,6 @@ from runner.service.dependencies import (
     require_written,
 )
 from runner.service.errors import Refused
-from runner.service.problems import BUSY_ERRORS, error_docs
 from runner.service.settings import ServiceSettings
 from runner.util.values import Json
 
@@ -53,7 +52,6 @@ class RunsPage(BaseModel):
 @router.get(
     "/runs",
     response_model=RunsPage,
-    responses=error_docs(HTTPStatus.BAD_REQUEST),
     summary="List the runs that match a filter, the newest first.",
 )
 async def list_runs(
@@ -127,7 +125,6 @@ class RunResponse(BaseModel, extra="allow"):
 @router.get(
     "/runs/{run}",
     response_model=RunResponse,
-    responses=error_docs(HTTPStatus.NOT_FOUND),
     summary="Everything about a run.",
 )
 def one_run(run: FoundRun, settings: SettingsOf) -> Response:
@@ -156,7 +153,6 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
 @router.patch(
     "/runs/{run}",
     response_model=LabelsResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Change name, tags and note.",
 )
 def label_run(run: WrittenRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
@@ -184,7 +180,6 @@ class MarksResponse(BaseModel):
 @router.post(
     "/runs/{run}/marks",
     response_model=MarksResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Mark a step.",
 )
 def mark_step(run: WrittenRun, sent: MarkSent) -> dict[str, object]:
@@ -196,7 +191,6 @@ def mark_step(run: WrittenRun, sent: MarkSent) -> dict[str, object]:
 @router.delete(
     "/runs/{run}/marks/{name}",
     response_model=MarksResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT),
     summary="Remove a mark.",
 )
 def remove_mark(run: WrittenRun, name: Annotated[str, InPath(max_length=40)]) -> dict[str, object]:
@@ -221,7 +215,6 @@ class StopResponse(BaseModel):
     "/runs/{run}/stop",
     status_code=HTTPStatus.ACCEPTED,
     response_model=StopResponse,
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND),
     summary="Request that a loop which is being recorded stops.",
 )
 def stop_run(run: FoundRun) -> StopResponse:
@@ -233,7 +226,6 @@ def stop_run(run: FoundRun) -> StopResponse:
 @router.post(
     "/runs/{run}/archive",
     response_model=dict[str, object],
-    responses=error_docs(HTTPStatus.BAD_REQUEST, HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT) | BUSY_ERRORS,
     summary="Archive a run.",
 )
 async def archive_run(

@@ -13,7 +13,6 @@ from pydantic import BaseModel
 
 from runner.client.uploads import UploadState, UploadStatus
 from runner.service.dependencies import OwnerOf, UploadsOf
-from runner.service.problems import error_docs
 from runner.service.tokens import Digest
 from runner.service.uploads import UploadSource
 
@@ -26,9 +25,7 @@ _BODY: Final = {"requestBody": {"required": True, "content": _BYTES}}
 _ID_IS: Final = "64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing."
 UploadId = Annotated[Digest, Path(description=_ID_IS)]
 
-router = APIRouter(
-    prefix="/uploads", tags=["uploads"], responses=error_docs(HTTPStatus.NOT_FOUND, HTTPStatus.CONFLICT)
-)
+router = APIRouter(prefix="/uploads", tags=["uploads"])
 
 
 class UploadsResponse(BaseModel):
