@@ -19,7 +19,7 @@ from runner.service.logs import FLOODS
 from runner.service.settings import ServiceLimits, ServiceSettings
 
 MAX_HEAD_BYTES: Final = 64 << 10
-"""Size of a request's target and headers."""
+"""Bytes after which a request's target and headers must be complete."""
 BACKLOG: Final = 1024
 BURST: Final = 8
 """Connections accepted at once; asyncio accepts this many before the first of them is known here."""
@@ -129,7 +129,7 @@ def _protocol(limits: ServiceLimits) -> type[HttpToolsProtocol]:
 
     class Protocol(HttpToolsProtocol):
         _timer: asyncio.TimerHandle | None = None
-        _head_bytes = 0
+        _is_in_head, _head_bytes = False, 0
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
             super().connection_made(transport)
@@ -150,6 +150,9 @@ def _protocol(limits: ServiceLimits) -> type[HttpToolsProtocol]:
 
         def data_received(self, data: bytes) -> None:
             super().data_received(data)
+            self._head_bytes = self._head_bytes + len(data) if self._is_in_head else 0
+            if self._head_bytes > MAX_HEAD_BYTES:
+                self.send_400_response("The head of the request is too long.")
             if self in by_activity:
                 by_activity[self] = by_activity.pop(self)
             if self.is_idle and self._timer is None and not self.transport.is_closing():
@@ -161,18 +164,11 @@ def _protocol(limits: ServiceLimits) -> type[HttpToolsProtocol]:
             return self.cycle is None or self.cycle.response_complete
 
         def on_message_begin(self) -> None:
-            self._head_bytes = 0
+            self._is_in_head = True
             super().on_message_begin()
 
-        def on_url(self, url: bytes) -> None:
-            self._count(url)
-            super().on_url(url)
-
-        def on_header(self, name: bytes, value: bytes) -> None:
-            self._count(name + value)
-            super().on_header(name, value)
-
         def on_headers_complete(self) -> None:
+            self._is_in_head = False
             self._set_timer(None)
             super().on_headers_complete()
 
@@ -183,11 +179,6 @@ def _protocol(limits: ServiceLimits) -> type[HttpToolsProtocol]:
         def resume_writing(self) -> None:
             self._set_timer(None)
             super().resume_writing()
-
-        def _count(self, part: bytes) -> None:
-            self._head_bytes += len(part) + 4
-            if self._head_bytes > MAX_HEAD_BYTES:
-                raise ValueError("the head of the request is too long")
 
         def _set_timer(self, seconds: float | None) -> None:
             """Close the connection unless this is called again in time; None to stop the timer."""
