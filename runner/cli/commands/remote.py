@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,17 +16,13 @@ from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, received
 from runner.errors import ExitCode, RunnerError
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import recordings_folder
 from runner.util.humanize import UNKNOWN, counted, size
 from runner.util.values import Json
 
 if TYPE_CHECKING:
     from runner.client.client import Client
-    from runner.client.connection import Report
     from runner.client.jobs import JobStatus
-    from runner.client.uploads import UploadStatus
-
-    Upload = Callable[[Report], dict[str, object]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,52 +113,31 @@ def push(
     """
     if bool(names) == outbox:
         raise click.UsageError("expected either runs or --outbox.")
+    from runner.client.outbox import deliver, outbox_folder, waiting
+
+    kept = {run.run_id: (run, url) for run, url in waiting(outbox_folder())} if outbox else {}
+    if outbox and not kept:
+        say(f"The outbox {outbox_folder()} is empty; there is nothing to do.")
     runs: list[Json] = []
     code = 0
-    for name, upload in _outbox(server) if outbox else _named(names, server, recordings):
+    for name in kept or names:
+        run, url = kept.get(name, (None, None))
         try:
-            with bytes_line(f"pushing {name}") as report:
-                runs.append(upload(report))
+            with server.client(url) as client, bytes_line(f"pushing {name}") as report:
+                run = run or find_recorded(name, recordings)
+                run_bytes = run.recording.stat().st_size  # a run leaves the outbox when it is delivered
+                status = deliver(run, client, report) if outbox else client.push(run, report)
         except RunnerError as error:
             failure = Failure(error, name)
             failure.show()
             code = max(code, failure.exit_code)
+        else:
+            facts = {"name": run.name, "bytes": run_bytes, "already": status.already}
+            runs.append({"run_id": status.run_id, **facts})
     outcomes = {True: "was there already", False: "stored"}
     rows = [(run["run_id"], run["name"], size(run["bytes"]), outcomes[run["already"]]) for run in runs]
     pushed = table("run", "name", "size", "", rows=rows, left=("run", "name", ""))
     return Reply({"runs": runs}, [pushed] if runs else (), exit_code=code)
-
-
-def _named(names: tuple[str, ...], server: Server, recordings: Path | None) -> Iterator[tuple[str, Upload]]:
-    """Yield the names of runs, and the function that uploads each."""
-
-    def upload(name: str, report: Report) -> dict[str, object]:
-        run = find_recorded(name, recordings)
-        return _stored(client.push(run, report), run.name, run.recording.stat().st_size)
-
-    with server.client() as client:
-        for name in names:
-            yield name, functools.partial(upload, name)
-
-
-def _outbox(server: Server) -> Iterator[tuple[str, Upload]]:
-    """Yield the ids of the runs in the outbox, and the function that uploads each."""
-    from runner.client.outbox import deliver, outbox_folder, waiting
-
-    def upload(run: Run, url: str, report: Report) -> dict[str, object]:
-        run_bytes = run.recording.stat().st_size  # the run leaves the outbox when it is delivered
-        with server.client(url) as client:
-            return _stored(deliver(run, client, report), run.name, run_bytes)
-
-    uploads = waiting(outbox_folder())
-    if not uploads:
-        say(f"The outbox {outbox_folder()} is empty; there is nothing to do.")
-    for run, url in uploads:
-        yield run.run_id, functools.partial(upload, run, url)
-
-
-def _stored(status: UploadStatus, name: str, run_bytes: int) -> Json:
-    return {"run_id": status.run_id, "name": name, "bytes": run_bytes, "already": status.already}
 
 
 @remote_command.command("pull")
