@@ -271,7 +271,7 @@ def pictures(path: Path) -> bytes:
     if len(figures) < total:
         texts = [f"The last {len(figures):,} of {total:,} pictures."]
     return str(
-        partials().paragraphs(texts) + Markup('<div class="logged">{}</div>').format(Markup().join(figures))
+        partials().paragraphs(texts) + Markup('<div class="pictures">{}</div>').format(Markup().join(figures))
     ).encode()
 
 
