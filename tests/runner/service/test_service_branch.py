@@ -156,7 +156,7 @@ def test_what_is_wrong_for_a_loop_is_refused_before_it_is_queued(client, loop, s
 
 def test_the_replay_of_a_loop_leads_to_the_form_which_queues_the_job(client, loop):
     replay = client.get(f"/runs/{loop.run_id}/replay/train/1?t=4")
-    (address,) = re.findall(r'data-to-branch href="([^"]+)"', replay.text)
+    (address,) = re.findall(r'href="(/runs/\w+/branch[^"]+)"', replay.text)
     assert address.endswith("?at=1:4")
     form = client.get(address)
     assert ">as recorded: left</option>" in form.text
@@ -189,7 +189,7 @@ def test_a_loop_that_another_user_recorded_has_no_form_and_no_job(client, loop):
 
 def test_the_replay_leads_to_the_form_which_queues_the_branch(client):
     replay = client.get("/runs/first/replay/train/20?t=1")
-    (address,) = re.findall(r'data-to-branch href="([^"]+)"', replay.text)
+    (address,) = re.findall(r'href="(/runs/\w+/branch[^"]+)"', replay.text)
     assert address.endswith("?at=20:1")
     form = client.get(address)
     assert 'value="20:1"' in form.text
@@ -210,7 +210,7 @@ def test_the_replay_leads_to_the_form_which_queues_the_branch(client):
 
 
 def test_a_trial_offers_no_branch_of_training(client):
-    assert "data-to-branch" not in client.get("/runs/first/replay/eval/10/0").text
+    assert "/branch?" not in client.get("/runs/first/replay/eval/10/0").text
 
 
 def test_a_branch_whose_parent_was_removed_fails_and_leaves_no_run(connect, recordings, tmp_path):

@@ -348,9 +348,9 @@ def test_a_step_is_opened_in_rerun(page, folder):
     browser = page("/runs/first/replay/train/7?t=3")
     wait(
         browser,
-        lambda: "at=7:2" in browser.find_element(By.CSS_SELECTOR, "[data-to-rerun]").get_attribute("href"),
+        lambda: "at=7:2" in browser.find_element(By.CSS_SELECTOR, "[data-step=last]").get_attribute("href"),
     )
-    browser.find_element(By.CSS_SELECTOR, "[data-to-rerun]").click()
+    browser.find_element(By.CSS_SELECTOR, "[data-step=last]").click()
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "iframe.viewer"))
     browser.switch_to.frame(browser.find_element(By.CSS_SELECTOR, "iframe.viewer"))
     wait(browser, lambda: browser.execute_script("return document.body.dataset.opened"), 240)

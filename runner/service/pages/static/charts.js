@@ -1,7 +1,7 @@
 // Metrics of one or several runs over an axis; runs that differ in nothing but the seed are one line with a band.
 // Of a long curve the server returns the lowest and the highest value of each stretch, with a notice; zooming in
 // requests that part at full resolution. The address holds what is chosen.
-import { request } from "./api.js";
+import { json } from "./page.js";
 
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
@@ -98,7 +98,7 @@ async function draw() {
   if (logged) query.set("metric", `training.logged.${logged}`);
   box.setAttribute("aria-busy", "true");
   try {
-    const found = await request(`/api/v1/curves?${query}`);
+    const found = await json(`/api/v1/curves?${query}`);
     if (mine !== requests) return;
     last = found;
     const named = found.axes.map(({ name }) => name),
@@ -305,7 +305,7 @@ async function table(metric) {
   if (chosen().lines) query.set("lines", "true");
   query.set("metric", metric);
   for (const name of ["smooth", "log_x", "log_y"]) query.delete(name); // the values as they were recorded
-  const { axis, curves } = await request(`/api/v1/curves?${query}`);
+  const { axis, curves } = await json(`/api/v1/curves?${query}`);
   const lines = [...new Set(curves.map((curve) => curve.line))];
   const columns = curves.flatMap((curve) => {
     const label = labelOf(curve, lines);
