@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Grid, Paging, Section
 from runner.environments.naming import event_in_words, spoken
 from runner.errors import NotInRecording
 from runner.recording import schema
@@ -294,7 +294,9 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
     return columns
 
 
-def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord]) -> Section:
+def evaluations_section(
+    recording: Recording, records: Sequence[EvaluationRecord], paging: Paging | None = None
+) -> Section:
     """Return evaluations of a recording, one at least, as a table, without metrics unknown of a loop."""
     columns = list(metric_columns(records).items())
     for name in recording.environment["event_names"]:
@@ -314,5 +316,6 @@ def evaluations_section(recording: Recording, records: Sequence[EvaluationRecord
             "episodes. Events are counted over all trials."
         )
     headings, cells = zip(*columns, strict=True)
-    grid = Grid(headings, list(zip(*cells, strict=True)))
+    links = [f"replay/eval/{record.episode}/0" for record in records]
+    grid = Grid(headings, list(zip(*cells, strict=True)), links=links, paging=paging)
     return Section("Evaluations", [explanation], [grid])

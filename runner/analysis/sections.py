@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,48 @@ class Plot(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Paging:
+    """The links below a long table."""
+
+    page: int
+    """From 1."""
+    rows: int
+    """Rows of the whole table."""
+    rows_per_page: int
+    address: str
+    """Address of the first page."""
+
+    @property
+    def pages(self) -> int:
+        """Number of pages."""
+        return max(1, math.ceil(self.rows / self.rows_per_page))
+
+    @property
+    def previous(self) -> str:
+        """Address of the page before; empty on the first one."""
+        return self._address(self.page - 1) if self.page > 1 else ""
+
+    @property
+    def next(self) -> str:
+        """Address of the next page; empty on the last one."""
+        return self._address(self.page + 1) if self.page < self.pages else ""
+
+    def _address(self, page: int) -> str:
+        if page == 1:
+            return self.address
+        return f"{self.address}{'&' if '?' in self.address else '?'}page={page}"
+
+
+class Source(NamedTuple):
+    """A file of source code."""
+
+    path: str
+    state: str
+    """How it relates to the commit; empty if the commit has it."""
+    text: str
+
+
+@dataclass(frozen=True)
 class Grid:
     """A small table of text."""
 
@@ -38,6 +81,8 @@ class Grid:
     """The address of what each row is about, below the address of the run."""
     streams: Sequence[str] = ()
     """The stream of each row, if the rows are lines of output: `stdout`, `stderr` or `note`."""
+    paging: Paging | None = None
+    """The links to other rows, if the table is a part of a longer one."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:
@@ -67,6 +112,16 @@ class Section:
     """Charts, which are drawn on a page; `NOT_DRAWN` stands for them in text."""
     replay: str = ""
     """The address of the replay of a step to look at, below the address of the run."""
+    sources: Sequence[Source] = ()
+    """Files, which a page shows whole, and text by their names."""
+    is_folded: bool = False
+    """Whether a page folds the facts, and text leaves them out."""
+
+    @property
+    def tables(self) -> list[Grid]:
+        """The tables of the section in text."""
+        rows = [(file.path, file.state, f"{file.text.count(chr(10)):,}") for file in self.sources]
+        return [*self.grids, *([Grid(("file", "state", "lines"), rows)] if rows else [])]
 
     @property
     def anchor(self) -> str:
@@ -78,11 +133,12 @@ def markdown(sections: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of sections in Markdown."""
     for section in sections:
         yield from (f"## {section.title}", "")
-        yield from (f"- {name}: {text}" for name, text in section.facts.items())
-        yield from [""] * bool(section.facts)
+        facts = {} if section.is_folded else section.facts
+        yield from (f"- {name}: {text}" for name, text in facts.items())
+        yield from [""] * bool(facts)
         for sentence in [*section.sentences, *([NOT_DRAWN] if section.charts else [])]:
             yield from (sentence, "")
-        for grid in section.grids:
+        for grid in section.tables:
             yield _row(grid.headings)
             yield _row(tuple("---:" if is_number else "---" for is_number in grid.numeric))
             yield from (_row(row) for row in grid.rows)
@@ -98,7 +154,7 @@ def html(sections: Sequence[Section]) -> str:
     for section in sections:
         parts += [f"<h3>{escape(section.title)}</h3>"]
         parts += [f"<p>{escape(sentence)}</p>" for sentence in section.sentences]
-        for grid in section.grids:
+        for grid in section.tables:
             sides = [f' style="text-align:{"right" if is_number else "left"}"' for is_number in grid.numeric]
             head = "".join(
                 f'<th scope="col"{side}>{escape(heading)}</th>'

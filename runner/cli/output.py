@@ -184,8 +184,9 @@ def draw(*parts: Part) -> None:
         elif isinstance(part, str):
             echo(part)
         elif isinstance(part, Section):
-            _render(facts(part.facts) if part.facts else title(part.title), *part.sentences)
-            draw(*part.grids, *map(patch_text, part.diffs), *([NOT_DRAWN] if part.charts else []))
+            has_facts = part.facts and not part.is_folded
+            _render(facts(part.facts) if has_facts else title(part.title), *part.sentences)
+            draw(*part.tables, *map(patch_text, part.diffs), *([NOT_DRAWN] if part.charts else []))
         elif isinstance(part, Mapping):
             _render(facts(part))
         elif isinstance(part, Grid):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import click
+
 from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     force_option,
@@ -61,5 +63,6 @@ def _declared(given: Input, view: View) -> Declared:
     flag = f"--{given.name}"
     if given.kind is bool:
         return option(flag, is_flag=True, help=given.help)
-    kind = INDEX if given.kind is int else None
-    return option(flag, type=kind, default=given.default, metavar=given.metavar, help=given.help)
+    kind = click.Choice(given.values) if given.values else INDEX if given.kind is int else None
+    metavar = given.metavar or None
+    return option(flag, type=kind, default=given.default, metavar=metavar, help=given.help)

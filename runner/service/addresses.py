@@ -2,48 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from urllib.parse import urlencode
 
 from runner.analysis.episodes import EpisodeRef
 from runner.errors import RunnerError
 from runner.runs.branches import BranchOrigin, origin_in
 from runner.runs.run import Run
-
-
-@dataclass(frozen=True)
-class Paging:
-    """The links below a long table."""
-
-    page: int
-    """From 1."""
-    rows: int
-    """Rows of the whole table."""
-    rows_per_page: int
-    address: str
-    """Address of the first page."""
-
-    @property
-    def pages(self) -> int:
-        """Number of pages."""
-        return max(1, math.ceil(self.rows / self.rows_per_page))
-
-    @property
-    def previous(self) -> str:
-        """Address of the page before; empty on the first one."""
-        return self._address(self.page - 1) if self.page > 1 else ""
-
-    @property
-    def next(self) -> str:
-        """Address of the next page; empty on the last one."""
-        return self._address(self.page + 1) if self.page < self.pages else ""
-
-    def _address(self, page: int) -> str:
-        if page == 1:
-            return self.address
-        return f"{self.address}{'&' if '?' in self.address else '?'}page={page}"
 
 
 def link(path: str, values: Mapping[str, object]) -> str:

@@ -27,7 +27,7 @@ from runner.analysis.compare.score_table import MIN_MAX, parse_table
 from runner.analysis.compare.statistics import require_scipy
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.episodes import EpisodeRef
-from runner.analysis.evaluations import evaluation_records, training_records
+from runner.analysis.evaluations import training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
 from runner.analysis.histograms import histograms
@@ -75,7 +75,7 @@ AxisName = Annotated[
         description=f"The horizontal axis: one of {', '.join(AXES)}, or a name of logged values.",
     ),
 ]
-RecordKind = Literal["evaluations", "training", "optimality"]
+RecordKind = Literal["training", "optimality"]
 
 
 class _MetricOptions(BaseModel, frozen=True):
@@ -239,12 +239,10 @@ def _shown_curve(panel: Panel, curve: Curve, options: CurveOptions, lines: bool)
 
 
 def records(path: Path, kind: RecordKind, rows: range, limit: int) -> bytes:
-    """Return evaluations, reports of training or exact measures by their numbers, as JSON."""
+    """Return reports of training or exact measures by their numbers, as JSON."""
     with open_recording(path) as recording:
         if kind == "optimality":
             everything = list(recording.table(schema.OPTIMALITY_TOPIC).decoded())
-        elif kind == "evaluations":
-            everything = [each.as_json() for each in evaluation_records(recording)]
         else:
             recording.require_job("a report of training", "Its metrics can be had all the same.")
             everything = [each.as_json() for each in training_records(recording)]

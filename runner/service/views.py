@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from http import HTTPStatus
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
@@ -16,17 +16,19 @@ from runner.runs.run import Run
 from runner.service import computed, fragments
 from runner.service.addresses import link
 from runner.service.api.replay import OCTETS
-from runner.service.dependencies import Computation, ComputationOf, RecordedRun
+from runner.service.computed import require_few
+from runner.service.dependencies import Computation, ComputationOf, RecordedRun, SettingsOf
 from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import filled, media_docs, status_of
 from runner.views import VIEWS, view_named
-from runner.views.view import Given, Input, View
+from runner.views.view import Given, Input, View, rows_in
 
 api = APIRouter(
     prefix="/runs/{run}",
     tags=["reading"],
 )
 pages = APIRouter(prefix="/runs/{run}", include_in_schema=False)
+PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**9)]
 
 
 def _add_routes(view: View) -> None:
@@ -35,7 +37,11 @@ def _add_routes(view: View) -> None:
     def add(
         function: Callable[..., bytes], ending: str, media_type: str, summary: str, **options: Any
     ) -> None:
-        async def answer(run: RecordedRun, compute: ComputationOf, given: BaseModel) -> Response:
+        async def answer(
+            run: RecordedRun, compute: ComputationOf, settings: SettingsOf, given: Any
+        ) -> Response:
+            if view.rows_per_page:
+                require_few(len(rows_in(given.start, given.stop)), settings.limits.page_records)
             body = await _computed(compute, function, run, view, given)
             return Response(body, media_type=media_type)
 
@@ -57,20 +63,26 @@ def _add_routes(view: View) -> None:
     if view.is_live:
 
         async def part(
-            run: RecordedRun, compute: ComputationOf, given: BaseModel, status: StatusName
+            run: RecordedRun,
+            compute: ComputationOf,
+            given: BaseModel,
+            status: StatusName,
+            number: PageNumber = 1,
         ) -> Response:
             """Return the answer; 204 if the run no longer has this status."""
             if run.status != status:
                 return Response(status_code=HTTPStatus.NO_CONTENT)
             return HTMLResponse(
-                await _computed(compute, fragments.answer, run, view, given, view.page_values)
+                await _computed(compute, fragments.answer, run, view, given, _page_values(view, number))
             )
 
         part.__annotations__["given"] = Annotated[given_type, Query()]
         pages.get(f"/{view.name}/part")(part)
 
     @pages.get(f"/{view.name}")
-    async def page(request: Request, run: RecordedRun, compute: ComputationOf) -> Response:
+    async def page(
+        request: Request, run: RecordedRun, compute: ComputationOf, number: PageNumber = 1
+    ) -> Response:
         """Show the form, and the answer to what it asks."""
         query = request.query_params
         form = {each.name: query.get(each.name, "").strip() for each in view.inputs.values()}
@@ -78,16 +90,26 @@ def _add_routes(view: View) -> None:
         try:
             if view.has_default or any(form.values()):
                 given = filled(given_type, form)
-                body = await _computed(compute, fragments.answer, run, view, given, view.page_values)
+                body = await _computed(
+                    compute, fragments.answer, run, view, given, _page_values(view, number)
+                )
         except RunnerError as error:
             problem = error
         live = ""
         if view.is_live and run.status == "running":
             asked = {name: text for name, text in form.items() if text}
-            live = link(f"/runs/{run.run_id}/{view.name}/part", asked | {"status": run.status})
+            shown_page = {"page": number} if number > 1 else {}
+            live = link(f"/runs/{run.run_id}/{view.name}/part", asked | shown_page | {"status": run.status})
         shown = {"view": view, "form": form, "body": body.decode(), "problem": problem, "live": live}
         status = status_of(problem) if isinstance(problem, RecordingError) else None
         return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
+
+
+def _page_values(view: View, number: int) -> Given:
+    """Return the arguments of a view that its page gives; with a long list, the rows of a page."""
+    first = (number - 1) * view.rows_per_page
+    rows = (("start", first), ("stop", first + view.rows_per_page)) if view.rows_per_page else ()
+    return view.page_values + rows
 
 
 async def _computed(
@@ -107,8 +129,11 @@ def _type_of(view: View) -> type[BaseModel]:
     """Return the type of the inputs of a view in the query of a request."""
 
     def declared(given: Input) -> tuple[Any, Any]:
-        kind: Any = given.kind if given.required or given.default is not None else given.kind | None
-        limits: dict[str, Any] = {} if given.kind is bool else {"max_length": given.max_length}
+        kind: Any = Literal[given.values] if given.values else given.kind
+        kind = kind if given.required or given.default is not None else kind | None
+        limits: dict[str, Any] = (
+            {} if given.kind is bool or given.values else {"max_length": given.max_length}
+        )
         if given.kind is int:
             limits = {"ge": 0, "le": given.maximum}
         default = ... if given.required else given.default
@@ -123,8 +148,11 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
     """Return the texts to choose from in the form of a view, or why it has none."""
     with open_recording(run.recording) as recording:
         refusal = view.refusal(recording) if view.refusal is not None and run.can_train_again else ""
-        listed = {given.name: given.choices for given in view.inputs.values()}
-        choices = {name: made(recording) for name, made in listed.items() if made is not None}
+        choices = {
+            given.name: given.values if given.choices is None else given.choices(recording)
+            for given in view.inputs.values()
+            if given.values or given.choices is not None
+        }
     return {"choices": choices, "refusal": refusal}
 
 

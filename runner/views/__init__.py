@@ -10,10 +10,13 @@ from functools import cache
 from typing import Final
 
 from runner.util import plugins
-from runner.views import console, qtable, system, when, why
+from runner.views import code, console, episodes, evaluations, qtable, system, when, why
 from runner.views.view import View
 
-VIEWS: Final = {module.VIEW.name: module.VIEW for module in (qtable, when, why, system, console)}
+VIEWS: Final = {
+    module.VIEW.name: module.VIEW
+    for module in (episodes, evaluations, qtable, when, why, system, console, code)
+}
 """Name of a view -> the view, in the order of tabs."""
 
 

@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
 from runner.analysis.sections import Grid, Section
-from runner.errors import ConfigError
 from runner.util.humanize import counted, duration
 from runner.views.view import View, view_input
 
@@ -63,9 +62,8 @@ def console(
         "stream",
         "Only lines of stdout, or of stderr.  [default: both]",
         default=_BOTH,
-        metavar="NAME",
         label="Stream",
-        choices=lambda _: _STREAMS,
+        values=_STREAMS,
     ),
     limit: int = view_input(
         "limit",
@@ -89,8 +87,6 @@ def console(
     from runner.recording.clock import read_clock
     from runner.recording.console import read_console
 
-    if stream not in _STREAMS:
-        raise ConfigError(f"stream: found {stream!r}, expected {', '.join(_STREAMS[:-1])} or {_STREAMS[-1]}.")
     lines = read_console(recording, read_clock(recording))
     matching = [
         line for line in lines if search.casefold() in line.text.casefold() and stream in (_BOTH, line.stream)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal, Protocol
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -59,13 +59,32 @@ class Input:
     placeholder: str = ""
     button: str = ""
     """Text of a button that sends the form with this flag."""
+    values: tuple[str, ...] = ()
+    """The values that it takes; empty if it takes others, too."""
     choices: Callable[[Recording], Sequence[str]] | None = None
-    """Returns the texts to choose from."""
+    """Returns the texts that the field of the page offers, if those are not the values."""
 
 
 def view_input(name: str, text: str, **attributes: Any) -> Any:
     """Return the default of a parameter that is an `Input`, explained by a text."""
     return Input(name, text, **attributes)
+
+
+_DEFAULT_ROWS: Final = 1000
+_MAX_ROW: Final = 2**62
+START: Final = Input("start", "The first row, from 0.", kind=int, default=0, metavar="N", maximum=_MAX_ROW)
+STOP: Final = Input(
+    "stop",
+    f"The first row not included.  [default: {_DEFAULT_ROWS:,} more]",
+    kind=int,
+    metavar="N",
+    maximum=_MAX_ROW,
+)
+
+
+def rows_in(start: int, stop: int | None) -> range:
+    """Return the numbers of the rows from `START` to `STOP`."""
+    return range(start, start + _DEFAULT_ROWS if stop is None else stop)
 
 
 @dataclass(frozen=True)
@@ -89,8 +108,11 @@ class View:
     """What the command says that it does."""
     counts_steps: bool = True
     """Whether the function has the parameter `report`."""
-    needs: Literal["", "tables", "training"] = ""
-    """What a run needs for a tab of this page: Q-tables, or a training that the runner can repeat."""
+    needs: Literal["", "episodes", "tables", "training"] = ""
+    """What a run needs for a tab of this page: an environment, Q-tables, or a training that the runner can
+    repeat."""
+    rows_per_page: int = 0
+    """Rows of each page of a long list, a function with the inputs `START` and `STOP`; else 0."""
     is_live: bool = False
     """Whether the answer changes while the run is running, so that the page loads it again."""
     has_default: bool = False

@@ -91,7 +91,7 @@ COMMANDS: Final = (
     "show damaged",
     "show job-branch",
     "show loop-branch",
-    "show cooperative@latest --code",
+    "code cooperative@latest",
     "show cooperative@latest --json",
     "show pole --json",
     "play cooperative@latest --episode 0 --speed 1000",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,19 +10,17 @@ from typing import TYPE_CHECKING, Final
 import click
 
 from runner.analysis.sections import Grid, Section
-from runner.cli.command import Command, option
+from runner.cli.command import Command
 from runner.cli.options import recordings_option, run_argument
-from runner.cli.output import Reply, console, on_one_line, patch_text, say, title
+from runner.cli.output import Reply, console, say, title
 from runner.cli.progress import stage_line
 from runner.cli.runs import command_for, find, restored
 from runner.runs.branches import Origin, origin_in
-from runner.runs.run import Run
 from runner.util.humanize import UNKNOWN, ago, counted, duration, number, size
 
 if TYPE_CHECKING:
     from runner.analysis.summary import RecordedExtras, RunDetails
     from runner.cli.output import Part
-    from runner.recording.code import Code
     from runner.recording.maker import Shard
     from runner.recording.run_file import Summary
 
@@ -37,15 +34,8 @@ MAX_CYCLES: Final = 8
 def show_command(
     run_name: str = run_argument,
     recordings: Path | None = recordings_option,
-    code: bool = option(
-        "--code", is_flag=True, help="Print the code that ran: commit, script, and a patch for `git apply`."
-    ),
 ) -> Reply:
     """Show a run: its evaluations, tables, configuration and provenance.
-
-    --code prints the code that ran; `git checkout COMMIT && dualtaxi show RUN --code | git apply` restores
-    it; without a commit the patch has all files. With --json as well, `files` has the text of each recorded
-    file, `new` those that the commit does not have, `patch` the changes since the commit.
 
     --json also prints the whole series: `eval` has an object for each evaluation, with the training episodes
     before it, success_percent, mean_length, mean_penalties and the count of every event; `optimality` its
@@ -59,14 +49,11 @@ def show_command(
     Examples:
       dualtaxi show @latest
       dualtaxi show k3v9m2xq --json
-      dualtaxi show k3v9m2xq --code | git apply
     """
     from runner.analysis.summary import describe_run
     from runner.runs.catalogue.index import look
 
     run = restored(find(run_name, recordings, newest=True))
-    if code:
-        return _code(run)
     details = describe_run(run, say)
     folders = [] if run.stands_alone else [run.folder.parent]
     branches = look(folders, lambda index: index.branches(run.run_id), say)
@@ -76,38 +63,6 @@ def show_command(
         "branches": {name: asdict(each) for name, each in branches.items()},
     }
     return Reply(details.as_json() | values, _text(details, branches))
-
-
-def _code(run: Run) -> Reply:
-    """Return the code of a run."""
-    from runner.recording.reader import open_recording
-
-    with open_recording(run.recording) as recording:
-        recorded = recording.code
-        code_facts = {
-            key: text
-            for key, text in recording.provenance.items()
-            if key.startswith(("git", "code.")) or key == "command"
-        }
-    values = code_facts | {"files": dict(recorded.files), "new": recorded.new, "patch": recorded.patch}
-    return Reply(values, _code_text(recorded, code_facts))
-
-
-def _code_text(recorded: Code, code_facts: dict[str, str]) -> Iterator[Part]:
-    """Yield facts as comments, which `git apply` ignores, and a patch."""
-    if not any(key.startswith(("git", "code.")) for key in code_facts):
-        code_facts["code.not_recorded"] = "the code of this run"
-    committed = [path for path in recorded.files if path not in recorded.new]
-    head = [f"# {key}: {on_one_line(text)}" for key, text in code_facts.items()]
-    head += (
-        [f"# also printed in full by --json: {', '.join(map(on_one_line, committed))}"] if committed else []
-    )
-    if console().is_terminal:
-        yield "\n".join(head)
-        yield patch_text(recorded.to_patch().splitlines())
-    else:
-        yield "\n".join(head) + "\n"
-        sys.stdout.write(recorded.to_patch())  # exact, for `git apply`
 
 
 def _text(details: RunDetails, branches: Mapping[str, Origin]) -> Iterator[Part]:

@@ -23,6 +23,7 @@ from runner.service.dependencies import (
 )
 from runner.service.problems import media_docs
 from runner.util.arrays import Array
+from runner.views.view import START, STOP, rows_in
 
 router = APIRouter(
     prefix="/runs/{run}",
@@ -31,22 +32,16 @@ router = APIRouter(
 ARROW: Final = "application/vnd.apache.arrow.stream"
 OCTETS: Final = "application/octet-stream"
 SVG: Final = "image/svg+xml"
-DEFAULT_RECORDS: Final = 1000
-"""Records in a response by default."""
-
-Start = Annotated[int, Query(ge=0, lt=2**62, description="The first, from 0.")]
-Stop = Annotated[
-    int | None,
-    Query(ge=0, lt=2**62, description=f"The first one not included; default: {DEFAULT_RECORDS:,} more."),
-]
+Start = Annotated[int, Query(ge=0, le=START.maximum, description=START.help)]
+Stop = Annotated[int | None, Query(ge=0, le=STOP.maximum, description=STOP.help)]
 
 
-async def rows_in(start: Start = 0, stop: Stop = None) -> range:
+async def _rows(start: Start = 0, stop: Stop = None) -> range:
     """Return the numbers of the records to return."""
-    return range(start, start + DEFAULT_RECORDS if stop is None else stop)
+    return rows_in(start, stop)
 
 
-Rows = Annotated[range, Depends(rows_in)]
+Rows = Annotated[range, Depends(_rows)]
 PhasePath = Annotated[Phase, Path(description="`train`, or `eval`: the trials of evaluations.")]
 AxisOf = Annotated[AxisName, Query()]
 
@@ -113,11 +108,6 @@ def _add_records_route(kind: computed.RecordKind, summary: str, description: str
         return await compute.json(computed.records, run.recording, kind, rows, settings.limits.page_records)
 
 
-_add_records_route(
-    "evaluations",
-    "The evaluations, with every event counted.",
-    "Evaluations as `dualtaxi show --json` has them under `eval`.",
-)
 _add_records_route(
     "training",
     "The reports of training.",

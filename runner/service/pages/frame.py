@@ -28,12 +28,9 @@ StatusName = Annotated[str, Query(max_length=20, description="The status that th
 TABS: Final = (
     ("", "Overview"),
     ("replay", "Replay"),
-    ("episodes", "Episodes"),
-    ("evaluations", "Evaluations"),
     ("learned", "What was learned"),
     *((view.name, view.title) for view in VIEWS.values()),
     ("config", "Configuration"),
-    ("code", "Code"),
     ("pictures", "Pictures"),
     ("rerun", "Rerun"),
 )
@@ -73,13 +70,11 @@ def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_episodes = has_environment(run.file.config)
     has_tables = run.can_train_again or _has_recorded_tables(run)
-    met = {"": True, "tables": has_tables, "training": run.can_train_again}
+    met = {"": True, "episodes": has_episodes, "tables": has_tables, "training": run.can_train_again}
     needs = {"learned": "tables"} | {view.name: view.needs for view in VIEWS.values()}
     has_tab = {
         **{name: met[need] for name, need in needs.items()},
         "replay": has_episodes,
-        "episodes": has_episodes,
-        "evaluations": has_episodes,
         "rerun": has_episodes,
         "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
         or (run.status == "running" and not run.can_train_again),
@@ -99,7 +94,7 @@ def head_of(run: Run) -> RunHead:
         lacking={
             name: "Q-tables" if not has_tables else "training that the runner can repeat"
             for name, need in needs.items()
-            if not met[need]
+            if not met[need] and need != "episodes"
         },
     )
 

@@ -8,8 +8,8 @@ from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Response
 
+from runner.analysis.sections import Paging
 from runner.debugging.explanation_files import explanations_in
-from runner.service.addresses import Paging
 from runner.service.api.jobs import Number
 from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,7 +18,6 @@ from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.episodes import TYPICAL
-from runner.analysis.evaluations import evaluation_record, evaluation_records, evaluations_section
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.export.encoder import FORMATS
@@ -38,7 +36,6 @@ from runner.service.dependencies import (
     ComputationOf,
     FoundRun,
     JobsOf,
-    OpenRecording,
     ProcessesOf,
     RecordedRun,
     SettingsOf,
@@ -53,7 +50,6 @@ from runner.util.values import Json
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
-MAX_EVALUATIONS: Final = 500
 MAX_LOGGED: Final = 8
 """Logged values on the first page of a run."""
 
@@ -181,23 +177,6 @@ async def random_policy(run: FoundRun, compute: ComputationOf) -> Response:
 async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisOf = EPISODES.name) -> Response:
     """Return the histograms of training, as a part of the run's page."""
     return HTMLResponse(await compute(fragments.distributions, run.recording, axis))
-
-
-@router.get("/evaluations")
-def evaluations(run: RecordedRun, recording: OpenRecording) -> Response:
-    """Show the last evaluations."""
-    agents, events = recording.agents, recording.environment["event_names"]
-    if recording.eval.has_metrics:
-        last = deque(recording.eval.metrics.decoded(), MAX_EVALUATIONS)
-        records = [evaluation_record(metrics, agents, events) for metrics in last]
-        total = recording.eval.metrics.count()
-    else:
-        every = evaluation_records(recording)
-        records, total = every[-MAX_EVALUATIONS:], len(every)
-    links = [f"/runs/{run.run_id}/replay/eval/{record.episode}/0" for record in records]
-    section = evaluations_section(recording, records) if records else None
-    values = {"section": section, "links": links, "total": total}
-    return RunPage(run, "evaluations", "run_evaluations.html", values)
 
 
 def _overview(

@@ -10,6 +10,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
+from runner.analysis.sections import Paging
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import (
     FIELDS,
@@ -25,7 +26,7 @@ from runner.runs.catalogue.columns import (
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.catalogue.usage import FREED_BY, usage_of
-from runner.service.addresses import Paging, link
+from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import Page, message_of, render, viewer_of

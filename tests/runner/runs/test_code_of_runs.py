@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import zstandard
 from click.testing import CliRunner
@@ -181,22 +183,26 @@ def test_two_commits_of_a_script(project, tmp_path):
     assert json.loads(dualtaxi(project, "diff", a, a, "--json"))["code"] == []
 
 
-def test_show_code_restores_it(project, tmp_path):
+def test_the_patch_restores_the_code(project, tmp_path):
     (project / "models.py").write_text("layers = 2\n")
     run = loop_in(project, 10)
-    patch = dualtaxi(project, "show", run, "--code")
+    dualtaxi(project, "code", run, "-o", str(tmp_path / "code.patch"))
+    patch = (tmp_path / "code.patch").read_text()
     commit = git(project, "rev-parse", "HEAD")
     assert f"# git: {commit}-dirty" in patch
     assert "# command: train.py" in patch
     copy = tmp_path / "copy"
     git(tmp_path, "clone", "-q", str(project), str(copy))
-    (tmp_path / "code.patch").write_text(patch)
     git(copy, "apply", str(tmp_path / "code.patch"))
     assert (copy / "train.py").read_text() == LOOP.format(steps=10)
     assert (copy / "models.py").read_text() == "layers = 2\n"
-    values = json.loads(dualtaxi(project, "show", run, "--code", "--json"))
+    values = json.loads(dualtaxi(project, "code", run, "--json"))
     assert values["files"]["train.py"] == LOOP.format(steps=10)
     assert values["new"] == ["models.py"]
+    assert values["packages"]["numpy"] == np.__version__
+    text = dualtaxi(project, "code", run)
+    assert "+" + LOOP.format(steps=10).splitlines()[-1] in text
+    assert re.search(r"models.py +not in the commit +1$", text, re.MULTILINE)
     assert "Packages" not in dualtaxi(project, "show", run)
 
 
@@ -207,10 +213,10 @@ def test_a_command_that_is_not_wanted_is_not_read(project, monkeypatch):
         assert "command" not in recording.provenance
 
 
-def test_show_code_of_a_run_without_it(project, monkeypatch):
+def test_a_run_without_its_code(project, monkeypatch):
     monkeypatch.setenv("DUALTAXI_CODE", "off")
     run = loop_in(project, 10)
-    assert "not_recorded" in dualtaxi(project, "show", run, "--code")
+    assert "was not recorded" in dualtaxi(project, "code", run)
 
 
 # --- hostile files -----------------------------------------------------------------------------------------

@@ -69,12 +69,18 @@ def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(cli
     assert "<pre>  status==&#39;finishd&#39;\n          ^^^^^^^^^</pre>" in page
 
 
-def test_the_page_notes_when_not_all_evaluations_are_shown(client, monkeypatch):
-    assert "The last" not in page_of(client, "/runs/first/evaluations")
-    monkeypatch.setattr("runner.service.pages.run.MAX_EVALUATIONS", 2)
+def test_each_evaluation_leads_to_its_replay(client):
     page = page_of(client, "/runs/first/evaluations")
-    assert "The last 2 of 7;" in page
-    assert re.findall(r'replay/eval/(\d+)/0"', page) == ["50", "60"]
+    assert re.findall(r'replay/eval/(\d+)/0"', page) == ["0", "10", "20", "30", "40", "50", "60"]
+    assert "There are 7 evaluations, from 0." in page_of(client, "/runs/first/evaluations?page=2")
+
+
+def test_a_page_of_episodes_leads_to_the_others(client):
+    first = client.get("/api/v1/runs/first").json()["run_id"]
+    page = page_of(client, "/runs/first/episodes?phase=eval&page=2")
+    pages = re.findall(r'rel="(prev|next)" href="([^"]*)"', page)
+    assert pages[-1] == ("prev", f"/runs/{first}/episodes?phase=eval")
+    assert page_of(client, f"/runs/first/episodes?phase=eval&page={10**8}").count("<tr") == 0
 
 
 def test_a_search_keeps_the_columns_and_their_order(client):
@@ -302,7 +308,7 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
             writer.add_scalars("v", {str(i): i + step for i in range(100)}, step)
     page = page_of(client, "/runs/alone")
     tabs = re.findall(r'<li><a href="/runs/\w+/?(\w*)"', page[page.index("tabs") :])
-    assert tabs == ["", "system", "console", "config", "code"]
+    assert tabs == ["", "system", "console", "code", "config"]
     assert "Training steps" not in page
     curves = client.get("/api/v1/curves?run=alone").json()
     assert ([axis["label"] for axis in curves["axes"]], curves["axis"]) == (

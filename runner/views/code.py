@@ -1,0 +1,109 @@
+"""`code`: the code that ran, with the packages that it used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, BinaryIO, Final
+
+from runner.analysis.sections import Section, Source
+from runner.util.humanize import counted
+from runner.views.view import View
+
+if TYPE_CHECKING:
+    from runner.recording.code import Code
+    from runner.recording.reader import Recording
+    from runner.util.values import Json
+
+_MAX_LINES: Final = 5000
+"""Lines of the changes that people see; the file has all."""
+_MAX_FILES: Final = 100
+_NAMES: Final = {
+    "git": "Commit",
+    "git.branch": "Branch",
+    "git.remote": "Remote",
+    "git.not_recorded": "Git",
+    "command": "Command",
+    "code.script": "Script",
+    "code.not_recorded": "Not recorded",
+    "code.left_out": "Left out",
+}
+_PACKAGE: Final = "package."
+
+
+@dataclass(frozen=True)
+class RecordedCode:
+    """The code of a run, and the facts of its provenance that are about code."""
+
+    facts: Mapping[str, str]
+    packages: Mapping[str, str]
+    """Version of each installed package."""
+    code: Code
+    step_to_look_at = None
+
+    def as_json(self) -> Json:
+        """Return the facts, the text of each file, those that the commit does not have, and the changes."""
+        files = {"files": dict(self.code.files), "new": self.code.new, "patch": self.code.patch}
+        return {**self.facts, **files, "packages": dict(self.packages)}
+
+    def sections(self) -> list[Section]:
+        """Return facts, packages, the changes since the commit, and the files."""
+        facts = {_NAMES.get(key, key): text for key, text in self.facts.items()}
+        nothing = ["The code of this run was not recorded."]
+        sections = [Section("Commit and command", [] if facts else nothing, facts=facts)]
+        if self.packages:
+            sentence = f"{counted(len(self.packages), 'package')}."
+            sections.append(Section("Installed packages", [sentence], facts=self.packages, is_folded=True))
+        if lines := self.code.patch.splitlines():
+            more = f"{len(lines) - _MAX_LINES:,} more lines: `dualtaxi code RUN -o FILE.patch` writes all."
+            left_out = [more] * (len(lines) > _MAX_LINES)
+            sections.append(Section("Changes since the commit", left_out, diffs=[lines[:_MAX_LINES]]))
+        script = self.facts.get("code.script")
+        names = sorted(self.code.files, key=lambda path: path != script)
+        sources = [
+            Source(path, "not in the commit" if path in self.code.new else "", self.code.files[path])
+            for path in names[:_MAX_FILES]
+        ]
+        if sources:
+            more = f"{len(names) - _MAX_FILES:,} more files: `dualtaxi code RUN --json` has all."
+            left_out = [more] * (len(names) > _MAX_FILES)
+            sections.append(Section("Files", left_out, sources=sources))
+        return sections
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the facts as comments, which `git apply` ignores, and a patch."""
+        for key, text in self.facts.items():
+            stream.write(f"# {key}: {' '.join(text.split())}\n".encode(errors="replace"))
+        stream.write(self.code.to_patch().encode(errors="replace"))
+
+
+def code(recording: Recording) -> RecordedCode:
+    """Show the code that ran RUN: commit, script, changes since the commit, and files.
+
+    `git checkout COMMIT && git apply FILE.patch` restores it from the file that -o writes; without a commit
+    the patch has all files. With --json, `files` has the text of each recorded file, `new` those that the
+    commit does not have, `patch` the changes since the commit, and `packages` the installed packages.
+
+    Examples:
+      dualtaxi code @latest
+      dualtaxi code k3v9m2xq -o changes.patch
+      dualtaxi code k3v9m2xq --json
+    """
+    provenance = recording.provenance
+    is_code = ("git", "code.")
+    return RecordedCode(
+        {key: text for key, text in provenance.items() if key.startswith(is_code) or key == "command"},
+        {key.removeprefix(_PACKAGE): text for key, text in provenance.items() if key.startswith(_PACKAGE)},
+        recording.code,
+    )
+
+
+VIEW: Final = View(
+    "code",
+    "Code",
+    code,
+    counts_steps=False,
+    has_default=True,
+    file_ending=".patch",
+    file_help="Write a patch for `git apply` that makes this code of the commit.",
+)

@@ -1,0 +1,137 @@
+"""`episodes`: how the episodes of a run ended, with a link to the replay of each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from runner.analysis.sections import Grid, Paging, Section
+from runner.util.humanize import counted, number_column
+from runner.views.view import START, STOP, View, rows_in, view_input
+
+if TYPE_CHECKING:
+    from runner.analysis.episodes import EpisodeRef
+    from runner.analysis.frames import Phase
+    from runner.recording.reader import Recording
+    from runner.util.values import Json
+
+_ROWS: Final = 100
+_HIDDEN: Final = ("episode", "success", "terminated", "truncated", "last_step")
+"""Columns that the table does not show as they are."""
+
+
+_PHASE: Final = view_input(
+    "phase",
+    "Training episodes, or the trials of evaluations.  [default: train]",
+    default="train",
+    label="Phase",
+    values=("train", "eval"),
+)
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Some episodes of a phase."""
+
+    run_id: str
+    phase: str
+    start: int
+    total: int
+    """Number of all episodes of the phase."""
+    columns: Mapping[str, list[Any]]
+    references: Sequence[EpisodeRef]
+    headings: Mapping[str, str]
+    """Heading of each column of the table."""
+    step_to_look_at = None
+
+    def as_json(self) -> Json:
+        """Return a list for each column."""
+        return {
+            "run_id": self.run_id,
+            "start": self.start,
+            "total": self.total,
+            "columns": dict(self.columns),
+        }
+
+    def sections(self) -> list[Section]:
+        """Return a table with a row for each episode."""
+        from runner.analysis.episodes import UNKNOWN_EVALUATION
+
+        is_training = self.phase == "train"
+        title = "Training episodes" if is_training else "Trials of evaluations"
+        if not self.references:
+            text = f"There are {self.total:,}, from 0." if self.total else "None was recorded."
+            return [Section(title, [text])]
+        cells = [number_column(self.columns[name]) for name in self.headings]
+        rows = [
+            (
+                str(at.episode)
+                if at.after in (None, UNKNOWN_EVALUATION)
+                else f"{at.after}, trial {at.episode}",
+                self._end(i),
+                *(column[i] for column in cells),
+            )
+            for i, at in enumerate(self.references)
+        ]
+        links = [
+            "" if at.after == UNKNOWN_EVALUATION else f"replay/{at.episode_path}" for at in self.references
+        ]
+        paging = Paging(self.start // _ROWS + 1, self.total, _ROWS, f"{VIEW.name}?phase={self.phase}")
+        headings = ("episode" if is_training else "trial", "end", *self.headings.values())
+        sentence = counted(self.total, "episode" if is_training else "trial")
+        if len(rows) < self.total:
+            sentence = f"Numbers {self.start:,} to {self.start + len(rows) - 1:,} of {sentence}"
+        return [Section(title, [f"{sentence}."], [Grid(headings, rows, links=links, paging=paging)])]
+
+    def _end(self, i: int) -> str:
+        if self.columns["success"][i] > 0:
+            return "success"
+        if self.columns["terminated"][i]:
+            return "ended"
+        return "step limit" if self.columns["truncated"][i] else "cut off"
+
+
+def episodes(
+    recording: Recording,
+    phase: Phase = _PHASE,
+    start: Any = START,
+    stop: Any = STOP,
+) -> Episodes:
+    """Show the episodes of RUN: how each ended, its length, returns and events.
+
+    In Python, runner.frames.episodes() has all of them.
+
+    Examples:
+      dualtaxi episodes @latest
+      dualtaxi episodes k3v9m2xq --phase eval --start 100 --stop 200
+    """
+    from runner.analysis.episodes import references
+    from runner.analysis.frames import episode_columns
+    from runner.environments.naming import event_in_words
+
+    total, rows = recording.phase(phase).episodes.count(), rows_in(start, stop)
+    columns = episode_columns(recording, phase, min(rows.start, total), min(rows.stop, total))
+    shown = [name for name in columns if name not in _HIDDEN]
+    if recording.environment["penalty_below"] is None:
+        shown.remove("penalties")
+    headings = {name: event_in_words(name) for name in shown}
+    for agent in recording.agents:
+        name = f"return.{agent}"
+        headings[name] = "return" if len(recording.agents) == 1 else event_in_words(name)
+    values = {name: column.tolist() for name, column in columns.items()}
+    numbers = references(recording, phase, values["episode"])
+    return Episodes(recording.run_id, phase, rows.start, total, values, numbers, headings)
+
+
+VIEW: Final = View(
+    "episodes",
+    "Episodes",
+    episodes,
+    button="Show",
+    counts_steps=False,
+    has_default=True,
+    is_live=True,
+    needs="episodes",
+    rows_per_page=_ROWS,
+)
