@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from typing import Final
 
@@ -14,7 +13,8 @@ from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
-from runner.util.values import JsonView, flatten, is_whole
+from runner.runs.run import Run
+from runner.util.values import is_whole
 
 ENDINGS: Final = {
     "success": "ended in success",
@@ -44,6 +44,13 @@ def shortcomings(recording: Recording) -> list[str]:
             sentence = f"Run {recording.run_id}: {error.partition(', and ')[0]}."
         sentences.append(sentence)
     return sentences + [f"Some messages of {topic} were lost in a repair." for topic in recording.lost]
+
+
+def damage_of(run: Run, recording: Recording) -> str:
+    """Return what is wrong with the recording of a run, as far as opening it shows; empty if nothing is."""
+    if run.status == "finished" != recording.status:
+        return f"{run.recording}: is cut off, though its run is finished; `dualtaxi verify` says where."
+    return ""
 
 
 def require_steps(recording: Recording, purpose: str, may_redo: bool = False) -> None:
@@ -94,9 +101,3 @@ def whole_ranges(
                 f"there are {count:,}, from 0. Ranges are of whole episodes: START..STOP, STOP not included."
             )
     return whole
-
-
-def flat_text(config: JsonView) -> dict[str, str]:
-    """Return a resolved configuration as flat text: `evaluation.trials` is `100`; lists as JSON."""
-    flat = flatten(config, keep_empty=True)
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in flat.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +19,11 @@ from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.util import humanize
 from runner.util.arrays import Ints, Records
 from runner.util.values import Json, finite
+
+MAX_SPREAD: Final = 20
+"""Evaluations that the summary of a run shows."""
+_DISPENSABLE: Final = ("pickup",)
+"""Events that follow from others."""
 
 
 @dataclass(frozen=True)
@@ -292,6 +298,50 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
         for agent, *column in zip(values[0], *texts, strict=True):
             columns[f"{metric.heading} {spoken(agent)}"] = column
     return columns
+
+
+def spread(records: Sequence[EvaluationRecord]) -> list[EvaluationRecord]:
+    """Return at most `MAX_SPREAD` evaluations, evenly spread, with the first and the last."""
+    if len(records) <= MAX_SPREAD:
+        return list(records)
+    return [records[round(i * (len(records) - 1) / (MAX_SPREAD - 1))] for i in range(MAX_SPREAD)]
+
+
+def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequence[str]) -> Grid:
+    """Return evaluations, one at least, as a table for a terminal.
+
+    Successes are shown for each agent (`12/9`), other events summed over the agents. Of the events, a narrow
+    terminal leaves out those first that follow from others.
+    """
+    columns = metric_columns(records, is_narrow=True)
+    if records[0].training is not None:  # the returns of a job would leave no room for its events
+        columns.pop("mean return", None)
+    kinds: dict[str, list[str]] = {}
+    for name in records[0].events:
+        kinds.setdefault(name.rpartition(".")[2], []).append(name)
+    spare: list[str] = []
+    for kind, names in sorted(kinds.items(), key=lambda own: (own[1][0] not in success_events, len(own[1]))):
+        counts = [[record.events[name] for name in names] for record in records]
+        heading, cells = spoken(kind), [str(sum(own)) for own in counts]
+        if names[0] in success_events and len(names) > 1:
+            agents = [name.rpartition(".")[0].rpartition("_")[2] for name in names]
+            heading, cells = f"{heading} {'/'.join(agents)}", ["/".join(map(str, own)) for own in counts]
+        columns[heading] = cells
+        spare.insert(0, heading)
+    spare.sort(key=lambda heading: heading not in _DISPENSABLE)
+    filled = [list(record.training.percent_filled.values()) for record in records if record.training]
+    if filled:
+        digits = 0 if len(filled[0]) > 1 else 1
+        columns["filled %"] = ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled]
+    broken = {heading: heading.replace(" ", "\n", 1) for heading in columns}
+    return Grid(
+        tuple(broken.values()),
+        list(zip(*columns.values(), strict=True)),
+        left=(),
+        cut=(),
+        spare=tuple(map(broken.__getitem__, spare)),
+        gap=1,
+    )
 
 
 def evaluations_section(

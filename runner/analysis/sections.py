@@ -83,10 +83,20 @@ class Grid:
     """The stream of each row, if the rows are lines of output: `stdout`, `stderr` or `note`."""
     paging: Paging | None = None
     """The links to other rows, if the table is a part of a longer one."""
+    left: tuple[str, ...] | None = None
+    """Headings of the columns that are aligned to the left; None for those with other text than numbers."""
+    cut: tuple[str, ...] | None = None
+    """Headings of the columns whose cells a narrow terminal cuts, to keep a line a row; None wraps all."""
+    spare: tuple[str, ...] = ()
+    """Headings of the columns that a narrow terminal leaves out, in this order."""
+    gap: int = 2
+    """Blanks between columns of text."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:
-        """Whether each column has numbers, which are aligned to the right, and no other text."""
+        """Whether each column is aligned to the right, as numbers are."""
+        if self.left is not None:
+            return tuple(heading not in self.left for heading in self.headings)
         columns: list[list[str]] = [[str(cell) for cell in column] for column in zip(*self.rows, strict=True)]
         return tuple(
             any(column) and not any(_NUMBERS.sub("", cell) for cell in column)
@@ -100,6 +110,7 @@ class Section:
 
     title: str
     sentences: list[str] = field(default_factory=list)
+    """Paragraphs; a text of several lines is shown as it is."""
     grids: list[Grid] = field(default_factory=list)
     diffs: list[list[str]] = field(default_factory=list)
     """Unified diffs, each as its lines."""
@@ -118,6 +129,11 @@ class Section:
     """Whether a page folds the facts, and text leaves them out."""
 
     @property
+    def shown_facts(self) -> dict[str, str]:
+        """The facts in text, without empty ones."""
+        return {} if self.is_folded else {name: text for name, text in self.facts.items() if text}
+
+    @property
     def tables(self) -> list[Grid]:
         """The tables of the section in text."""
         rows = [(file.path, file.state, f"{file.text.count(chr(10)):,}") for file in self.sources]
@@ -132,20 +148,25 @@ class Section:
 def markdown(sections: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of sections in Markdown."""
     for section in sections:
-        yield from (f"## {section.title}", "")
-        facts = {} if section.is_folded else section.facts
-        yield from (f"- {name}: {text}" for name, text in facts.items())
+        yield from (f"## {section.title}", "") if section.title else ()
+        facts = [(name, text.replace("\n", "\\\n  ")) for name, text in section.shown_facts.items()]
+        yield from (f"- {name}: {text}" for name, text in facts)
         yield from [""] * bool(facts)
         for sentence in [*section.sentences, *([NOT_DRAWN] if section.charts else [])]:
-            yield from (sentence, "")
+            yield from _fenced(sentence.splitlines()) if "\n" in sentence else (sentence, "")
         for grid in section.tables:
             yield _row(grid.headings)
             yield _row(tuple("---:" if is_number else "---" for is_number in grid.numeric))
             yield from (_row(row) for row in grid.rows)
             yield ""
         for lines in section.diffs:
-            fence = "`" * max([3, *(len(run) + 1 for line in lines for run in re.findall("`{3,}", line))])
-            yield from (f"{fence}diff", *lines, fence, "")
+            yield from _fenced(lines, "diff")
+
+
+def _fenced(lines: Sequence[str], language: str = "") -> tuple[str, ...]:
+    """Return lines as a block of code."""
+    fence = "`" * max([3, *(len(run) + 1 for line in lines for run in re.findall("`{3,}", line))])
+    return f"{fence}{language}", *lines, fence, ""
 
 
 def html(sections: Sequence[Section]) -> str:
@@ -153,7 +174,16 @@ def html(sections: Sequence[Section]) -> str:
     parts = []
     for section in sections:
         parts += [f"<h3>{escape(section.title)}</h3>"]
-        parts += [f"<p>{escape(sentence)}</p>" for sentence in section.sentences]
+        if section.shown_facts:
+            pairs = "".join(
+                f'<tr><th scope="row" style="text-align:left">{escape(name)}</th>'
+                f'<td style="text-align:left;white-space:pre-wrap">{escape(text)}</td></tr>'
+                for name, text in section.shown_facts.items()
+            )
+            parts.append(f"<table><tbody>{pairs}</tbody></table>")
+        for sentence in section.sentences:
+            tag = "pre" if "\n" in sentence else "p"
+            parts.append(f"<{tag}>{escape(sentence)}</{tag}>")
         for grid in section.tables:
             sides = [f' style="text-align:{"right" if is_number else "left"}"' for is_number in grid.numeric]
             head = "".join(

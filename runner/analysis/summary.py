@@ -1,19 +1,26 @@
-"""All about one run: what `show` and the service report."""
+"""All about one run: what `show`, the pages, reports and notebooks say of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
+from runner.analysis.contents import damage_of
 from runner.analysis.evaluations import (
     EvaluationRecord,
     TrainingRecord,
     evaluation_records,
+    evaluations_grid,
     loop_summary,
     training_records,
 )
+from runner.analysis.sections import Grid, Section, html
+from runner.config.document import write_yaml
+from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.clock import Clock, read_clock
@@ -21,13 +28,20 @@ from runner.recording.composition import Composition, composition_of
 from runner.recording.maker import Shard
 from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
-from runner.recording.run_file import Summary
+from runner.recording.run_file import Summary, has_environment
 from runner.recording.spaces import Description
 from runner.replay.recorded import RecordedReset, resets_of
+from runner.runs.branches import Origin, origin_in
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
+from runner.util.humanize import UNKNOWN, counted, duration, number, size
 from runner.util.processes import Tell
 from runner.util.values import Json, JsonView
+
+MAX_PROCESSES: Final = 16
+"""Names of processes shown."""
+MAX_CYCLES: Final = 8
+"""Cycles of states shown, in which episodes reach the step limit."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +53,12 @@ class TableFill:
     """Training steps before the report."""
     zero_cells: int | None = None
     percent_filled: float | None = None
+
+    def __str__(self) -> str:
+        if self.step is None:
+            return UNKNOWN
+        filled = f"{self.percent_filled:.1f} % filled, {self.zero_cells:,} cells are still zero"
+        return f"{filled}, after {self.step:,} steps"
 
     def as_json(self) -> Json:
         """Return what is known, by name."""
@@ -93,6 +113,15 @@ class RunDetails:
     """The processes that recorded a loop together; empty if it was one."""
     clock: Clock | None = None
     """The time that was recorded; None without samples."""
+    damage: str = ""
+    """What is wrong with `run.json` or with the recording, as far as reading it shows."""
+    job: str = ""
+    """The hash of its job."""
+    spaces: str = ""
+    """The spaces of a loop's environment, in words."""
+    environments: int = 1
+    branches: Mapping[str, Origin] = field(default_factory=dict)
+    """Where its branches begin, by run id, if that was looked up."""
 
     def facts(self) -> dict[str, object]:
         """Return everything but the series, as JSON can hold it."""
@@ -103,7 +132,7 @@ class RunDetails:
             "seed": run.seed if run.has_seed else None,
             "status": run.status,
             "created": run.created_text,
-            **({"damage": run.problem} if run.problem else {}),
+            **({"damage": self.damage} if self.damage else {}),
             "path": str(run.recording.absolute()),
             "bytes": self.bytes,
             "content_digest": summary.content_digest,
@@ -126,50 +155,186 @@ class RunDetails:
 
     def as_json(self) -> Json:
         """Return everything, as JSON can hold it."""
+        origin = origin_in(self.config)
         return self.facts() | {
+            "origin": None if origin is None else asdict(origin),
+            "branches": {name: asdict(branch) for name, branch in self.branches.items()},
             "eval": [record.as_json() for record in self.evaluations],
             "optimality": [dict(measures) for measures in self.optimality],
             "train": [record.as_json() for record in self.training],
             "checkpoints": [checkpoint.as_json() for checkpoint in self.checkpoints],
         }
 
+    def sections(self) -> list[Section]:
+        """Return what people see of the run: what it is, its results, its configuration and provenance."""
+        run, first, *made = self.run, *self.origin_sections()
+        has_steps = has_environment(self.config)
+        results = [
+            Section("Last results", facts={} if self.loop is None else _loop_results(self.loop, has_steps)),
+            Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
+            Section("Branches", facts={name: str(origin) for name, origin in self.branches.items()}),
+            Section("Greedy policy, exactly", facts=self._optimality()),
+            Section("Tables", facts={table.agent: str(table) for table in self.tables}),
+        ]
+        if self.evaluations:
+            grid = evaluations_grid(self.evaluations, self.success_events)
+            results.insert(0, Section("Evaluations", grids=[grid]))
+        if self.checkpoints:
+            last = self.checkpoints[-1].reference
+            text = (
+                f"{len(self.checkpoints):,}, the last {last}; `dualtaxi checkpoints {run.run_id}` lists them."
+            )
+            results.append(Section("Checkpoints", [text]))
+        if run.marks:
+            rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
+            results.append(Section("Marks", grids=[Grid(("step", "text", "tags"), rows)]))
+        return [first, *(each for each in results if each.facts or each.grids or each.sentences), *made]
 
-def describe_run(run: Run, report: Tell = lambda _: None) -> RunDetails:
+    def _repr_html_(self) -> str:
+        return html(self.sections())
+
+    def origin_sections(self) -> list[Section]:
+        """Return what identifies the run, its configuration and its provenance."""
+        given = {key: value for key, value in self.config.items() if value not in ([], {})}
+        if (frames := given.get("frames")) and isinstance(frames, Mapping) and not frames.get("every"):
+            del given["frames"]
+        if not has_environment(given):
+            given.pop("env", None)
+        yaml = write_yaml(given, is_compact=True).rstrip()
+        sections = [
+            Section("The run", facts={name: text for name, text in self._identity().items() if text}),
+            Section("Configuration", [yaml]),
+            Section("Provenance", facts=brief_provenance(self.provenance)),
+        ]
+        return sections if self.provenance else sections[:2]
+
+    def _identity(self) -> dict[str, str]:
+        run, summary, origin = self.run, self.run.summary, origin_in(self.config)
+        clock, steps, environment, folder = (
+            self.clock,
+            "",
+            str(self.environment or ""),
+            f"{run.folder}{os.sep}",
+        )
+        if environment and None not in (self.train_steps, self.episodes, self.eval_steps):
+            steps = f"{self.train_steps:,} of training in {counted(self.episodes or 0, 'episode')}, "
+            steps += f"{self.eval_steps:,} of evaluation"
+        if self.environments > 1:
+            environment += f", {self.environments:,} in parallel"
+        time = ""
+        if clock is not None and clock.steps_a_second is not None:
+            time = f"{duration(clock.duration)} recorded"
+            if self.train_steps or self.eval_steps:
+                time += f", {clock.steps_a_second:,.0f} steps a second"
+        took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
+        by = self.config.get("made_by")
+        return {
+            "run": f"{run.run_id}  {run.title}",
+            "status": f"{run.status}, begun {run.created:%Y-%m-%d %H:%M:%S} UTC{took}",
+            "damage": self.damage.replace(folder, ""),
+            "error": (summary.error or "").replace(folder, ""),
+            "branch": "" if origin is None else f"of run {origin.run} {origin}",
+            "processes": _processes(self.shards),
+            "recorded": f"{'from a loop' if environment else 'logged values'}, by {by}" if by else "",
+            "environment": environment,
+            "spaces": self.spaces,
+            "steps": steps,
+            "first reset": "; ".join(
+                f"{schema.PHASE_NAMES[phase]} with {reset.in_words}"
+                for phase, reset in self.first_resets.items()
+                if reset.in_words
+            ),
+            "time": time,
+            "job": self.job,
+            "digest": summary.content_digest or f"{UNKNOWN} (written when a run ends properly)",
+            "size": size(self.bytes) if self.bytes else "no recording",
+        }
+
+    def _optimality(self) -> dict[str, str]:
+        """Return the last exact measures, next to the optimum; empty without any."""
+        if not self.optimality:
+            return {}
+        measures = self.optimality[-1]
+        with open_recording(self.run.recording) as recording:
+            states = states_in_words(recording.mdp)
+            gains = zip(recording.agents, measures["values"], measures["best_responses"], strict=True)
+        gain = " and ".join(f"{best - own:.3f} ({agent})" for agent, own, best in gains)
+        rows = {
+            "succeeds": f"{measures['success_percent']:.1f} % of {measures['starts']:,} start states "
+            f"(the optimum {measures['optimal_success_percent']:.1f} %)",
+            "length": f"{measures['mean_length']:.2f} steps "
+            f"(the optimum {measures['optimal_mean_length']:.2f})",
+            "value": f"{sum(measures['values']):.3f} of {measures['optimal_value']:.3f} that are possible",
+            "to gain": f"{gain}, by a best response",
+        }
+        cycles = zip(*(measures[f"cycle_{key}"] for key in ("states", "lengths", "percents")), strict=True)
+        lines = [
+            f"{percent:.1f} %  {f'round {length} states' if length > 1 else 'one state'}: {states[state]}"
+            for state, length, percent in cycles
+        ]
+        if len(lines) > MAX_CYCLES:
+            lines[MAX_CYCLES:] = [f"and {len(lines) - MAX_CYCLES:,} more cycles (--json)"]
+        return rows | ({"stuck in": "\n".join(lines)} if lines else {})
+
+
+def describe_run(run: Run, report: Tell = lambda _: None, with_results: bool = True) -> RunDetails:
     """Return all about a run; `report` is called with a sentence if the recording cannot be read."""
-    summary, config = run.summary, run.file.config
+    summary, damage = run.summary, run.problem
     if run.recording.is_file():
         try:
             with open_recording(run.recording) as recording:
-                done = recording.done() | {key: summary[key] for key in recording.done() if key in summary}
-                return RunDetails(
-                    run,
-                    config if config == recording.config else recording.config,  # the former in better order
-                    **done,
-                    environment=composition_of(recording),
-                    bytes=recording.file.size,
-                    shards=recording.shards,
-                    clock=read_clock(recording),
-                    provenance=recording.provenance,
-                    success_events=tuple(recording.environment["success_events"]),
-                    tables=_tables(recording),
-                    evaluations=tuple(evaluation_records(recording)),
-                    optimality=tuple(
-                        {key: value for key, value in measures.items() if key != "log_time"}
-                        for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
-                    ),
-                    training=tuple(training_records(recording)),
-                    loop=None if recording.eval.has_metrics else loop_summary(recording),
-                    extras=_extras(recording),
-                    first_resets={
-                        phase: reset
-                        for phase in schema.PHASES
-                        if (reset := next(resets_of(recording, phase), None)) is not None
-                    },
-                    checkpoints=tuple(read_checkpoints(recording, run.folder.parent)),
-                )
+                return describe_recording(run, recording, with_results)
         except RecordingError as error:
             report(f"Only what run.json says: {error}")
-    return RunDetails(run, config, summary.episodes, summary.train_steps, summary.eval_steps)
+            damage = damage or str(error)
+    known = summary.episodes, summary.train_steps, summary.eval_steps
+    return RunDetails(run, run.file.config, *known, damage=damage)
+
+
+def describe_recording(run: Run, recording: Recording, with_results: bool = True) -> RunDetails:
+    """Return all about a run whose recording is open; without the results it takes no time.
+
+    Raises:
+        RecordingError: it is damaged.
+    """
+    config, is_loop = run.file.config, not recording.can_train_again
+    done = recording.done() | {key: run.summary[key] for key in recording.done() if key in run.summary}
+    spaces = recording.spaces if is_loop and has_environment(recording.config) else {}
+    details = RunDetails(
+        run,
+        config if config == recording.config else recording.config,  # the former in better order
+        **done,
+        environment=composition_of(recording),
+        bytes=recording.file.size,
+        shards=recording.shards,
+        clock=read_clock(recording),
+        provenance=recording.provenance,
+        success_events=tuple(recording.environment["success_events"]),
+        first_resets={
+            phase: reset
+            for phase in schema.PHASES
+            if (reset := next(resets_of(recording, phase), None)) is not None
+        },
+        damage=run.problem or damage_of(run, recording),
+        job=recording.run["job"],
+        spaces=", ".join(f"{name} {space['type']}" for name, space in spaces.items()),
+        environments=recording.environments,
+    )
+    if not with_results:
+        return details
+    return replace(
+        details,
+        tables=_tables(recording),
+        evaluations=tuple(evaluation_records(recording)),
+        optimality=tuple(
+            {key: value for key, value in measures.items() if key != "log_time"}
+            for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
+        ),
+        training=tuple(training_records(recording)),
+        loop=None if recording.eval.has_metrics else loop_summary(recording),
+        extras=_extras(recording),
+        checkpoints=tuple(read_checkpoints(recording, run.folder.parent)),
+    )
 
 
 def _extras(recording: Recording) -> dict[str, RecordedExtras]:
@@ -225,3 +390,35 @@ def _tables(recording: Recording) -> tuple[TableFill, ...]:
         return tuple(map(TableFill, recording.agents if recording.table(schema.Q_TABLE_TOPIC) else ()))
     fill = zip(recording.agents, last["zero_cells"], last["percent_filled"], strict=True)
     return tuple(TableFill(agent, last["step"], zero, filled) for agent, zero, filled in fill)
+
+
+def _processes(shards: Sequence[Shard]) -> str:
+    """Return the names of the processes that recorded a run, and how they ended if not properly."""
+    ill = [shard for shard in shards[1:] if shard.status != "finished"]  # the run has the status of the first
+    names = [shard.name or "the one that began the run" for shard in shards[:MAX_PROCESSES]]
+    more = [f"{len(shards) - MAX_PROCESSES:,} more"] if len(shards) > MAX_PROCESSES else []
+    ends = [f"{shard.name} {shard.status}" for shard in ill[:MAX_PROCESSES]]
+    ends += [f"{len(ill) - MAX_PROCESSES:,} more"] if len(ill) > MAX_PROCESSES else []
+    return "; ".join(", ".join(part) for part in (names + more, ends) if part)
+
+
+def _loop_results(loop: Summary, with_environment: bool) -> dict[str, str]:
+    """Return the means of a loop's last training episodes and the values it logged last."""
+    results = {"training": "no episode ended"} if with_environment else {}
+    if (recent := loop.recent_training) and recent.episodes:
+        episodes = f"last {recent.episodes:,} episodes" if recent.episodes > 1 else "one episode"
+        means = f"mean return {number(recent.mean_return)}, mean length {number(recent.mean_length)}"
+        results["training"] = f"{means} ({episodes})"
+    for name, value in loop.logged.items():
+        results[f"logged {name}"] = "not finite" if value is None else f"{value:,.6g}"
+    return results
+
+
+def _extras_in_words(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
+    """Return the number of steps with extras, and dtype and shape of each name: `int64 [T]`."""
+    rows = {f"{schema.PHASE_NAMES[phase]} steps": f"{own.steps:,}" for phase, own in extras.items()}
+    for own in extras.values():
+        for name, (dtype, shape) in own.names.items():
+            lengths = ", ".join("T" if n is None else str(n) for n in shape)
+            rows[name] = f"{dtype} [{lengths}]" if shape else dtype
+    return rows

@@ -90,7 +90,7 @@ class Command(click.Command):
         callback: Callable[..., object],
         declared: Mapping[str, Declared] | None = None,
         params: Sequence[click.Parameter] = (),
-        forms: Sequence[str] = ("json",),
+        forms: Sequence[str] = ("json", "markdown"),
         **attributes: Any,
     ) -> None:
         call = _Record(callback, declared)

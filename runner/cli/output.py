@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,8 +29,11 @@ if TYPE_CHECKING:  # imported when something is drawn
     from rich.table import Table
     from rich.text import Text
 
-SHRUNK: Final = 10
-"""Minimum characters of a shrinking column."""
+_LEAST: Final = {"cut": 14, "wrapped": 10}
+"""Characters that a column keeps where it does not fit a terminal."""
+
+MAX_DRAWN: Final = 1000
+"""Rows drawn in the style of a terminal, which takes a second for every few thousand."""
 
 UNBOUNDED: Final = 1 << 16
 """Width without a terminal: more than the longest line of a run's output."""
@@ -47,9 +50,8 @@ class Remark(str):
     __slots__ = ()
 
 
-if TYPE_CHECKING:
-    Part = str | Mapping[str, str] | Grid | Section | RenderableType
-    """What a reply's text consists of: lines, names and values, tables, sections."""
+Part = str | Mapping[str, str] | Grid | Section
+"""What a reply's text consists of: lines, names and values, tables, sections."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +81,16 @@ def print_replies(replies: Reply | Iterable[Reply], form: str = "text") -> int:
             parts = [json.dumps(finite(data), indent=1) + "\n"] if isinstance(data, Mapping) else data
             sys.stdout.writelines(map(printable, parts))
         elif form == "markdown":
-            text = [*reply.text]
-            echo("\n".join(markdown([part for part in text if isinstance(part, Section)])))
-            draw(*[part for part in text if isinstance(part, Remark)])
+            for part in reply.text:
+                if isinstance(part, Remark):
+                    say(part)
+                elif part:
+                    echo("\n".join(markdown([_as_section(part)])))
         elif form == "csv" or reply.text == ():
             sys.stdout.writelines(map(printable, reply.csv))
         elif not reply.page:
-            for part in reply.text:
-                draw(part)
+            for number, part in enumerate(reply.text):
+                draw(part, is_first=not number)
         sys.stdout.flush()
         for note in reply.notes:
             say(note)
@@ -176,56 +180,52 @@ def console(stderr: bool = False) -> Console:
     return drawn
 
 
-def draw(*parts: Part) -> None:
-    """Print lines and tables on stdout, remarks on stderr."""
-    for part in parts:
-        if isinstance(part, Remark):
-            say(part)
-        elif isinstance(part, str):
-            echo(part)
-        elif isinstance(part, Section):
-            has_facts = part.facts and not part.is_folded
-            _render(facts(part.facts) if has_facts else title(part.title), *part.sentences)
-            draw(*part.tables, *map(patch_text, part.diffs), *([NOT_DRAWN] if part.charts else []))
-        elif isinstance(part, Mapping):
-            _render(facts(part))
-        elif isinstance(part, Grid):
-            _render(grid_table(part))
+def draw(part: Part, is_first: bool = False) -> None:
+    """Print a part of a text on stdout, a remark on stderr; facts that come first need no title."""
+    if isinstance(part, Remark):
+        say(part)
+        return
+    if isinstance(part, str):
+        echo(part)
+        return
+    section = _as_section(part)
+    pairs = section.shown_facts
+    heading = [title(section.title)] if section.title and not (pairs and is_first) else []
+    _render(*heading, *([facts(pairs)] if pairs else []))
+    for sentence in section.sentences:
+        echo(sentence) if "\n" in sentence else _render(sentence)
+    for grid in section.tables:
+        if not console().is_terminal or len(grid.rows) > MAX_DRAWN:
+            echo("\n".join(aligned(grid)))
         else:
-            _render(part)
+            _render(grid_table(grid, console().width))
+    _render(*map(patch_text, section.diffs), *([NOT_DRAWN] if section.charts else []))
+
+
+def _as_section(part: str | Mapping[str, str] | Grid | Section) -> Section:
+    if isinstance(part, Section):
+        return part
+    if isinstance(part, Grid):
+        return Section("", grids=[part])
+    return Section("", [part]) if isinstance(part, str) else Section("", facts=part)
 
 
 def _render(*parts: RenderableType) -> None:
     """Print on stdout what Rich draws; without trailing blanks unless stdout is a terminal."""
+    if not parts:
+        return
     drawn = console()
     if drawn.is_terminal:
+        width = drawn.width
         for part in parts:
             # The terminal wraps lines that are too long: no number is truncated.
-            drawn.print(part, width=max(drawn.width, _least_width(part)), crop=False)
+            drawn.width = max(width, getattr(part, "min_width", None) or 0)
+            drawn.print(part, crop=False)
         return
     with drawn.capture() as captured:
         for part in parts:
             drawn.print(part)
     echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
-
-
-def _least_width(part: RenderableType) -> int:
-    """Return the width at which only the shrinking columns of a table are truncated."""
-    from rich.cells import cell_len
-    from rich.table import Table
-
-    if not isinstance(part, Table) or not part.columns or part.show_header is False:
-        return 0
-    widths = [
-        max(cell_len(line) for cell in (heading, *column.cells) for line in printable(str(cell)).split("\n"))
-        for column in part.columns
-        for heading in [getattr(column.header, "renderable", column.header)]
-    ]
-    shown = [
-        width if column.no_wrap else min(width, SHRUNK)
-        for width, column in zip(widths, part.columns, strict=True)
-    ]
-    return sum(shown) + 2 * len(shown)
 
 
 def title(text: str) -> Text:
@@ -235,36 +235,58 @@ def title(text: str) -> Text:
     return Text.assemble("\n", (text, "bold underline"))
 
 
-def table(
-    *headings: str,
-    rows: Iterable[Iterable[str]] = (),
-    left: tuple[str, ...] = (),
-    shrinking: tuple[str, ...] = (),
-) -> Table:
-    """Return a table of rows; cells of a row and headings of several lines are aligned.
+def grid_table(grid: Grid, width: int) -> Table:
+    """Return a grid as a table for a terminal of a width, without the spare columns for which it has no room.
 
-    Columns whose headings are in `left` are aligned to the left, as text is, others to the right; those in
-    `shrinking` are truncated where a terminal is too narrow.
+    Cells of a row and headings of several lines are aligned. Where a cell is not whole, the width of the
+    terminal is taken from the columns that may be cut or wrapped, but the table is at least `min_width` wide.
     """
     from rich.align import Align
+    from rich.cells import cell_len
     from rich.table import Table
+    from rich.text import Text
 
-    drawn = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    for heading in headings:
-        side: Literal["left", "right"] = "left" if heading in left else "right"
+    shown = dict(enumerate(grid.headings))
+    least = {
+        number: max(
+            cell_len(line)
+            for cell in (heading, *(row[number] for row in grid.rows))
+            for line in printable(cell).split("\n")
+        )
+        for number, heading in shown.items()
+    }
+    for number, heading in shown.items():
+        if grid.cut is None or heading in grid.cut:
+            least[number] = min(least[number], _LEAST["wrapped" if grid.cut is None else "cut"])
+    left_out = []
+    for heading in filter(grid.headings.__contains__, grid.spare):
+        if sum(map(least.__getitem__, shown)) + grid.gap * (len(shown) - 1) > width:
+            left_out.append(heading)
+            del shown[grid.headings.index(heading)]
+    drawn = Table(
+        box=None,
+        padding=(0, grid.gap, 0, 0),
+        pad_edge=False,
+        header_style="bold",
+        caption=f"No room for: {', '.join(left_out)}.".replace("\n", " ") if left_out else None,
+        caption_justify="left",
+        min_width=sum(map(least.__getitem__, shown)) + grid.gap * (len(shown) - 1),
+    )
+    numeric, cut = grid.numeric, grid.cut or ()
+    for number, heading in shown.items():
+        side: Literal["left", "right"] = "right" if numeric[number] else "left"
         header = Align(heading, side, vertical="bottom")
-        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=heading not in shrinking)
-    for row in rows:
-        drawn.add_row(*row)
+        is_whole = grid.cut is not None and heading not in cut
+        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=is_whole)
+    for row in grid.rows:
+        cells = {number: printable(row[number]) for number in shown}
+        drawn.add_row(
+            *(
+                Text(on_one_line(cell), no_wrap=True) if grid.headings[number] in cut else cell
+                for number, cell in cells.items()
+            )
+        )
     return drawn
-
-
-def grid_table(grid: Grid) -> Table:
-    """Return a grid as a table, numbers aligned to the right; its columns shrink on a narrow terminal."""
-    columns = zip(grid.headings, grid.numeric, strict=True)
-    left = tuple(heading for heading, is_number in columns if not is_number)
-    shrinking = grid.headings if console().is_terminal else ()
-    return table(*grid.headings, rows=grid.rows, left=left, shrinking=shrinking)
 
 
 def facts(pairs: Mapping[str, str]) -> Table:
@@ -280,16 +302,21 @@ def facts(pairs: Mapping[str, str]) -> Table:
     return grid
 
 
-def aligned(lines: Sequence[Sequence[str]], left: Sequence[bool]) -> list[str]:
-    """Return lines of cells aligned in columns; far quicker than a table where there are many."""
-    lines = [[on_one_line(cell) for cell in line] for line in lines]
+def aligned(grid: Grid) -> list[str]:
+    """Return the lines of a grid, a line for each row; far quicker than a table where there are many."""
+    headings = [heading.split("\n") for heading in grid.headings]
+    height = max(map(len, headings), default=0)
+    columns = [[*[""] * (height - len(lines)), *lines] for lines in headings]
+    lines = [[on_one_line(cell) for cell in line] for line in (*zip(*columns, strict=True), *grid.rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    columns = list(zip(widths, left, strict=True))
+    sides = list(zip(widths, grid.numeric, strict=True))
     return [
-        "  ".join(
-            cell.ljust(width) if is_left else cell.rjust(width)
-            for cell, (width, is_left) in zip(line, columns, strict=True)
-        ).rstrip()
+        (" " * grid.gap)
+        .join(
+            cell.rjust(width) if is_number else cell.ljust(width)
+            for cell, (width, is_number) in zip(line, sides, strict=True)
+        )
+        .rstrip()
         for line in lines
     ]
 

@@ -53,7 +53,7 @@ def command_of(view: View) -> Command:
     if view.file_ending:
         output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=view.file_help)
         declared |= {"output": output, "force": force_option}
-    return Command(view.name, call, declared, forms=("json", "markdown"), help=view.help)
+    return Command(view.name, call, declared, help=view.help)
 
 
 def _declared(given: Input, view: View) -> Declared:

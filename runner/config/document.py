@@ -131,10 +131,11 @@ def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
     return Document(value, builder.places, builder.problems)
 
 
-def write_yaml(value: Mapping[str, object]) -> str:
-    """Return `value` as YAML, from which `read_yaml` returns an equal value."""
+def write_yaml(value: Mapping[str, object], is_compact: bool = False) -> str:
+    """Return `value` as YAML, from which `read_yaml` returns an equal value; compact with `{a: 1, b: 2}`."""
+    style = None if is_compact else False
     text: str = yaml.dump(
-        value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, allow_unicode=True, width=110
+        value, Dumper=_Dumper, sort_keys=False, default_flow_style=style, allow_unicode=True, width=110
     )
     return text
 

@@ -194,17 +194,8 @@ def _result_html(run: Run) -> str:
 
 
 def facts_html(run: Run) -> str:
-    """Return the facts of a run in `run.json` as a small table."""
-    last = run.summary.last_evaluation
-    evaluation = {"episode": last.episode, "trials": last.trials, **last.values} if last else {}
-    facts = {
-        "run": f"{run.run_id}, {run.status}",
-        "name": run.title,
-        "recording": str(run.recording),
-        **{f"last evaluation: {key.replace('_', ' ')}": value for key, value in evaluation.items()},
-    }
-    rows = "".join(
-        f'<tr><th scope="row" style="text-align:left">{escape(key)}</th><td>{escape(str(value))}</td></tr>'
-        for key, value in facts.items()
-    )
-    return f"<table>{rows}</table>"
+    """Return all about a run as `dualtaxi show` prints it."""
+    from runner.analysis.sections import html
+    from runner.analysis.summary import describe_run
+
+    return html(describe_run(run).sections())

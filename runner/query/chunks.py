@@ -21,6 +21,7 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 from pyarrow.fs import LocalFileSystem
 
+from runner.analysis.contents import damage_of
 from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.archive.columns import Shape, Table
@@ -139,10 +140,8 @@ def opened_tables(run: Run) -> Iterator[RunTables]:
     """
     if run.status != "archived":
         with open_recording(run.recording) as recording:
-            if run.status == "finished" != recording.status:
-                raise RecordingError(
-                    f"{run.recording}: is cut off, though its run is finished; `dualtaxi verify` says where."
-                )
+            if damage := damage_of(run, recording):
+                raise RecordingError(damage)
             batches = Batches(recording)
             yield RunTables(
                 batches.shape,

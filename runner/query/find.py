@@ -137,6 +137,7 @@ class Found:
     @property
     def grid(self) -> Grid:
         """The hits as a table."""
+        cut = ("name", "events", "marks")
         headings = ("run", "name", "episode", "return", "length", "ended", "events", "marks")
         rows = []
         for hit in self.hits:
@@ -144,7 +145,13 @@ class Found:
             events = ", ".join(f"{name} {hit.events[name]:,}" for name in most)
             numbers = UNKNOWN if hit.ret is None else f"{hit.ret:,.6g}", f"{hit.length:,}"
             rows.append((hit.run_id, hit.name, hit.at, *numbers, hit.ended, events, ", ".join(hit.marks)))
-        return Grid(headings, rows)
+        shown = [
+            (heading, *cells)
+            for heading, *cells in zip(headings, *rows, strict=True)
+            if any(cells) or heading not in cut
+        ]
+        headings, *rows = zip(*shown, strict=True)
+        return Grid(headings, rows, left=("run", "ended", *cut), cut=cut)
 
     def as_json(self) -> Json:
         """Return the result as JSON can hold it."""

@@ -96,9 +96,9 @@ class Clock:
 
     @property
     def steps_a_second(self) -> float | None:
-        """The mean rate, of training and evaluation together; None if no time passed."""
+        """The mean rate, of training and evaluation together; None if no step or no time was recorded."""
         steps = int(self.positions[-1] - self.positions[0])
-        return steps / self.duration if self.duration > 0 else None
+        return steps / self.duration if steps and self.duration > 0 else None
 
     def seconds_at(self, positions: Ints) -> Floats:
         """Return the seconds that had passed at each number of steps, interpolated between samples.

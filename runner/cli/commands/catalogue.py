@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from runner.analysis.sections import Grid, Section
 from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     filter_argument,
@@ -18,7 +19,7 @@ from runner.cli.options import (
     limit_option,
     tags_option,
 )
-from runner.cli.output import Remark, Reply, say, table, title
+from runner.cli.output import Remark, Reply, say
 from runner.cli.runs import found_run
 from runner.errors import ExitCode, RunnerError
 from runner.runs.catalogue.columns import with_same_as
@@ -101,7 +102,8 @@ def mark_command(
     if removed:
         unmark(run, *removed)
     rows = [(mark.id, mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
-    grid = table("mark", "step", "text", "tags", rows=rows, left=("mark", "step", "text", "tags"))
+    headings = ("mark", "step", "text", "tags")
+    grid = Grid(headings, rows, left=headings)
     values = {"run_id": run.run_id, "marks": [mark.as_row() for mark in run.marks]}
     return Reply(values, [grid if rows else f"Run {run.run_id} has no marks."])
 
@@ -173,24 +175,23 @@ def _text(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Ite
 
     same_as = ["same as"] if any(usage.row["same_as"] for usage in largest) else []
     left = ("id", "name", "status", "same as")
-    grid = table("id", "name", "status", *kinds, *same_as, left=left, shrinking=("name",))
+    rows = []
     for usage in largest:
         row = usage.row
         originals = [row["same_as"] or ""] if same_as else []
-        grid.add_row(row["id"], row["name"], row["status"], *cells(usage.bytes), *originals)
+        rows.append((row["id"], row["name"], row["status"], *cells(usage.bytes), *originals))
     if sums.runs > len(largest):
         rest = {kind: total[kind] - sum(usage.bytes[kind] for usage in largest) for kind in kinds}
-        grid.add_row(f"{sums.runs - len(largest):,} more", "", "", *cells(rest))
-    grid.add_row("all", "", "", *cells(total), style="bold")
-    yield grid
+        rows.append((f"{sums.runs - len(largest):,} more", "", "", *cells(rest), *[""] * len(same_as)))
+    rows.append(("all", "", "", *cells(total), *[""] * len(same_as)))
+    yield Grid(("id", "name", "status", *kinds, *same_as), rows, left=left, cut=("name",))
     reasons = {
         FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
         for kind, count in freeable.items()
         if count
     }
     if reasons:
-        yield title("Could be freed")
-        yield reasons
+        yield Section("Could be freed", facts=reasons)
 
 
 @click.group("index", cls=CommandGroup)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from runner.analysis.sections import Grid
 from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     checkpoint_option,
@@ -20,7 +21,7 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import Remark, Reply, csv_lines, table, written
+from runner.cli.output import Remark, Reply, csv_lines, written
 from runner.cli.parameter_types import PATH
 from runner.cli.progress import stage_line
 from runner.cli.runs import recorded_run
@@ -44,7 +45,7 @@ def checkpoints_command(run: Run = recorded_run) -> Reply:
       dualtaxi checkpoints cartpole --json
     """
     checkpoints = run.checkpoints()
-    rows = (
+    rows = [
         (
             each.reference,
             each.phase,
@@ -55,11 +56,11 @@ def checkpoints_command(run: Run = recorded_run) -> Reply:
             "here" if each.is_here else "missing",
         )
         for each in checkpoints
-    )
+    ]
     nothing = Remark("There are no checkpoints; a loop records one by rec.checkpoint(name, value).")
     return Reply(
         {"checkpoints": [checkpoint.as_json() for checkpoint in checkpoints]},
-        [table(*_HEADINGS, rows=rows, left=_LEFT) if checkpoints else nothing],
+        [Grid(_HEADINGS, rows, left=_LEFT, cut=()) if checkpoints else nothing],
     )
 
 
@@ -150,8 +151,8 @@ def values_command(
     if output is not None:
         write_text_new(output, force, "".join(csv_lines(columns, rows)))
         return written(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps", output, **about)
-    shown = ((f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows)
-    return Reply(about | {"files": []}, [table(*columns, rows=shown)])
+    shown = [tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows]
+    return Reply(about | {"files": []}, [Grid(tuple(columns), shown, left=(), cut=())])
 
 
 def _columns(name: str, values: Any) -> dict[str, list[object]]:

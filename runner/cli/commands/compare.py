@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from runner.analysis.series import RunSeries
 
 
-@click.command("compare", cls=Command, forms=("json", "markdown"))
+@click.command("compare", cls=Command)
 def compare_command(
     run_names: tuple[str, ...] = compared_argument,
     by: str | None = option(
@@ -161,7 +161,7 @@ def _compare(
     )
 
 
-@click.command("diff", cls=Command, forms=("json", "markdown"))
+@click.command("diff", cls=Command)
 def diff_command(
     a: str = argument(metavar="A", type=RunName()),
     b: str = argument(metavar="B", type=RunName()),

@@ -36,7 +36,7 @@ class _Planned(Exception):
         self.plan = plan
 
 
-@click.command("explain", cls=Command, forms=("json", "markdown"))
+@click.command("explain", cls=Command)
 @job_option
 def explain_command(
     a: str = argument(metavar="A"),

@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, limit_option, require_one
-from runner.cli.output import Reply, aligned, console, csv_lines, json_list, on_one_line, say, table
+from runner.cli.output import Reply, csv_lines, json_list, say
 from runner.cli.parameter_types import INDEX
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
@@ -64,7 +65,7 @@ _DEFAULT_COLUMNS: Final = (
 """Columns of the table, unless they hold nothing of interest."""
 _OPTIONAL: Final = ("change", "config", "logged", "bytes", "episodes", "seed", "folder", "age")
 """Columns left out where a terminal is narrow, in this order."""
-_SHRINKING: Final = (
+_CUT: Final = (
     "name",
     "config",
     "tags",
@@ -77,14 +78,11 @@ _SHRINKING: Final = (
     "folder",
     "path",
 )
-_MIN_WIDTH: Final = 14
-"""The width at which a shrinking column can still be read."""
-
 Row = Json
 Render = Callable[[Iterable[Row], Sequence[str]], Iterator[str]]
 
 
-@click.command("ls", cls=Command, forms=("csv", "json"))
+@click.command("ls", cls=Command, forms=("csv", "json", "markdown"))
 def ls_command(
     words: tuple[str, ...] = filter_argument,
     recordings: tuple[Path, ...] = folders_option,
@@ -123,7 +121,7 @@ def ls_command(
     """  # noqa: D301 - Click's mark for preformatted text
     from runner.runs.catalogue.filters import parse
 
-    require_one("quiet", "as_csv", "as_json")
+    require_one("quiet", "as_csv", "as_json", "as_markdown")
     shown = columns_of(columns) if columns else None
     listing = _Listing(recordings, parse(" ".join(words)), sort, limit, offset)
     if quiet:
@@ -195,7 +193,10 @@ class _Listing:
         found, self._total = look(self._recordings, work, say)
         rows = [*self._noted(found)]
         if rows:
-            yield _table(rows, columns or _fitting(rows, _informative(rows, len(self._recordings))))
+            if columns:
+                yield _grid(rows, columns)
+            else:
+                yield _grid(rows, _informative(rows, len(self._recordings)), _OPTIONAL)
 
     def _noted(self, rows: Iterable[Row]) -> Iterator[Row]:
         """Yield rows, noting their number and the problems of damaged runs."""
@@ -264,35 +265,17 @@ def _informative(rows: Sequence[Row], folders: int) -> list[str]:
     return [column for column in _DEFAULT_COLUMNS if is_informative.get(column, True)]
 
 
-def _fitting(rows: Sequence[Row], columns: Sequence[str]) -> list[str]:
-    """Return the columns that fit the terminal."""
-    fitting, terminal = list(columns), console()
-    widths = {
-        column: 2 + max(len(HEADINGS.get(column, column)), *(len(_cell(row, column)) for row in rows))
-        for column in columns
-    }
-    for column in _SHRINKING:
-        widths[column] = min(widths.get(column, 0), _MIN_WIDTH)
-    for column in _OPTIONAL:
-        if (
-            terminal.is_terminal
-            and column in fitting
-            and sum(map(widths.__getitem__, fitting)) > terminal.width
-        ):
-            fitting.remove(column)
-    return fitting
-
-
-def _table(rows: Sequence[Row], columns: Sequence[str]) -> Part:
-    """Return a table, fitted to the terminal if there is one; ids are never truncated."""
-    headings = [HEADINGS.get(column, column) for column in columns]
-    left = [column not in FIELDS or FIELDS[column].kind in LEFT_KINDS for column in columns]
-    cells = [[_cell(row, column) for column in columns] for row in rows]
-    if not console().is_terminal:
-        return "\n".join(aligned([headings, *cells], left))
-    left_headings = tuple(heading for heading, is_left in zip(headings, left, strict=True) if is_left)
-    return table(*headings, rows=cells, left=left_headings, shrinking=_SHRINKING)
-
-
-def _cell(row: Row, column: str) -> str:
-    return on_one_line(as_text(row, column))
+def _grid(rows: Sequence[Row], columns: Sequence[str], spare: Sequence[str] = ()) -> Grid:
+    """Return a table, in which ids are never cut."""
+    headings = {column: HEADINGS.get(column, column) for column in columns}
+    texts = [column for column in columns if column not in FIELDS or FIELDS[column].kind in LEFT_KINDS]
+    left, cut, out = (
+        tuple(headings[column] for column in of if column in headings) for of in (texts, _CUT, spare)
+    )
+    return Grid(
+        tuple(headings.values()),
+        [tuple(as_text(row, column) for column in columns) for row in rows],
+        left=left,
+        cut=cut,
+        spare=out,
+    )

@@ -43,7 +43,7 @@ _MEANINGS: Final = {
 _POLL_SECONDS: Final = 0.02
 
 
-@click.command("play", cls=Command)
+@click.command("play", cls=Command, forms=("json",))
 def play_command(
     run: Run = recorded_run,
     chosen: EpisodeRef = episode_options,

@@ -15,7 +15,7 @@ from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
 from runner.cli.options import folders_option, force_option, limit_option, require_one, tags_option
-from runner.cli.output import Remark, Reply, console, csv_lines, json_list, table
+from runner.cli.output import Remark, Reply, csv_lines, json_list
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
@@ -23,8 +23,6 @@ from runner.util.extras import require
 from runner.util.humanize import counted, size
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from runner.cli.output import Part
     from runner.query.find import Found
     from runner.query.sql import QueryResult
@@ -34,15 +32,10 @@ _SHOWN: Final = 1000
 _SECONDS: Final = 600
 
 
-_CUT: Final = ("name", "events", "marks")
-"""Columns of hits that are cut on a narrow terminal, and left out if they are empty."""
-_LEFT: Final = ("run", "ended", *_CUT)
-
-
 _runs_option: Final = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`.")
 
 
-@click.command("sql", cls=Command, forms=("csv", "json"))
+@click.command("sql", cls=Command, forms=("csv", "json", "markdown"))
 def sql_command(
     query: str = argument(metavar="QUERY"),
     runs: str = _runs_option,
@@ -134,19 +127,6 @@ def _left_out(answered: QueryResult | Found) -> Iterator[str]:
         yield f"Runs are left out for {len(answered.left_out) - MAX_PROBLEMS:,} more reasons."
 
 
-def _one_line_each(grid: Grid) -> Table:
-    """Return the table of hits with a line for each; a narrow terminal cuts texts."""
-    from rich.text import Text
-
-    columns = {
-        heading: [Text(cell, no_wrap=True, overflow="ellipsis") for cell in cells]
-        for heading, *cells in zip(grid.headings, *grid.rows, strict=True)
-        if any(cells) or heading not in _CUT
-    }
-    cut = _CUT if console().is_terminal else ()
-    return table(*columns, rows=zip(*columns.values(), strict=True), left=_LEFT, shrinking=cut)
-
-
 @click.command("find", cls=Command)
 def find_command(
     expression: str = argument(metavar="EXPRESSION"),
@@ -204,7 +184,7 @@ def find_command(
       dualtaxi find 'min(reward) < -15' --mark expensive --tag look-again
       dualtaxi find 'ret > 15' --phase train --quiet --limit 0
     """
-    require_one("as_json", "quiet")
+    require_one("as_json", "as_markdown", "quiet")
     if tags and mark is None:
         raise click.UsageError(
             "--tag needs --mark TEXT, as it is a tag of the marks; words find the tags of runs."
@@ -217,7 +197,7 @@ def find_command(
             expression, recordings, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )
     marked = None if mark is None else found.mark(mark, tags=tags)
-    text: list[Part] = [_one_line_each(found.grid)] if found.hits else []
+    text: list[Part] = [found.grid] if found.hits else []
     if quiet:
         text = [
             f"{run} {of_phase} {','.join(map(str, episodes))}"

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from runner.analysis.sections import Grid
 from runner.cli import Failure
 from runner.cli.command import CommandGroup, argument, option, record
 from runner.cli.options import limit_option, recordings_option, workers_option
-from runner.cli.output import Remark, Reply, say, table
+from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, received
@@ -136,7 +137,7 @@ def push(
             runs.append({"run_id": status.run_id, **facts})
     outcomes = {True: "was there already", False: "stored"}
     rows = [(run["run_id"], run["name"], size(run["bytes"]), outcomes[run["already"]]) for run in runs]
-    pushed = table("run", "name", "size", "", rows=rows, left=("run", "name", ""))
+    pushed = Grid(("run", "name", "size", ""), rows, left=("run", "name", ""))
     return Reply({"runs": runs}, [pushed] if runs else (), exit_code=code)
 
 
@@ -208,7 +209,7 @@ def jobs(limit: int = limit_option(20), server: Server = server_options) -> Repl
     """
     with server.client() as client:
         newest = client.jobs(limit or 1000)
-    rows = (
+    rows = [
         (
             str(job.number),
             job.kind,
@@ -219,9 +220,9 @@ def jobs(limit: int = limit_option(20), server: Server = server_options) -> Repl
             str(job.workers),
         )
         for job in newest
-    )
+    ]
     left = ("kind", "name", "state", "progress")
-    listed = table("job", *left, "runs", "workers", rows=rows, left=left, shrinking=("name",))
+    listed = Grid(("job", *left, "runs", "workers"), rows, left=left, cut=("name",))
     nothing = Remark("No jobs yet. `dualtaxi remote submit FILE` submits one.")
     return Reply({"jobs": [dataclasses.asdict(job) for job in newest]}, [listed if newest else nothing])
 

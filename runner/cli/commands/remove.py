@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
+from runner.analysis.sections import Grid
 from runner.archive.places import archive_place
 from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, recordings_option, runs_argument
-from runner.cli.output import Remark, Reply, aligned, console, say, table
+from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.runs import find
 from runner.errors import RunnerError
@@ -149,7 +150,7 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool) ->
         cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in explanations]
         stay = [run for each in explanations for run in each.runs if run.refusal]
         notices = [Remark(f"Run {run.run_id} stays: {run.refusal}.") for run in stay]
-        grid = table("explanation", "runs", "frees", rows=cells, left=("explanation",))
+        grid = Grid(("explanation", "runs", "frees"), cells, left=("explanation",))
         yield Reply(text=[grid, *notices])
         if not dry_run:
             _confirm(f"Remove {what} for good, and free {size(freed)}?", yes)
@@ -244,10 +245,7 @@ def _preview(removals: Sequence[Removal], contents: int) -> Iterator[Part]:
         )
         for removal in removals
     ]
-    if console().is_terminal and len(removals) <= _MAX_DRAWN:
-        yield table(*_HEADINGS, rows=rows, left=_LEFT, shrinking=("name",))
-    else:
-        yield "\n".join(aligned([_HEADINGS, *rows], [heading in _LEFT for heading in _HEADINGS]))
+    yield Grid(_HEADINGS, rows, left=_LEFT, cut=("name",))
     yield from (Remark(_archive_notice(removal.run())) for removal in removals if removal.is_archived)
     if contents:
         yield Remark(f"Checkpoints that no other run refers to go too: {size(contents)}.")

@@ -17,7 +17,7 @@ from runner.cli.options import (
     recordings_option,
     trust_option,
 )
-from runner.cli.output import Reply, console, say
+from runner.cli.output import Reply, say
 from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line
 from runner.cli.runs import (
@@ -172,8 +172,7 @@ def evaluate_command(
         raise click.UsageError(f"--start: found {start!r}, expected random, each, or a state from 0.")
     if start == "each" and trials is not None:
         raise click.UsageError("--start each plays one episode per state: leave out --trials.")
-    from runner.analysis.evaluations import evaluation_records
-    from runner.cli.evaluations import evaluation_table
+    from runner.analysis.evaluations import evaluation_records, evaluations_grid
     from runner.execution.rerecord import evaluate
     from runner.recording.reader import open_recording
 
@@ -200,7 +199,7 @@ def evaluate_command(
         return Reply(values, notes=[note], exit_code=ExitCode.INTERRUPTED)
     with open_recording(run.recording) as recording:
         successes = recording.environment["success_events"]
-        grid = evaluation_table(evaluation_records(recording), successes, console())
+        grid = evaluations_grid(evaluation_records(recording), successes)
     table = f"of run {origin['run']} after {origin['step']:,} training steps"
     play = command_for(run, "play", "--eval 0:0")
     return Reply(values, [grid, "", run_facts(run) | {"table": table, "next": play}])

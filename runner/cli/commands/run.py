@@ -13,7 +13,7 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.jobs import job_option
 from runner.cli.options import config_argument, recordings_option, set_option, workers_option
-from runner.cli.output import Reply, console, json_lines, say
+from runner.cli.output import Reply, json_lines, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
@@ -168,8 +168,7 @@ def _reply(run: Run, number: int) -> Reply:
 
 def _text(run: Run, number: int) -> Iterator[Part]:
     """Yield a run that is over: its evaluations, facts and what to type next."""
-    from runner.analysis.evaluations import evaluation_records
-    from runner.cli.evaluations import evaluation_table, spread
+    from runner.analysis.evaluations import evaluation_records, evaluations_grid, spread
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
@@ -179,7 +178,7 @@ def _text(run: Run, number: int) -> Iterator[Part]:
         yield ""
     if records:
         shown = spread(records)
-        yield evaluation_table(shown, successes, console())
+        yield evaluations_grid(shown, successes)
         if len(shown) < len(records):
             show = command_for(run, "show")
             yield f"{len(shown)} of {len(records)} evaluations; `{show}` has all."

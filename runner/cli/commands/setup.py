@@ -8,9 +8,10 @@ from pathlib import Path
 import click
 from click.shell_completion import get_completion_class
 
+from runner.analysis.sections import Grid
 from runner.cli.command import Command, CommandGroup, argument
 from runner.cli.options import config_argument, output_option, set_option
-from runner.cli.output import Remark, Reply, echo, files_written, table
+from runner.cli.output import Remark, Reply, echo, files_written
 from runner.cli.parameter_types import DIRECTORY, SHIPPED
 
 
@@ -60,13 +61,12 @@ def ls() -> Reply:
     """
     from runner.config.shipped import shipped
 
-    headings = ("name", "kind", "about")
     rows = [(each.name, each.kind, each.about) for each in shipped().values()]
     configs = [
         {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
         for each in shipped().values()
     ]
-    return Reply({"configs": configs}, [table(*headings, rows=rows, left=headings, shrinking=("about",))])
+    return Reply({"configs": configs}, [Grid(("name", "kind", "about"), rows)])
 
 
 @config_command.command("copy")

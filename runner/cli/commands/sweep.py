@@ -120,7 +120,7 @@ def run(
     return _results(sweep, trials, status, ExitCode.INTERRUPTED if code and interrupt.came else code)
 
 
-@sweep_command.command("show", forms=("json", "markdown"))
+@sweep_command.command("show")
 def show(
     name: str = argument(),
     everything: bool = all_option,

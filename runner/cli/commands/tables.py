@@ -13,7 +13,7 @@ from runner.cli.output import Reply, csv_lines, json_lines
 ROWS_AT_ONCE = 50_000
 
 
-@click.command("table", cls=Command)
+@click.command("table", cls=Command, forms=("json",))
 def table_command(
     env_id: str = option(
         "--env",

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import click
 
+from runner.analysis.sections import Grid
 from runner.cli.command import CommandGroup, argument, option
-from runner.cli.output import Remark, Reply, table
+from runner.cli.output import Remark, Reply
 from runner.service.settings import tokens_file
 
 
@@ -57,9 +58,9 @@ def ls() -> Reply:
     from runner.service.tokens import Tokens
 
     tokens = Tokens(tokens_file()).all()
-    headings = ("id", "name", "scopes", "created")
     rows = [(token.id, token.name, " ".join(token.scopes), token.created) for token in tokens]
-    listed = table(*headings, rows=rows, left=headings, shrinking=("name",))
+    headings = ("id", "name", "scopes", "created")
+    listed = Grid(headings, rows, left=headings, cut=("name",))
     nothing = Remark("No tokens yet. `dualtaxi token create NAME` makes one.")
     return Reply({"tokens": [token.as_json() for token in tokens]}, [listed if tokens else nothing])
 

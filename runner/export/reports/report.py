@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis
-from runner.analysis.contents import flat_text, shortcomings, why_no_steps
+from runner.analysis.contents import shortcomings, why_no_steps
 from runner.analysis.episodes import EpisodeRef, first_state, last_whole_evaluation, ranked, ranked_trials
 from runner.analysis.evaluations import EvaluationRecord, evaluation_records, evaluations_section
 from runner.analysis.groups import groups_of
 from runner.analysis.sections import Section
 from runner.analysis.series import RunSeries, read_series, values_left_out
-from runner.analysis.summary import brief_provenance, random_policy_sentence
+from runner.analysis.summary import describe_recording, random_policy_sentence
 from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
@@ -28,10 +28,10 @@ from runner.export.plots.style import PLAIN, CurveStyle
 from runner.export.reports.maps import MapRow, maps_of, stages_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import LegendEntry, embedded, render, templates
-from runner.recording.composition import composition_of
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import RecentTraining, has_environment
+from runner.runs.listing import run_at
 from runner.util.processes import Tell
 
 
@@ -73,9 +73,7 @@ class ReportedRun:
     has_steps: bool
     evaluations: Section | None
     broad: bool
-    facts: Mapping[str, str]
-    config: Mapping[str, str]
-    provenance: Mapping[str, str]
+    origin: list[Section]
     notes: list[str]
     maps: list[MapRow]
     replay: ReportReplay | None
@@ -159,45 +157,12 @@ def _run(recording: Recording, number: int, chosen: Sequence[EpisodeRef], progre
         has_steps=any(phase.steps for phase in recording.phases),
         evaluations=evaluations_section(recording, evaluations) if evaluations else None,
         broad=drawing is not None and drawing.width > svg.BROAD,
-        facts=_facts(recording),
-        config=flat_text(recording.config),
-        provenance=brief_provenance(recording.provenance),
+        origin=describe_recording(run_at(recording.path), recording, with_results=False).origin_sections(),
         notes=notes,
         maps=_maps(recording, next(iter(episodes), None)),
         replay=replay,
         has_tables=recording.has_tables,
     )
-
-
-def _facts(recording: Recording) -> dict[str, str]:
-    """Return what identifies a run, and how much of it was recorded."""
-    config = recording.config
-    episodes = recording.train.episodes.count()
-    steps, trial_steps = (phase.steps.total() for phase in recording.phases)
-    if recording.can_train_again:
-        facts = {
-            "Environment": composition_of(recording),
-            "Algorithm": spoken(config["algorithm"]),
-            "Tables": f"{spoken(config['tables'])}, reward: {config['rewards']}",
-            "Training": f"{episodes:,} of {config['episodes']:,} episodes, {steps:,} steps recorded",
-            "Evaluation": f"{trial_steps:,} steps recorded",
-            "Job": recording.run["job"],
-        }
-    elif not has_environment(recording.config):
-        facts = {"Recorded": f"logged values, by {config['made_by']}"}
-    else:
-        spaces = recording.spaces
-        parallel = f", {recording.environments} in parallel" if recording.environments > 1 else ""
-        facts = {
-            "Environment": f"{composition_of(recording)}{parallel}",
-            "Recorded": f"from a loop, by {config['made_by']}",
-            "Spaces": f"observation {spaces['observation']['type']}, action {spaces['action']['type']}",
-            "Training": f"{episodes:,} episodes, {steps:,} steps",
-            "Evaluation": f"{trial_steps:,} steps",
-        }
-    facts["Begun"] = recording.run["created"]
-    facts["Content digest"] = recording.result.content_digest or f"none ({recording.status})"
-    return {key: str(value) for key, value in facts.items()}
 
 
 def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[EpisodeRef, list[str]]:

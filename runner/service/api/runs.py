@@ -147,6 +147,7 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
         "last_optimality": details.optimality[-1] if details.optimality else None,
         "error": settings.without_folders(str(error)) if error else None,
         "problems": [settings.without_folders(problem) for problem in problems],
+        **({"damage": settings.without_folders(details.damage)} if details.damage else {}),
     }
 
 

@@ -14,7 +14,6 @@ from runner.analysis.evaluations import loop_summary
 from runner.analysis.qtable import recorded_tables
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.composition import composition_of
 from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
@@ -115,13 +114,6 @@ def last_results(run: Run) -> Summary:
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         return loop_summary(recording)
     return Summary()
-
-
-def environment_of(run: Run) -> str:
-    """Return what a run's environment consists of; empty if it has none, or cannot be read."""
-    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return str(composition_of(recording) or "")
-    return ""
 
 
 def result_of(metric: EvaluationMetric, evaluation: EvaluationMetrics) -> tuple[str, str]:

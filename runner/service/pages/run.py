@@ -17,10 +17,12 @@ from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.axes import EPISODES
+from runner.analysis.contents import damage_of
 from runner.analysis.episodes import TYPICAL
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.export.encoder import FORMATS
+from runner.recording.composition import composition_of
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
@@ -42,7 +44,7 @@ from runner.service.dependencies import (
     WrittenRun,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunPage, StatusName, environment_of, last_results, result_of
+from runner.service.pages.frame import RunPage, StatusName, last_results, result_of
 from runner.service.pages.rendering import Form, Page, form_of, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
@@ -210,7 +212,8 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
     }
-    facts = {"Environment": environment} if (environment := environment_of(run)) else {}
+    environment, damage = _environment(run)
+    facts = {"Environment": environment} if environment else {}
     facts |= _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
         **(taken if has_environment(run.file.config) else {}),
         **({"Evaluation steps": humanize.number(trial_steps, 0)} if trial_steps or live else {}),
@@ -229,12 +232,21 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
         facts=facts,
         share=share,
         progress=progress,
-        error=settings.without_folders(run.problem or run.summary.error or ""),
+        error=settings.without_folders(run.problem or damage or run.summary.error or ""),
         job=number,
         is_live=run.status == "running" or (number is not None and run.status != "finished"),
         run_id=run.run_id,
         stop=stop,
     )
+
+
+def _environment(run: Run) -> tuple[str, str]:
+    """Return what a run's environment consists of, and what is wrong with the recording of a finished run."""
+    try:
+        with open_recording(run.recording) as recording:
+            return str(composition_of(recording) or ""), damage_of(run, recording)
+    except RecordingError as error:
+        return "", str(error) if run.status == "finished" else ""
 
 
 def _done_by(run: Run) -> Json:

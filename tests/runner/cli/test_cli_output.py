@@ -6,9 +6,9 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from runner.analysis.evaluations import EvaluationRecord, TrainingRecord
+from runner.analysis.evaluations import EvaluationRecord, TrainingRecord, evaluations_grid, spread
+from runner.analysis.sections import Grid
 from runner.cli import cli, output
-from runner.cli.evaluations import evaluation_table, spread
 from runner.config import from_mapping
 from runner.drawing.text import TextDrawing, signs
 from runner.execution.estimate import estimate, step_limit
@@ -95,7 +95,7 @@ def _record(events, episode=50_000, success=98.5, filled=(77.8, 78.1)):
 def _lines(records, success, width):
     console = Console(width=width)
     with console.capture() as captured:
-        console.print(evaluation_table(records, success, console))
+        console.print(output.grid_table(evaluations_grid(records, success), width))
     return captured.get().splitlines()
 
 
@@ -113,11 +113,10 @@ def test_the_table_of_evaluations_fits(width):
 
 
 def test_wrapped_cells_are_aligned_with_their_row():
-    table = output.table("in\nepisode", "about", left=("about",), shrinking=("about",))
-    table.add_row("7", "a text that takes several lines")
+    grid = Grid(("in\nepisode", "about"), [("7", "a text that takes several lines")])
     console = Console(width=20)
     with console.capture() as captured:
-        console.print(table)
+        console.print(output.grid_table(grid, 20))
     lines = [line.split() for line in captured.get().splitlines()]
     assert lines[:2] == [["in"], ["episode", "about"]]
     assert lines[2][:2] == ["7", "a"]

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import shutil
 
 import pytest
@@ -71,7 +72,7 @@ def test_text_shows_the_same(recorded, recorded_run):
         "Provenance",
     ):
         assert values in result.stdout
-    assert "name         tiny" in result.stdout
+    assert "name: tiny" in result.stdout
     assert "taxi_2  " in result.stdout
     assert all(line == line.rstrip() for line in result.stdout.splitlines())
 
@@ -131,6 +132,27 @@ def test_a_run_that_was_cut_off(recorded_run, command):
     assert values["content_digest"] is None
     assert values["train_steps"] > 0
     assert command("show", "@latest").exit_code == 0
+
+
+def test_a_finished_run_says_that_its_recording_is_cut_off(recorded_run, command):
+    folder = command.recordings / recorded_run.run_id
+    shutil.copytree(recorded_run.folder, folder)
+    assert "damage" not in command("show", "@latest").stdout
+    content = (folder / "recording.mcap").read_bytes()
+    for kept in (len(content) * 9 // 10, 100):
+        (folder / "recording.mcap").write_bytes(content[:kept])
+        shown = command("show", "@latest").stdout
+        assert "cut off" in re.search("^damage .*$", shown, re.MULTILINE)[0]
+        assert "cut off" in command.json("show", "@latest")["damage"]
+
+
+def test_markdown_has_the_same_sections(recorded):
+    text = recorded("show", "tiny").stdout
+    shown = recorded("show", "tiny", "--markdown").stdout
+    for title in re.findall("^## (.*)$", shown, re.MULTILINE)[1:]:
+        assert f"\n{title}\n" in text
+    assert "- status: finished, begun " in shown
+    assert "```\nname: tiny\n" in shown
 
 
 def test_a_run_without_a_recording(command, tiny):
