@@ -83,7 +83,7 @@ STEP = MessageType(
         truncated=_BOOL,
     ),
 )
-"""A step of a job, or of a loop over states; `layout` has the fields of other steps."""
+"""A step of a job, or of a loop over states; `layout` adds the fields of other steps, numbered up to 15."""
 AGENT_FIELDS: Final = _fields(11, acted=_FIXED32, agents_terminated=_FIXED32, agents_truncated=_FIXED32)
 """More fields of a step in a game of several agents: bit i is agent i."""
 ENVIRONMENT_OF_STEP: Final = Field(14, "environment", _FIXED32)

@@ -44,3 +44,9 @@ def test_an_archive_keeps_it(name):
     batch = batch_of(table, schema.TRAIN_STEP, records, shape)
     ((_, restored),) = records_of(table, schema.TRAIN_STEP, batch, shape)
     assert restored.tobytes() == records.tobytes()
+
+
+def test_no_two_fields_of_a_step_have_one_number():
+    fields = (*schema.STEP.fields, *schema.AGENT_FIELDS, schema.ENVIRONMENT_OF_STEP, schema.TAKEN)
+    numbers = [field.number for field in fields]
+    assert sorted(set(numbers)) == sorted(numbers)
