@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from multiprocessing import connection
+from dataclasses import replace
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any, Final
+from typing import Final
 
 from runner.client.jobs import EventData, LogEvent, StateEvent
 from runner.execution.estimate import free_bytes
@@ -23,7 +24,8 @@ from runner.util.processes import process_context, start_process
 
 STOP_SECONDS: Final = 15.0
 """How long a worker may take to close its recording before it is killed."""
-RECEIVE_SECONDS: Final = 0.1
+LOOK_SECONDS: Final = 0.1
+"""Time between two looks for a job to start or to stop."""
 MAX_DEATHS: Final = 2
 """A job fails when this number of its workers have died."""
 RESERVE_BYTES: Final = 256 << 20
@@ -32,35 +34,18 @@ RETRY_SECONDS: Final = 5.0
 """Time between attempts to start a worker when the system has no process to give."""
 
 
-@dataclass
-class _Worker:
-    job: QueuedJob
-    process: BaseProcess
-    pipe: Any
-    stopped: float | None = None
-    """When the request to stop was sent."""
-
-    def stop(self) -> None:
-        """Ask the worker to close its recording; kill it if it does not."""
-        if self.stopped is None:
-            self.stopped = time.monotonic()
-            with contextlib.suppress(OSError):  # it is dead
-                self.pipe.send(None)
-        elif time.monotonic() - self.stopped > STOP_SECONDS:
-            self.process.kill()
-
-
 class WorkerPool:
     """Runs the queued jobs of a store, each in a worker process, or on a Ray cluster.
 
-    One thread starts the workers, receives their events, and stops a worker when its job is no longer
-    running; the other methods read.
+    One thread starts the workers. For each of them, another one receives its events, and stops it when its
+    job is no longer running. The other methods read.
     """
 
     def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
         self.size, self.ray, self._store = size, ray, store
         self._context = process_context(PRELOADED)
-        self._busy: dict[int, _Worker] = {}
+        self._busy: dict[int, tuple[QueuedJob, threading.Thread]] = {}
+        """The jobs whose worker has not ended, by number, each with the thread that follows its worker."""
         self._start_problem, self._retry_at = "", 0.0
         """Why the last attempt to start a worker failed, and when to try again (monotonic seconds)."""
         self._stopping = threading.Event()
@@ -90,12 +75,12 @@ class WorkerPool:
         return self._start_problem or self._short_of_disk()
 
     def _run(self) -> None:
-        """Start workers and receive their events, until the server stops."""
-        while self._busy or not self._stopping.is_set():
+        """Start workers until the server stops, then wait for their ends."""
+        while not self._stopping.wait(LOOK_SECONDS):
             with _logged(), self._store.lock:
                 self._start_next()
-            with _logged():
-                self._receive()
+        for _, thread in list(self._busy.values()):
+            thread.join()
 
     def _start_next(self) -> None:
         """Start the first queued job, if the workers that it needs are free."""
@@ -103,12 +88,17 @@ class WorkerPool:
         if job is None:
             self._start_problem = ""
             return
-        if self._stopping.is_set() or time.monotonic() < self._retry_at or job.number in self._busy:
+        if time.monotonic() < self._retry_at or job.number in self._busy:
             return
         if self._needed(job) > self._free() or self._short_of_disk():
             return
+        job = replace(job, workers=self._needed(job))
+        spec = JobSpec(self._store.path(job.number), job)
         try:
-            self._busy[job.number] = self._start_worker(job)
+            ours, theirs = self._context.Pipe()
+            with contextlib.closing(theirs):
+                # Not a daemon: a sweep's worker has child processes of its own.
+                process = start_process(self._context, work, theirs, spec, self.ray, name=f"job-{job.number}")
         except OSError as error:  # no process, memory or descriptor is left
             self._start_problem = f"no worker process can be started ({error.strerror or error})"
             self._retry_at = time.monotonic() + RETRY_SECONDS
@@ -120,20 +110,9 @@ class WorkerPool:
             raise
         self._start_problem = ""
         self._store.update(job.number, state="running", started=job.started or now(), progress=None)
-
-    def _start_worker(self, job: QueuedJob) -> _Worker:
-        """Start the worker process of a job."""
-        job = replace(job, workers=self._needed(job))
-        spec = JobSpec(self._store.path(job.number), job)
-        ours, theirs = self._context.Pipe()
-        with contextlib.closing(theirs):
-            # Not a daemon: a sweep's worker has child processes of its own.
-            try:
-                process = start_process(self._context, work, theirs, spec, self.ray, name=f"job-{job.number}")
-            except BaseException:
-                ours.close()
-                raise
-        return _Worker(job, process, ours)
+        thread = threading.Thread(target=self._follow, args=(job, process, ours), daemon=True)
+        self._busy[job.number] = job, thread
+        thread.start()
 
     def _next_job(self) -> QueuedJob | None:
         """Return the job that is started next: jobs start in the order of their numbers."""
@@ -144,7 +123,7 @@ class WorkerPool:
         return min(job.workers, self.size)
 
     def _free(self) -> int:
-        return self.size - sum(worker.job.workers for worker in list(self._busy.values()))
+        return self.size - sum(job.workers for job, _ in list(self._busy.values()))
 
     def _short_of_disk(self) -> str:
         free = free_bytes(self._store.recordings)
@@ -152,52 +131,51 @@ class WorkerPool:
             return ""
         return f"disk: {size(free)} are free, and a job is started when {size(RESERVE_BYTES)} are"
 
-    def _receive(self) -> None:
-        """Receive events of workers, and stop workers that have nothing more to do."""
-        by_pipe = {worker.pipe: worker for worker in self._busy.values()}
-        if not by_pipe:
-            self._stopping.wait(RECEIVE_SECONDS)
-            return
-        for worker in by_pipe.values():
-            if self._stopping.is_set() or not self._store.is_running(worker.job.number):
-                worker.stop()
-        for pipe in connection.wait(list(by_pipe), RECEIVE_SECONDS):
-            with _logged():
-                self._receive_from(by_pipe[pipe])
-
-    def _receive_from(self, worker: _Worker) -> None:
-        """Handle one event of a worker, or its end."""
-        event: EventData | None = None
+    def _follow(self, job: QueuedJob, process: BaseProcess, pipe: Connection) -> None:
+        """Keep the events of a worker until it ends; stop it when its job is no longer running."""
+        outcome: StateEvent | None = None
+        kill_at = math.inf
         try:
-            event = worker.pipe.recv()
+            while outcome is None:
+                if kill_at < math.inf:
+                    if time.monotonic() > kill_at:
+                        process.kill()
+                elif self._stopping.is_set() or not self._store.is_running(job.number):
+                    kill_at = time.monotonic() + STOP_SECONDS
+                    with contextlib.suppress(OSError):  # it is dead
+                        pipe.send(None)
+                if pipe.poll(LOOK_SECONDS):
+                    event: EventData = pipe.recv()
+                    if isinstance(event, StateEvent):
+                        outcome = event
+                    else:
+                        with _logged():
+                            self._store.report(job.number, event)
         except (EOFError, OSError):
-            pass
+            pass  # it is dead
         except Exception:  # an event that cannot be read; after it the pipe is useless
             LOG.exception("jobs")
-            worker.process.kill()
-        if event is None or isinstance(event, StateEvent):
-            self._end(worker, event)
-        else:
-            self._store.report(worker.job.number, event)
+            process.kill()
+        with _logged():
+            self._end(job, process, outcome)
 
-    def _end(self, worker: _Worker, outcome: StateEvent | None) -> None:
-        """Remove a worker that is about to end, with the outcome of its job; None if it died.
+    def _end(self, job: QueuedJob, process: BaseProcess, outcome: StateEvent | None) -> None:
+        """Free the workers of a job whose process is about to end, with its outcome; None if it died.
 
         A job that was cancelled, and perhaps queued again, keeps its state. When a worker died, or was
         stopped from outside, its job is queued again, unless too many workers died.
         """
-        worker.process.join(STOP_SECONDS)
-        worker.process.kill()
-        worker.process.join()
-        worker.pipe.close()
+        process.join(STOP_SECONDS)
+        process.kill()
+        process.join()
         with self._store.lock:
-            del self._busy[worker.job.number]
-            if not self._store.is_running(worker.job.number):
+            del self._busy[job.number]
+            if not self._store.is_running(job.number):
                 return
-            job = self._store.job(worker.job.number)
+            job = self._store.job(job.number)
             deaths = job.deaths + (outcome is None)
             if outcome is None:
-                code = worker.process.exitcode
+                code = process.exitcode
                 self._store.report(job.number, LogEvent(f"the worker died (exit code {code})"))
                 error = (
                     f"its worker died {deaths} times, at last with exit code {code}; was there enough memory?"
@@ -216,4 +194,4 @@ def _logged() -> Iterator[None]:
         yield
     except Exception:
         LOG.exception("jobs")
-        time.sleep(RECEIVE_SECONDS)  # it may happen again at once
+        time.sleep(LOOK_SECONDS)  # it may happen again at once

@@ -399,7 +399,7 @@ def test_readiness_reports_a_dead_job_thread(client, monkeypatch):
         raise SystemExit
 
     jobs = jobs_of(client)
-    monkeypatch.setattr(jobs.pool, "_receive", fatal)
+    monkeypatch.setattr(jobs.pool, "_start_next", fatal)
     until(lambda ready: ready.status_code == 503, lambda: client.get("/readyz"))
     assert client.get("/readyz").json()["checks"]["jobs_can_be_started"] is False
 

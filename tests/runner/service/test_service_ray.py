@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import sys
 from pathlib import Path
@@ -88,8 +89,10 @@ def test_jobs_on_a_cluster_give_the_same_runs_are_cancelled_and_outlive_a_machin
 
         endless = submit(jobs, ENDLESS)
         job_until(jobs, endless, lambda job: job.progress and job.progress.episode > 0)
-        jobs.pool._busy[endless].process.kill()  # the command on the cluster goes on, and is replaced
-        job_until(jobs, endless, lambda job: job.deaths and job.progress and job.progress.episode > 0)
+        (worker,) = [each for each in multiprocessing.active_children() if each.name == f"job-{endless}"]
+        worker.kill()  # the command on the cluster goes on, and is replaced
+        job_until(jobs, endless, lambda job: job.deaths and job.state == "running")
+        job_until(jobs, endless, lambda job: job.progress and job.progress.episode > 0)
         jobs.cancel(endless)
         (run,) = until(
             lambda runs: runs[0].status == "interrupted",
