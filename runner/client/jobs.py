@@ -189,6 +189,32 @@ class JobEvent:
             raise RunnerError(f"found an event {kind[:20]!r} of a job that is not as expected.") from error
 
 
+@dataclass(frozen=True, kw_only=True)
+class JobFacts:
+    """A submitted job and its state. Times are in UTC, as ISO 8601; empty if they have not come."""
+
+    number: int
+    kind: str
+    name: str
+    state: JobState = "queued"
+    runs: int
+    """Number of runs: a configuration's seeds; a sweep's trials, times its seeds."""
+    workers: int = 1
+    """How many workers of the server it holds while it is running."""
+    created: str
+    started: str = ""
+    ended: str = ""
+    error: str = ""
+    """Why it failed; empty if it did not."""
+    progress: JobProgress | None = None
+    """The last progress that its worker reported; clients see it while the job is running."""
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more happens unless a user resumes it."""
+        return self.state in OVER
+
+
 @dataclass(frozen=True)
 class RunOfJob:
     """A run that a job has started."""
@@ -197,31 +223,12 @@ class RunOfJob:
     run_id: str
 
 
-@dataclass(frozen=True)
-class JobStatus:
-    """A job on a server. Times are in UTC, as ISO 8601; empty if they have not come."""
+@dataclass(frozen=True, kw_only=True)
+class JobStatus(JobFacts):
+    """A job on a server."""
 
-    number: int
-    kind: str
-    name: str
-    state: JobState
-    runs: int
-    """Its number of runs."""
-    workers: int
-    """How many workers of the server it holds while it is running."""
-    created: str
-    started: str
-    ended: str
-    error: str
-    progress: JobProgress | None
-    """Its progress, if it is running and its worker has reported any."""
     begun: list[RunOfJob]
     """Its started runs; empty for a sweep, whose runs have the tag sweep=NAME."""
-
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing more happens unless a user resumes it."""
-        return self.state in OVER
 
 
 @dataclass(frozen=True)

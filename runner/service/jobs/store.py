@@ -24,10 +24,9 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 from pydantic import TypeAdapter
 
 from runner.client.jobs import (
-    OVER,
     JobEvent,
+    JobFacts,
     JobProgress,
-    JobState,
     JobStatus,
     LogEvent,
     RunEvent,
@@ -81,23 +80,11 @@ class CheckedJob(JobEstimate):
     are tasks for several workers."""
 
 
-@dataclass(frozen=True)
-class QueuedJob:
-    """A submitted job and its state. Times are in UTC, as ISO 8601; empty if they have not come."""
+@dataclass(frozen=True, kw_only=True)
+class QueuedJob(JobFacts):
+    """A job as the server stores it, but for its progress."""
 
-    number: int
     kind: Kind
-    name: str
-    runs: int
-    """Number of runs: a configuration's seeds; a sweep's trials, times its seeds."""
-    created: str
-    workers: int = 1
-    """How many workers it holds while it is running."""
-    state: JobState = "queued"
-    started: str = ""
-    ended: str = ""
-    error: str = ""
-    """Why it failed; empty if it did not."""
     deaths: int = 0
     """Number of its workers that died since it was submitted or resumed."""
     accept_changes: bool = False
@@ -109,13 +96,6 @@ class QueuedJob:
     started twice."""
     begun: int = 0
     """How many of these runs were started."""
-    progress: JobProgress | None = None
-    """The last progress that its worker reported, also when it is over; not stored."""
-
-    @property
-    def is_over(self) -> bool:
-        """Whether nothing more happens unless a user resumes it."""
-        return self.state in OVER
 
     @property
     def started_runs(self) -> dict[int, str]:
@@ -198,7 +178,15 @@ class JobStore:
                 )
             number = max(self._jobs, default=0) + 1
             run_ids = {seed: new_run_id(self.recordings) for seed in checked.seeds}
-            job = QueuedJob(number, checked.kind, checked.name, checked.runs, now(), workers, run_ids=run_ids)
+            job = QueuedJob(
+                number=number,
+                kind=checked.kind,
+                name=checked.name,
+                runs=checked.runs,
+                workers=workers,
+                created=now(),
+                run_ids=run_ids,
+            )
             try:
                 with storage_errors(self.path(number), "free some disk"):
                     self.path(number).mkdir()

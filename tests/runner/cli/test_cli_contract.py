@@ -108,7 +108,8 @@ WORDS = {
 """What is typed after a command; nothing for the others."""
 HOSTILE = "a\x1b]0;owned\x1b\\\x9b31m\x7f\u202eb"
 """Sets the title of a terminal, begins a red text, and turns the direction of writing."""
-JOB = JobStatus(1, "config", "tiny", "finished", 1, 1, "", "", "", "", None, [RunOfJob(3, "k3v9m2xq")])
+RUNS = [RunOfJob(3, "k3v9m2xq")]
+JOB = JobStatus(number=1, kind="config", name="tiny", state="finished", runs=1, created="", begun=RUNS)
 
 
 def always_left(content, *spaces):
