@@ -17,6 +17,7 @@ class Scrubber {
     this.slider.addEventListener("input", () => this.go(Number(this.slider.value)));
     this.slider.addEventListener("keydown", (event) => this.key(event));
     this.button.addEventListener("click", () => this.play());
+    this.pause();
   }
 
   show(k) {

@@ -83,7 +83,7 @@ def test_a_mistake_is_shown_at_its_line_then_a_job_is_submitted_and_watched(page
     wait(browser, lambda: "1 run" in text_of(browser, "#valid"))
     browser.find_element(By.CSS_SELECTOR, "button[value=submit]").click()
     wait(browser, lambda: "/queue/" in browser.current_url)
-    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "[data-state].finished"))
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "[data-state] .finished"))
     browser.find_element(By.CSS_SELECTOR, "[data-runs] a").click()
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#status"))
     assert find_run("asked", folder).run_id in browser.current_url
@@ -336,11 +336,11 @@ def test_two_runs_are_chosen_in_the_table_and_replayed_in_step(page):
     assert "seed" in text_of(browser, "[aria-label='Settings that differ']")
     browser.find_element(By.LINK_TEXT, "Replays in step").click()
     wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".choice ol")) == 2)
-    slider = browser.find_element(By.CSS_SELECTOR, ".both")
+    slider = browser.find_element(By.CSS_SELECTOR, "[data-together] .step")
     before = slider.get_attribute("value")
     slider.send_keys(Keys.ARROW_RIGHT)
     wait(browser, lambda: slider.get_attribute("value") == str(int(before) + 1))
-    assert f"step {int(before) + 1} of" in text_of(browser, ".both-count")
+    assert f"step {int(before) + 1} of" in text_of(browser, "[data-together] .count")
 
 
 def test_a_step_is_opened_in_rerun(page, folder):

@@ -73,22 +73,22 @@ def test_the_numbers_of_a_known_environment_have_names(page, name):
 def test_two_loops_are_played_in_step(page):
     browser = page("/compare/replay?run=pole&run=framed&at=2:1")
     wait(browser, lambda: len(shown_pictures(browser)) == 2)
-    slider = browser.find_element(By.CSS_SELECTOR, ".both")
+    slider = browser.find_element(By.CSS_SELECTOR, "[data-together] .step")
     before = shown_pictures(browser)
     slider.send_keys(Keys.ARROW_RIGHT * 3)
     wait(browser, lambda: not set(before) & set(shown_pictures(browser)))
-    assert browser.find_element(By.CSS_SELECTOR, ".both-count").text.startswith("step 4 of")
+    assert browser.find_element(By.CSS_SELECTOR, "[data-together] .count").text.startswith("step 4 of")
 
 
 def test_the_environments_of_a_vector_are_played_in_step(page):
     browser = page("/runs/poles/replay/train/1")
     browser.find_element(By.PARTIAL_LINK_TEXT, "side by side").click()
     wait(browser, lambda: len(shown_pictures(browser)) == 3)
-    slider = browser.find_element(By.CSS_SELECTOR, ".both")
+    slider = browser.find_element(By.CSS_SELECTOR, "[data-together] .step")
     before = shown_pictures(browser)
     slider.send_keys(Keys.ARROW_RIGHT)
     wait(browser, lambda: before != shown_pictures(browser))
-    assert browser.find_element(By.CSS_SELECTOR, ".both-count").text.startswith("step 1 of")
+    assert browser.find_element(By.CSS_SELECTOR, "[data-together] .count").text.startswith("step 1 of")
     wait(browser, lambda: browser.current_url.endswith("/environments?t=1"))
 
 
