@@ -64,10 +64,11 @@ function remember(kind, metric) {
 
 // --- data -----------------------------------------------------------------------------------------------
 
-// Return the query for curves over the axis, with values that are not empty.
+// Return the query for curves over the axis, with values that are neither empty nor usual.
 function queryOf(values) {
-  const query = new URLSearchParams(runs.map(({ id }) => ["run", id]));
-  for (const [name, value] of Object.entries({ axis: fields.axis.value, ...values })) if (value) query.set(name, value);
+  const axis = new URLSearchParams(location.search).get("axis") ?? USUAL.axis;
+  const query = new URLSearchParams([["axis", axis], ...runs.map(({ id }) => ["run", id])]);
+  for (const [name, value] of Object.entries(values)) if (value && value !== USUAL[name]) query.set(name, value);
   return query;
 }
 

@@ -14,8 +14,8 @@ let writing = null,
 function moved({ k, length, timer }) {
   const steps = { last: Math.max(0, k - 1), now: k, next: Math.min(k, length - 1) };
   for (const field of fields) {
-    const name = field.href === undefined ? "value" : "href";
-    field[name] = field[name].replace(/[0-9]+$/, steps[field.dataset.step]);
+    const name = field.matches("a") ? "href" : "value";
+    field.setAttribute(name, field.getAttribute(name).replace(/[0-9]+$/, steps[field.dataset.step]));
   }
   clearTimeout(writing);
   if (onward && timer && k === length) return location.assign(`${onward}?${kept}&play=1`);
