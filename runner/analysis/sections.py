@@ -60,7 +60,7 @@ class Paging:
         return f"{self.address}{'&' if '?' in self.address else '?'}page={page}"
 
 
-class Source(NamedTuple):
+class SourceFile(NamedTuple):
     """A file of source code."""
 
     path: str
@@ -123,7 +123,7 @@ class Section:
     """Charts, which are drawn on a page; `NOT_DRAWN` stands for them in text."""
     replay: str = ""
     """The address of the replay of a step to look at, below the address of the run."""
-    sources: Sequence[Source] = ()
+    sources: Sequence[SourceFile] = ()
     """Files, which a page shows whole, and text by their names."""
     is_folded: bool = False
     """Whether a page folds the facts, and text leaves them out."""

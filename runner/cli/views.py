@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import Final
 
 import click
 
@@ -18,6 +20,8 @@ from runner.export.places import new_file, require_new
 from runner.runs.run import Run
 from runner.views.view import Input, View
 
+_STDOUT: Final = Path("-")
+
 
 def command_of(view: View) -> Command:
     """Return the command of a view."""
@@ -28,13 +32,16 @@ def command_of(view: View) -> Command:
         force: bool = False,
         **values: object,
     ) -> Reply:
-        if output is not None:
+        if output not in (None, _STDOUT):
             require_new(output, force)
         from runner.recording.reader import open_recording
 
         line = steps_line if view.counts_steps else stage_line
         with compilation_notice(), line(view.stage) as report, open_recording(run.recording) as recording:
             answer = view.compute(recording, **values, **({"report": report} if view.counts_steps else {}))
+        if output == _STDOUT:
+            answer.write(sys.stdout.buffer)
+            return Reply(())
         data, text = answer.as_json(), [*answer.sections()]
         if answer.step_to_look_at is not None:
             text.append({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))})
@@ -51,7 +58,8 @@ def command_of(view: View) -> Command:
         **{name: _declared(each, view) for name, each in view.inputs.items()},
     }
     if view.file_ending:
-        output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=view.file_help)
+        help_text = f"{view.file_help} FILE `-` is stdout."
+        output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=help_text)
         declared |= {"output": output, "force": force_option}
     return Command(view.name, call, declared, help=view.help)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from runner.analysis.sections import Section, Source
+from runner.analysis.sections import Section, SourceFile
 from runner.util.humanize import counted
 from runner.views.view import View
 
@@ -32,7 +32,7 @@ _PACKAGE: Final = "package."
 
 
 @dataclass(frozen=True)
-class RecordedCode:
+class RunCode:
     """The code of a run, and the facts of its provenance that are about code."""
 
     facts: Mapping[str, str]
@@ -61,7 +61,7 @@ class RecordedCode:
         script = self.facts.get("code.script")
         names = sorted(self.code.files, key=lambda path: path != script)
         sources = [
-            Source(path, "not in the commit" if path in self.code.new else "", self.code.files[path])
+            SourceFile(path, "not in the commit" if path in self.code.new else "", self.code.files[path])
             for path in names[:_MAX_FILES]
         ]
         if sources:
@@ -77,21 +77,22 @@ class RecordedCode:
         stream.write(self.code.to_patch().encode(errors="replace"))
 
 
-def code(recording: Recording) -> RecordedCode:
+def code(recording: Recording) -> RunCode:
     """Show the code that ran RUN: commit, script, changes since the commit, and files.
 
-    `git checkout COMMIT && git apply FILE.patch` restores it from the file that -o writes; without a commit
-    the patch has all files. With --json, `files` has the text of each recorded file, `new` those that the
-    commit does not have, `patch` the changes since the commit, and `packages` the installed packages.
+    `git checkout COMMIT && dualtaxi code RUN -o - | git apply` restores it; without a commit the patch has
+    all files. With --json, `files` has the text of each recorded file, `new` those that the commit does not
+    have, `patch` the changes since the commit, and `packages` the installed packages.
 
     Examples:
       dualtaxi code @latest
       dualtaxi code k3v9m2xq -o changes.patch
+      dualtaxi code k3v9m2xq -o - | git apply
       dualtaxi code k3v9m2xq --json
     """
     provenance = recording.provenance
     is_code = ("git", "code.")
-    return RecordedCode(
+    return RunCode(
         {key: text for key, text in provenance.items() if key.startswith(is_code) or key == "command"},
         {key.removeprefix(_PACKAGE): text for key, text in provenance.items() if key.startswith(_PACKAGE)},
         recording.code,

@@ -31,7 +31,7 @@ _PHASE: Final = view_input(
 
 
 @dataclass(frozen=True)
-class Episodes:
+class EpisodeRows:
     """Some episodes of a phase."""
 
     run_id: str
@@ -97,7 +97,7 @@ def episodes(
     phase: Phase = _PHASE,
     start: Any = START,
     stop: Any = STOP,
-) -> Episodes:
+) -> EpisodeRows:
     """Show the episodes of RUN: how each ended, its length, returns and events.
 
     In Python, runner.frames.episodes() has all of them.
@@ -121,7 +121,7 @@ def episodes(
         headings[name] = "return" if len(recording.agents) == 1 else event_in_words(name)
     values = {name: column.tolist() for name, column in columns.items()}
     numbers = references(recording, phase, values["episode"])
-    return Episodes(recording.run_id, phase, rows.start, total, values, numbers, headings)
+    return EpisodeRows(recording.run_id, phase, rows.start, total, values, numbers, headings)
 
 
 VIEW: Final = View(

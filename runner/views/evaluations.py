@@ -18,7 +18,7 @@ _ROWS: Final = 500
 
 
 @dataclass(frozen=True)
-class Evaluations:
+class EvaluationRows:
     """Some evaluations of a run."""
 
     run_id: str
@@ -39,7 +39,7 @@ class Evaluations:
         return [self.table]
 
 
-def evaluations(recording: Recording, start: Any = START, stop: Any = STOP) -> Evaluations:
+def evaluations(recording: Recording, start: Any = START, stop: Any = STOP) -> EvaluationRows:
     """Show the evaluations of RUN: returns, lengths, successes, and every event counted.
 
     The evaluations of a loop are its evaluation episodes between two training episodes.
@@ -58,7 +58,7 @@ def evaluations(recording: Recording, start: Any = START, stop: Any = STOP) -> E
         table = evaluations_section(recording, records, paging)
     elif every:
         table = Section("Evaluations", [f"There are {len(every):,} evaluations, from 0."])
-    return Evaluations(recording.run_id, rows.start, len(every), records, table)
+    return EvaluationRows(recording.run_id, rows.start, len(every), records, table)
 
 
 VIEW: Final = View(

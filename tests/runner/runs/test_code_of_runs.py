@@ -188,6 +188,7 @@ def test_the_patch_restores_the_code(project, tmp_path):
     run = loop_in(project, 10)
     dualtaxi(project, "code", run, "-o", str(tmp_path / "code.patch"))
     patch = (tmp_path / "code.patch").read_text()
+    assert dualtaxi(project, "code", run, "-o", "-") == patch
     commit = git(project, "rev-parse", "HEAD")
     assert f"# git: {commit}-dirty" in patch
     assert "# command: train.py" in patch
