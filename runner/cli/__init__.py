@@ -56,7 +56,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "diff": ("compare", "Show what differs between two runs, and where they diverge."),
         "compare": ("compare", "Compare groups of runs, with statistics over seeds."),
         "verify": ("verify", "Check every step of a run: retrain it, or rerun its environment."),
-        "checkpoints": ("checkpoints", "List the checkpoints that a loop recorded."),
+        "checkpoints": (_VIEW, "List the checkpoints that a loop recorded."),
         "checkpoint": ("checkpoints", "Write a checkpoint of a run into a file."),
         "values": ("checkpoints", "Compute what a checkpoint's agent returns along a recorded episode."),
         "qtable": (_VIEW, "Show the exact Q-table of a run at any step."),

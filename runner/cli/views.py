@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Final
 
@@ -37,8 +38,9 @@ def command_of(view: View) -> Command:
         from runner.recording.reader import open_recording
 
         line = steps_line if view.counts_steps else stage_line
-        with compilation_notice(), line(view.stage) as report, open_recording(run.recording) as recording:
-            answer = view.compute(recording, **values, **({"report": report} if view.counts_steps else {}))
+        opened = nullcontext(run) if view.takes_run else open_recording(run.recording)
+        with compilation_notice(), line(view.stage) as report, opened as subject:
+            answer = view.compute(subject, **values, **({"report": report} if view.counts_steps else {}))
         if output == _STDOUT:
             answer.write(sys.stdout.buffer)
             return Reply(())

@@ -204,6 +204,10 @@ class Computation:
         response = self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
         return await (self._unless_gone(response) if alone else response)
 
+    async def uncached(self, function: Callable[..., bytes], *args: object) -> bytes:
+        """Return the result of a function that reads more than the recordings it takes."""
+        return await self._processes(function, *args)
+
     async def _unless_gone(self, response: Awaitable[bytes]) -> bytes:
         waiting = asyncio.ensure_future(response)
         try:

@@ -145,6 +145,11 @@ def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
         return str(partials().answer(sections, recording.run_id)).encode()
 
 
+def answer_of_run(run: Run, question: Callable[..., Answer], values: Given) -> bytes:
+    """Return the answer to a question about a run and the files stored with it as HTML."""
+    return str(partials().answer(question(run, **dict(values)).sections(), run.run_id)).encode()
+
+
 def _branch_part(recording: Recording, at: StepLike, action: str, start: int, steps: int) -> Json:
     episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
     return _part(recording, episode, False, "" if episode.grid else "The environment has no scene to draw.")

@@ -49,13 +49,14 @@ def _add_routes(view: View) -> None:
         path, description = f"/{view.name}{ending}", f"As `dualtaxi {view.name}` returns it."
         api.get(path, name=path[1:], summary=summary, description=description, **options)(answer)
 
-    add(
-        computed.answer,
-        "",
-        "application/json",
-        view.help.partition("\n")[0],
-        response_model=dict[str, object],
-    )
+    if not view.takes_run:
+        add(
+            computed.answer,
+            "",
+            "application/json",
+            view.help.partition("\n")[0],
+            response_model=dict[str, object],
+        )
     if view.file_ending:
         documented = {"response_class": Response, "responses": media_docs(OCTETS)}
         add(computed.answer_file, view.file_ending, OCTETS, view.file_help, **documented)
@@ -72,9 +73,7 @@ def _add_routes(view: View) -> None:
             """Return the answer; 204 if the run no longer has this status."""
             if run.status != status:
                 return Response(status_code=HTTPStatus.NO_CONTENT)
-            return HTMLResponse(
-                await _computed(compute, fragments.answer, run, view, given, _page_values(view, number))
-            )
+            return HTMLResponse(await _answered(compute, run, view, given, number))
 
         part.__annotations__["given"] = Annotated[given_type, Query()]
         pages.get(f"/{view.name}/part")(part)
@@ -90,9 +89,7 @@ def _add_routes(view: View) -> None:
         try:
             if view.has_default or any(form.values()):
                 given = filled(given_type, form)
-                body = await _computed(
-                    compute, fragments.answer, run, view, given, _page_values(view, number)
-                )
+                body = await _answered(compute, run, view, given, number)
         except RunnerError as error:
             problem = error
         live = ""
@@ -105,11 +102,15 @@ def _add_routes(view: View) -> None:
         return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
 
 
-def _page_values(view: View, number: int) -> Given:
-    """Return the arguments of a view that its page gives; with a long list, the rows of a page."""
+async def _answered(compute: Computation, run: Run, view: View, given: BaseModel, number: int) -> bytes:
+    """Return the answer on a page; of a long list, the rows of one page."""
     first = (number - 1) * view.rows_per_page
     rows = (("start", first), ("stop", first + view.rows_per_page)) if view.rows_per_page else ()
-    return view.page_values + rows
+    more = view.page_values + rows
+    if view.takes_run:
+        values = tuple((given.model_dump() | dict(more)).items())
+        return await compute.uncached(fragments.answer_of_run, run, view.compute, values)
+    return await _computed(compute, fragments.answer, run, view, given, more)
 
 
 async def _computed(

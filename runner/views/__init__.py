@@ -10,12 +10,12 @@ from functools import cache
 from typing import Final
 
 from runner.util import plugins
-from runner.views import code, console, episodes, evaluations, qtable, system, when, why
+from runner.views import checkpoints, code, console, episodes, evaluations, qtable, system, when, why
 from runner.views.view import View
 
 VIEWS: Final = {
     module.VIEW.name: module.VIEW
-    for module in (episodes, evaluations, qtable, when, why, system, console, code)
+    for module in (episodes, evaluations, qtable, when, why, checkpoints, system, console, code)
 }
 """Name of a view -> the view, in the order of tabs."""
 

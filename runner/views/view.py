@@ -96,6 +96,9 @@ class View:
     title: str
     compute: Callable[..., Any]
     """Takes the recording, the inputs and `report`, called with the steps done; returns an `Answer`."""
+    takes_run: bool = False
+    """Whether the function takes the run instead of its recording, for files that are stored with the
+    recordings: no answer is cached, and no route follows from the view, as answers hold paths."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
@@ -108,9 +111,9 @@ class View:
     """What the command says that it does."""
     counts_steps: bool = True
     """Whether the function has the parameter `report`."""
-    needs: Literal["", "episodes", "tables", "training"] = ""
-    """What a run needs for a tab of this page: an environment, Q-tables, or a training that the runner can
-    repeat."""
+    needs: Literal["", "checkpoints", "episodes", "tables", "training"] = ""
+    """What a run needs for a tab of this page: checkpoints, an environment, Q-tables, or a training that
+    the runner can repeat."""
     rows_per_page: int = 0
     """Rows of each page of a long list, a function with the inputs `START` and `STOP`; else 0."""
     is_live: bool = False

@@ -1,4 +1,4 @@
-"""`dualtaxi checkpoints` and `dualtaxi checkpoint get`: what a loop recorded by `rec.checkpoint`."""
+"""`dualtaxi checkpoint get` and `dualtaxi values`: checkpoints that a loop recorded, and what they return."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,7 +21,7 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import Remark, Reply, csv_lines, written
+from runner.cli.output import Reply, csv_lines, written
 from runner.cli.parameter_types import PATH
 from runner.cli.progress import stage_line
 from runner.cli.runs import recorded_run
@@ -31,37 +31,6 @@ from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
-
-_HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest", "content")
-_LEFT: Final = ("checkpoint", "phase", "format", "digest", "content")
-
-
-@click.command("checkpoints", cls=Command)
-def checkpoints_command(run: Run = recorded_run) -> Reply:
-    """List the checkpoints of RUN, which a loop recorded by `rec.checkpoint(name, ...)`.
-
-    Examples:
-      dualtaxi checkpoints @latest
-      dualtaxi checkpoints cartpole --json
-    """
-    checkpoints = run.checkpoints()
-    rows = [
-        (
-            each.reference,
-            each.phase,
-            f"{each.episode:,}",
-            each.format,
-            size(each.size),
-            each.digest[:16],
-            "here" if each.is_here else "missing",
-        )
-        for each in checkpoints
-    ]
-    nothing = Remark("There are no checkpoints; a loop records one by rec.checkpoint(name, value).")
-    return Reply(
-        {"checkpoints": [checkpoint.as_json() for checkpoint in checkpoints]},
-        [Grid(_HEADINGS, rows, left=_LEFT, cut=()) if checkpoints else nothing],
-    )
 
 
 @click.group("checkpoint", cls=CommandGroup)

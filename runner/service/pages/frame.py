@@ -69,14 +69,21 @@ def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_episodes = has_environment(run.file.config)
     has_tables = run.can_train_again or _has_recorded_tables(run)
-    met = {"": True, "episodes": has_episodes, "tables": has_tables, "training": run.can_train_again}
+    is_running_loop = run.status == "running" and not run.can_train_again
+    messages = run.summary.messages
+    met = {
+        "": True,
+        "checkpoints": bool(messages.get(schema.CHECKPOINT_TOPIC.name)) or is_running_loop,
+        "episodes": has_episodes,
+        "tables": has_tables,
+        "training": run.can_train_again,
+    }
     needs = {"learned": "tables"} | {view.name: view.needs for view in VIEWS.values()}
     has_tab = {
         **{name: met[need] for name, need in needs.items()},
         "replay": has_episodes,
         "rerun": has_episodes,
-        "pictures": bool(run.summary.messages.get(schema.IMAGE_TOPIC.name))
-        or (run.status == "running" and not run.can_train_again),
+        "pictures": bool(messages.get(schema.IMAGE_TOPIC.name)) or is_running_loop,
     }
     return RunHead(
         id=run.run_id,
@@ -93,7 +100,7 @@ def head_of(run: Run) -> RunHead:
         lacking={
             name: "Q-tables" if not has_tables else "training that the runner can repeat"
             for name, need in needs.items()
-            if not met[need] and need != "episodes"
+            if not met[need] and need in ("tables", "training")
         },
     )
 

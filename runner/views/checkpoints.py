@@ -1,0 +1,74 @@
+"""`checkpoints`: what a loop recorded of its agent."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from runner.analysis.sections import Grid, Section
+from runner.util.humanize import counted, size
+from runner.views.view import View
+
+if TYPE_CHECKING:
+    from runner.runs.checkpoints import Checkpoint
+    from runner.runs.run import Run
+    from runner.util.values import Json
+
+_HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest", "content")
+
+
+@dataclass(frozen=True)
+class CheckpointRows:
+    """The checkpoints of a run, in order."""
+
+    checkpoints: Sequence[Checkpoint]
+    step_to_look_at = None
+
+    def as_json(self) -> Json:
+        """Return the checkpoints."""
+        return {"checkpoints": [checkpoint.as_json() for checkpoint in self.checkpoints]}
+
+    def sections(self) -> list[Section]:
+        """Return a table with a row for each checkpoint."""
+        if not self.checkpoints:
+            nothing = "There are no checkpoints; a loop records one by `rec.checkpoint(name, value)`."
+            return [Section("Checkpoints", [nothing])]
+        rows = [
+            (
+                checkpoint.reference,
+                checkpoint.phase,
+                f"{checkpoint.episode:,}",
+                checkpoint.format,
+                size(checkpoint.size),
+                checkpoint.digest[:16],
+                "here" if checkpoint.is_here else "missing",
+            )
+            for checkpoint in self.checkpoints
+        ]
+        sentence = (
+            f"{counted(len(rows), 'checkpoint')}. `dualtaxi checkpoint get RUN {rows[-1][0]}` writes one."
+        )
+        return [Section("Checkpoints", [sentence], [Grid(_HEADINGS, rows)])]
+
+
+def checkpoints(run: Run) -> CheckpointRows:
+    """List the checkpoints of RUN, which a loop recorded by `rec.checkpoint(name, ...)`.
+
+    Examples:
+      dualtaxi checkpoints @latest
+      dualtaxi checkpoints cartpole --json
+    """
+    return CheckpointRows(run.checkpoints())
+
+
+VIEW: Final = View(
+    "checkpoints",
+    "Checkpoints",
+    checkpoints,
+    counts_steps=False,
+    has_default=True,
+    is_live=True,
+    needs="checkpoints",
+    takes_run=True,
+)
