@@ -18,13 +18,49 @@ _NUMBERS: Final = re.compile(
 NOT_DRAWN: Final = "The charts are on the page of the run: `dualtaxi serve`."
 
 
-class Plot(NamedTuple):
-    """A chart in a page."""
+class Figure(NamedTuple):
+    """A picture in a page."""
 
-    title: str
     svg: str
-    wide: bool
+    caption: str = ""
+    """A text below it."""
+    title: str = ""
+    """A text above it."""
+    is_wide: bool = False
     """Whether it takes a whole row."""
+    ramp: tuple[float, float] | None = None
+    """The values of its darkest and its lightest colour."""
+
+
+class LegendEntry(NamedTuple):
+    """The line of a legend that explains the colour of its place."""
+
+    letter: str
+    """What stands for it in text and figures; may be empty."""
+    text: str
+
+
+class Link(NamedTuple):
+    """A link of a page."""
+
+    text: str
+    address: str
+    """Relative to the page of the run, so that only that page has it, or else to the server or the page."""
+
+
+class Player(NamedTuple):
+    """Episodes that a page replays."""
+
+    titles: list[str]
+    picture: str
+    """The grid at the first frame, as SVG; empty without a scene."""
+    key: str
+    data: str
+    """JSON for `replay.js`."""
+    has_frames: bool
+    """Whether it has pictures of the environment."""
+    is_broad: bool
+    """Whether the grid takes a whole row."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +114,7 @@ class Grid:
     title: str = ""
     """Its title in a page, if that is not the section's."""
     links: Sequence[str] = ()
-    """The address of what each row is about, below the address of the run."""
+    """The address of what each row is about, as in a `Link`."""
     streams: Sequence[str] = ()
     """The stream of each row, if the rows are lines of output: `stdout`, `stderr` or `note`."""
     paging: Paging | None = None
@@ -116,13 +152,21 @@ class Section:
     """Unified diffs, each as its lines."""
     facts: Mapping[str, str] = field(default_factory=dict)
     """Names and values, alone in their section."""
-    figure: str = ""
-    """A picture as SVG, and its caption."""
-    caption: str = ""
-    charts: Iterable[Plot] = ()
-    """Charts, which are drawn on a page; `NOT_DRAWN` stands for them in text."""
-    replay: str = ""
-    """The address of the replay of a step to look at, below the address of the run."""
+    figures: Iterable[Figure] = ()
+    """Pictures, which are drawn on a page; `NOT_DRAWN` stands for charts in text."""
+    layout: str = ""
+    """How a page arranges figures, or parts: the class of their element; charts in columns without one."""
+    ramp: tuple[float, float] | None = None
+    """The values of the darkest and the lightest colour of all figures."""
+    legend: Sequence[LegendEntry] = ()
+    """The colours of the figures."""
+    links: Sequence[Link] = ()
+    """Links below the sentences."""
+    player: Player | None = None
+    parts: Sequence[Section] = ()
+    """Sections within it, in a page."""
+    is_article: bool = False
+    """Whether it stands by itself, such as one of several runs."""
     sources: Sequence[SourceFile] = ()
     """Files, which a page shows whole, and text by their names."""
     is_folded: bool = False
@@ -142,7 +186,12 @@ class Section:
     @property
     def anchor(self) -> str:
         """The id of the section in a page: its title up to a colon, without blanks."""
-        return re.sub(r"\W+", "-", self.title.partition(":")[0].lower())
+        return re.sub(r"\W+", "-", self.title.partition(":")[0].lower()).strip("-")
+
+    @property
+    def said(self) -> list[str]:
+        """Its sentences in a form without figures."""
+        return [*self.sentences, *([NOT_DRAWN] if self.figures and not self.layout else [])]
 
 
 def markdown(sections: Sequence[Section]) -> Iterator[str]:
@@ -152,7 +201,7 @@ def markdown(sections: Sequence[Section]) -> Iterator[str]:
         facts = [(name, text.replace("\n", "\\\n  ")) for name, text in section.shown_facts.items()]
         yield from (f"- {name}: {text}" for name, text in facts)
         yield from [""] * bool(facts)
-        for sentence in [*section.sentences, *([NOT_DRAWN] if section.charts else [])]:
+        for sentence in section.said:
             yield from _fenced(sentence.splitlines()) if "\n" in sentence else (sentence, "")
         for grid in section.tables:
             yield _row(grid.headings)
@@ -173,7 +222,7 @@ def html(sections: Sequence[Section]) -> str:
     """Return sections as HTML that depends on no style sheet, as notebooks display it."""
     parts = []
     for section in sections:
-        parts += [f"<h3>{escape(section.title)}</h3>"]
+        parts += [f"<h3>{escape(section.title)}</h3>"] if section.title else []
         if section.shown_facts:
             pairs = "".join(
                 f'<tr><th scope="row" style="text-align:left">{escape(name)}</th>'
@@ -197,6 +246,7 @@ def html(sections: Sequence[Section]) -> str:
             body = "".join(f"<tr>{row}</tr>" for row in rows)
             parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
         parts += [f"<pre>{escape(chr(10).join(lines))}</pre>" for lines in section.diffs]
+        parts += [f'<figure style="max-width: 46em">{figure.svg}</figure>' for figure in section.figures]
     return "\n".join(parts)
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import click
 
-from runner.analysis.sections import NOT_DRAWN, Grid, Section, markdown
+from runner.analysis.sections import Grid, Section, markdown
 from runner.errors import ExitCode
 from runner.export.places import require_new
 from runner.util.humanize import printable
@@ -192,14 +192,14 @@ def draw(part: Part, is_first: bool = False) -> None:
     pairs = section.shown_facts
     heading = [title(section.title)] if section.title and not (pairs and is_first) else []
     _render(*heading, *([facts(pairs)] if pairs else []))
-    for sentence in section.sentences:
+    for sentence in section.said:
         echo(sentence) if "\n" in sentence else _render(sentence)
     for grid in section.tables:
         if not console().is_terminal or len(grid.rows) > MAX_DRAWN:
             echo("\n".join(aligned(grid)))
         else:
             _render(grid_table(grid, console().width))
-    _render(*map(patch_text, section.diffs), *([NOT_DRAWN] if section.charts else []))
+    _render(*map(patch_text, section.diffs))
 
 
 def _as_section(part: str | Mapping[str, str] | Grid | Section) -> Section:

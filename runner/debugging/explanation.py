@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from runner.analysis.compare.statistics import Estimate, bootstrap_ratio
-from runner.analysis.sections import Grid, Plot, Section, html
+from runner.analysis.sections import Figure, Grid, Section, html
 from runner.export.plots.mixtures import BarColumn, bars_chart, mixtures_chart
 from runner.util.humanize import counted, duration
 from runner.util.values import Json
@@ -140,9 +140,7 @@ class Explanation:
 
     def _repr_html_(self) -> str:
         """Return pictures and text for a notebook."""
-        first, *others = sections(self)
-        figures = [f'<figure style="max-width: 46em">{plot.svg}</figure>' for plot in plots(self)]
-        return "".join([html([first]), *figures, html(others)])
+        return html(drawn_sections(self))
 
 
 # --- as text ----------------------------------------------------------------------------------------------
@@ -306,21 +304,27 @@ def signed(estimate: Estimate) -> str:
 # --- as pictures ------------------------------------------------------------------------------------------
 
 
-def plots(explanation: Explanation) -> list[Plot]:
-    """Return the pictures of an explanation: shares, clear interactions, and mixtures by their value."""
+def drawn_sections(explanation: Explanation) -> list[Section]:
+    """Return the text of an explanation, with its pictures after the first section."""
+    first, *others = sections(explanation)
+    return [first, Section("", figures=_figures(explanation)), *others]
+
+
+def _figures(explanation: Explanation) -> list[Figure]:
+    """Return shares, clear interactions, and mixtures by their value."""
     names, result = [setting.name for setting in explanation.settings], []
     shares = [(each.name, each.share) for each in explanation.settings if each.share is not None]
     if shares:
         title = f"Share of each setting in the difference of {explanation.metric}"
-        result.append(Plot("Shares", bars_chart(title, shares).svg(), True))
+        result.append(Figure(bars_chart(title, shares).svg(), is_wide=True))
     pairs = [(" x ".join(pair.settings), pair.beyond) for pair in explanation.clear_interactions]
     if pairs:
         title = f"{explanation.metric}: what two settings do together beyond what each does"
-        result.append(Plot("Which need each other", bars_chart(title, pairs).svg(), True))
+        result.append(Figure(bars_chart(title, pairs).svg(), is_wide=True))
     columns = [
         BarColumn(one.settings, one.values, one == explanation.smallest)
         for one in sorted(shown_mixtures(explanation), key=lambda one: one.mean.value)
     ]
     title = f"{explanation.metric} of mixtures: a filled dot is the value of B, a hollow one that of A"
-    result.append(Plot("Mixtures", mixtures_chart(title, names, columns).svg(), True))
+    result.append(Figure(mixtures_chart(title, names, columns).svg(), is_wide=True))
     return result

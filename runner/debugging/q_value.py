@@ -7,7 +7,7 @@ from html import escape
 from typing import Final
 
 from runner.analysis.episodes import EpisodeRef
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Figure, Grid, Section
 from runner.drawing.svg_moves import Move
 from runner.environments.naming import spoken
 from runner.errors import MissingExtra
@@ -193,8 +193,8 @@ def _parts_of(found: Why) -> list[Section]:
             "The sum",
             [off, EXPLANATION, *([found.note] if found.note else [])],
             [Grid(("", *columns), sums)],
-            figure=found.picture,
-            caption=KEY,
+            figures=[Figure(found.picture, KEY)] if found.picture else [],
+            layout="split",
         ),
         largest,
     ]

@@ -19,7 +19,7 @@ import numpy as np
 
 from runner.analysis.contents import require_steps
 from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, StepLike, training_step
-from runner.analysis.sections import Grid, Section, html
+from runner.analysis.sections import Grid, Link, Section, html
 from runner.archive.places import opened
 from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
 from runner.debugging.quantities import JobColumns, check_lost
@@ -145,7 +145,8 @@ class When:
             grids.append(_intervals_grid(self.intervals, last))
             if len(self.intervals) < self.count:
                 sentences.append(f"The first {len(self.intervals):,} intervals are listed.")
-        return [Section(self.expression, sentences, grids, replay=moment.at.replay)]
+        links = [Link("Replay this step", moment.at.replay)]
+        return [Section(self.expression, sentences, grids, links=links)]
 
     def _repr_html_(self) -> str:
         return html(self.sections())

@@ -10,38 +10,31 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from markupsafe import Markup, escape
+from markupsafe import escape
 
 from runner.analysis.axes import axis_of
 from runner.analysis.compare.score_table import parse_table
-from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATION
-from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
-from runner.analysis.episodes import (
-    EpisodeRef,
-    StepLike,
-    first_state,
-    last_whole_evaluation,
-    ranked_trials,
-)
+from runner.analysis.diff.divergence import Divergence
+from runner.analysis.diff.sections import summary
+from runner.analysis.episodes import TYPICAL, EpisodeRef, StepLike
 from runner.analysis.histograms import histograms
-from runner.analysis.sections import Grid, Plot
+from runner.analysis.sections import Figure, Grid, Link, Section
 from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
-from runner.errors import ConfigError, RecordingError, RunnerError, shortened
+from runner.errors import ConfigError, RunnerError, shortened
 from runner.export.encoded import picture_note
 from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
-from runner.export.plots.tasks import task_charts
-from runner.export.reports.compare import tasks_legend
-from runner.export.reports.diff import ShownDivergence, difference_view
-from runner.export.reports.maps import maps_of, situations, stages_of
+from runner.export.reports.compare import drawn_task_sections
+from runner.export.reports.diff import difference_sections
+from runner.export.reports.maps import learned_section, situations, start_of
 from runner.export.reports.playback import playback_of
 from runner.export.reports.player_data import Playback
-from runner.export.reports.rendering import Link, partials
+from runner.export.reports.rendering import partials
 from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
 from runner.export.thumbnail import thumbnail
@@ -90,8 +83,9 @@ class ShownDifference:
     first_frame: str | None
     """The first frame of the replays that differs; None if there is none."""
     body: str
+    """Where they diverge and what else differs, as HTML."""
     tables: str
-    """Their Q-tables, as HTML as the body is."""
+    """Their Q-tables, as HTML."""
 
 
 def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
@@ -142,7 +136,7 @@ def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
     """Return the answer to a question about a recording as HTML."""
     with open_recording(path) as recording:
         sections = question(recording, **dict(values)).sections()
-        return str(partials().answer(sections, recording.run_id)).encode()
+        return str(partials().answer(sections, f"/runs/{recording.run_id}/")).encode()
 
 
 def answer_of_run(run: Run, question: Callable[..., Answer], values: Given) -> bytes:
@@ -197,20 +191,17 @@ def maps(path: Path, state: Sequence[str] = ()) -> bytes:
 
     They are of the situation of a state, given by the parts of its name; of a typical one by default.
     """
-    shown = partials()
     with open_recording(path) as recording:
-        drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
-        if drawing is None:
-            return f"<h2>What was learned</h2>{shown.maps([], broad=False)}".encode()
-        mdp, problem, number = recording.mdp, "", _typical_start(recording)
-        try:
-            number = state_of(mdp, ", ".join(state)) if state else number
-        except ConfigError:
-            problem = f"There is no state with {shortened(', '.join(state), 200)}."
-        rows = maps_of(mdp, recording.agents, stages_of(recording), number)
-        form = shown.situation(situations(mdp, number) if rows else [], problem)
-        maps = shown.maps(rows, drawing.width > svg.BROAD)
-        return f"<h2>What was learned</h2>{form}{maps}".encode()
+        form, number = "", 0
+        if recording.tabular and svg.drawing_of(recording.mdp) is not None:
+            problem, number = "", start_of(recording, EpisodeRef.parse(TYPICAL))
+            try:
+                number = state_of(recording.mdp, ", ".join(state)) if state else number
+            except ConfigError:
+                problem = f"There is no state with {shortened(', '.join(state), 200)}."
+            form = partials().situation(situations(recording.mdp, number), problem)
+        section = replace(learned_section(recording, number), title="")
+        return f"<h2>What was learned</h2>{form}{partials().answer([section])}".encode()
 
 
 def distributions(path: Path, axis: str) -> bytes:
@@ -220,7 +211,8 @@ def distributions(path: Path, axis: str) -> bytes:
     if not result:
         return b""
     text = " ".join([EXPLANATION, *constants_in(result), *notes])
-    return str(partials().charts("distributions", "Distributions", text, heatmap_plots(result))).encode()
+    section = Section("Distributions", [text], figures=heatmap_plots(result))
+    return str(partials().answer([section])).encode()
 
 
 def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
@@ -235,23 +227,7 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
         if table is not None:
             raise
         return f'<p class="hint">{escape(str(error).removeprefix("normalise: "))}</p>'.encode()
-    shown = partials()
-    plots = [Plot(chart.title, chart.svg(), False) for chart in task_charts(comparison)]
-    html = [shown.charts("tasks", "Normalised scores", TASKS_EXPLANATION, plots, tasks_legend(comparison))]
-    html += [
-        shown.section(f"tasks-{i}", each.title, each) for i, each in enumerate(task_sections(comparison)[:-1])
-    ]
-    return "".join(html).encode()
-
-
-def _typical_start(recording: Recording) -> int:
-    evaluation = last_whole_evaluation(recording)
-    try:
-        if evaluation is not None:
-            return first_state(recording, ranked_trials(recording, evaluation)[1])
-    except RecordingError:  # it has no steps
-        pass
-    return int(recording.mdp.start.argmax())
+    return str(partials().answer(drawn_task_sections(comparison))).encode()
 
 
 def pictures(path: Path) -> bytes:
@@ -266,45 +242,51 @@ def pictures(path: Path) -> bytes:
             while len(last) > MAX_PICTURES or size > MAX_PICTURE_BYTES:
                 size -= len(last.popleft()[2])
     figures = [
-        Markup(
-            '<figure><img src="data:{};base64,{}" alt=""><figcaption>{}, step {:,}</figcaption></figure>'
-        ).format(kind, base64.b64encode(data).decode(), name, step)
+        Figure(
+            f'<img src="data:{kind};base64,{base64.b64encode(data).decode()}" alt="">',
+            f"{name}, step {step:,}",
+        )
         for name, step, data in reversed(last)
         if (kind := media_type(data))
     ]
     texts = ["No picture was logged."] if not total else []
     if len(figures) < total:
         texts = [f"The last {len(figures):,} of {total:,} pictures."]
-    return str(
-        partials().paragraphs(texts) + Markup('<div class="pictures">{}</div>').format(Markup().join(figures))
-    ).encode()
+    return str(partials().answer([Section("", texts, figures=figures, layout="pictures")])).encode()
 
 
 def difference(a: Run, b: Run) -> bytes:
     """Return `ShownDifference` as JSON."""
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
-        view = difference_view(without_ignored(with_seconds(diff(ours, theirs), a, b), ()), ours, theirs)
-
-    def linked(shown: ShownDivergence) -> ShownDivergence:
-        runs = [a.run_id, b.run_id]
-        both = link("/compare/replay", {"run": runs, "at": str(shown.frame)})
-        viewers = [
-            Link(f"{letter} in Rerun", link(f"/runs/{run}/rerun", {"at": str(place)}))
-            for letter, run, place in zip("AB", runs, places_in([a, b], shown.step), strict=True)
-        ]
-        return replace(shown, links=[Link("Both replays at this step", both), *viewers])
-
-    shown = partials()
-    body = [shown.divergences(list(map(linked, view.divergences)), view.training, view.visits)]
-    body += [shown.section(other.title.lower(), other.title, other) for other in view.others]
+        found = without_ignored(with_seconds(diff(ours, theirs), a, b), ())
+        shown = difference_sections(found, ours, theirs)
+    divergences = {"Training": found.divergence, "Evaluation": found.evaluation_divergence}
+    known = {title: divergence for title, divergence in divergences.items() if divergence is not None}
+    for title, divergence in known.items():
+        shown[title] = replace(shown[title], links=_links([a, b], divergence))
+    body = [section for title, section in shown.items() if title not in ("Metrics", "Q-tables", "Runs")]
+    first = next(iter(known.values()), None)
     shown_difference = ShownDifference(
-        lead=view.lead,
-        notes=view.notes,
-        first_frame=str(view.divergences[0].frame) if view.divergences else None,
-        body="".join(body),
-        tables=shown.tables(view.tables, view.table_figures),
+        lead=summary(found),
+        notes=found.notes,
+        first_frame=None if first is None else str(first.frame),
+        body=partials().answer(body),
+        tables=partials().answer([shown["Q-tables"]]),
     )
     return as_json(shown_difference)
+
+
+def _links(runs: list[Run], divergence: Divergence) -> list[Link]:
+    """Return links to the replays at the first step that differs."""
+    query = {"run": [run.run_id for run in runs], "at": str(divergence.frame)}
+    places = zip("AB", runs, places_in(runs, divergence.reference), strict=True)
+    return [
+        Link("Both replays at this step", link("/compare/replay", query)),
+        *(
+            Link(f"{letter} in Rerun", link(f"/runs/{run.run_id}/rerun", {"at": str(place)}))
+            for letter, run, place in places
+        ),
+    ]
 
 
 def viewer_place(run: Run, at: EpisodeRef | None) -> bytes:

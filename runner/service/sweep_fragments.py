@@ -7,7 +7,7 @@ import importlib
 import os
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,10 +16,9 @@ from markupsafe import Markup
 
 from runner.analysis.sections import Grid, Section
 from runner.errors import RunnerError
-from runner.export.plots.curves import footnote, panel_plots
 from runner.export.reports.rendering import partials
 from runner.service.settings import without_folders
-from runner.sweep.charts import learning, picture_of, picture_plots, sweep_legend
+from runner.sweep.charts import best_section, learning, learning_section, parameters_section, picture_of
 from runner.sweep.results import Results, effects_sections, ranking_sections, results_of
 from runner.sweep.state import read_sweep
 
@@ -51,16 +50,14 @@ def _results(name: str, recordings: Path, digest: str) -> Results:  # noqa: ARG0
 def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
     """Return the ranking of a sweep as HTML, with links to its runs."""
     results = _results(name, recordings, digest)
-    ranking, *others = (_without_folders(each, recordings) for each in ranking_sections(results, None))
+    ranking, *others = ranking_sections(results, None)
     runs = {str(entry.number): _run_links(entry.runs) for entry in results.ranking}
     grids = [
         Grid((*grid.headings, "runs, by seed"), [(*row, runs[row[0]]) for row in grid.rows])
-        for grid in ranking.grids[:1]
+        for grid in ranking.grids
     ]
-    shown = partials()
-    html = [shown.section("ranking", "Ranking", replace(ranking, grids=[*grids, *ranking.grids[1:]]))]
-    html += [shown.section(f"results-{i}", each.title, each) for i, each in enumerate(others)]
-    return "".join([*html, shown.best(results.best_yaml) if results.best_yaml else ""]).encode()
+    best = [best_section(results)] if results.best_yaml else []
+    return _answer([replace(ranking, title="Ranking", grids=grids), *others, *best], recordings)
 
 
 def _run_links(runs: Mapping[int, str]) -> str:
@@ -72,29 +69,25 @@ def _run_links(runs: Mapping[int, str]) -> str:
 
 def sweep_importance(name: str, recordings: Path, digest: str) -> bytes:
     """Return the importance of a sweep's parameters as HTML, empty if it is unknown."""
-    shown = partials()
-    sections = [
-        _without_folders(each, recordings) for each in effects_sections(_results(name, recordings, digest))
-    ]
-    return "".join(
-        shown.section(f"importance-{i}", each.title, each) for i, each in enumerate(sections)
-    ).encode()
-
-
-def _without_folders(section: Section, recordings: Path) -> Section:
-    return replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
+    return _answer(effects_sections(_results(name, recordings, digest)), recordings)
 
 
 def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the charts of a sweep as HTML: its parameters, and learning curves of some of its trials."""
-    results, shown, html = _results(name, recordings, digest), partials(), ""
+    results, sections = _results(name, recordings, digest), []
     with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
-        picture = picture_of(results)
-        html = shown.charts("parameters", "Parameters", picture.footnote, picture_plots(picture))
+        sections.append(parameters_section(picture_of(results)))
     try:
-        groups, panels = learning(results, recordings)
-        plots, note = panel_plots(panels, len(groups)), footnote(groups, panels)
-        html += shown.charts("curves", "Learning curves", note, plots, sweep_legend(groups))
+        sections.append(learning_section(learning(results, recordings)))
     except RunnerError as error:
-        html += shown.charts("curves", "Learning curves", without_folders(str(error), recordings), [])
-    return str(html).encode()
+        sections.append(Section("Learning curves", [str(error)]))
+    return _answer(sections, recordings)
+
+
+def _answer(sections: Sequence[Section], recordings: Path) -> bytes:
+    """Return sections as HTML, without the path of the recordings folder."""
+    shown = [
+        replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
+        for section in sections
+    ]
+    return str(partials().answer(shown)).encode()

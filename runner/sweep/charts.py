@@ -7,7 +7,7 @@ import json
 import math
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -16,15 +16,15 @@ import numpy as np
 
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
-from runner.analysis.panels import Panel, panels_of
-from runner.analysis.sections import Plot, Section
+from runner.analysis.panels import Panel
+from runner.analysis.sections import Figure, LegendEntry, Section, Source
 from runner.analysis.series import series_of
 from runner.archive.places import at_hand
 from runner.drawing import palette
 from runner.errors import RunnerError
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
-from runner.export.plots.curves import HEIGHT, WIDTH, footnote, panel_chart, panel_plots
-from runner.export.reports.rendering import LegendEntry, render
+from runner.export.plots.curves import HEIGHT, WIDTH, curves_section, panel_chart
+from runner.export.reports.rendering import render
 from runner.runs.resolve import find_run
 from runner.sweep.model import Range
 from runner.sweep.results import Ranked, Results, sections, value_text, values_text
@@ -110,8 +110,8 @@ def picture_of(results: Results) -> ChartPicture:
     )
 
 
-def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Panel]]:
-    """Return the runs of the median and of the best trial, and their metrics over episodes.
+def learning(results: Results, recordings: Path) -> list[Group]:
+    """Return the runs of the median and of the best trial.
 
     Raises:
         RunnerError: no trial is finished yet, or a run cannot be read.
@@ -125,7 +125,7 @@ def learning(results: Results, recordings: Path) -> tuple[list[Group], list[Pane
         series = series_of(run.recording for run in runs)
         values = values_text(trial.values)
         groups.append(Group(f"{name}, trial {trial.number}: {values}", tuple(series)))
-    return groups, panels_of(groups)
+    return groups
 
 
 def panel_of(objective: str, panels: Sequence[Panel]) -> Panel:
@@ -183,12 +183,6 @@ def sweep_sheet(title: str, picture: ChartPicture, groups: Sequence[Group], pane
     for number, (line, colour) in enumerate(notes):
         sheet.text(10, end + 12 + 11 * number, line, size=SMALL, colour=colour)
     return sheet
-
-
-def picture_plots(picture: ChartPicture) -> list[Plot]:
-    """Return the trials for a page: along each parameter, and in parallel coordinates."""
-    along = [Plot(axis.path, parameter_chart(picture, axis).svg(), False) for axis in picture.axes]
-    return [*along, Plot("All parameters", parallel_chart(picture).svg(), True)]
 
 
 def parameter_chart(picture: ChartPicture, axis: ParameterAxis) -> Chart:
@@ -282,25 +276,39 @@ def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
 
 def render_sweep(results: Results, recordings: Path) -> str:
     """Return the page of a sweep whose runs are in a recordings folder."""
-    picture = picture_of(results)
-    groups, panels = learning(results, recordings)
     ranking, *others = sections(results)
     return render(
-        "sweep.html",
-        title=ranking.title,
-        lead=ranking.sentences,
-        sections=[Section("Ranking", grids=ranking.grids), *others],
-        parameters=picture_plots(picture),
-        note=picture.footnote,
-        best=results.best_yaml,
-        legend=sweep_legend(groups),
-        plots=panel_plots(panels, len(groups)),
-        footnote=footnote(groups, panels),
-        moment=f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
+        ranking.title,
+        ranking.sentences,
+        [
+            parameters_section(picture_of(results)),
+            learning_section(learning(results, recordings)),
+            replace(ranking, title="Ranking", sentences=[]),
+            *others,
+            best_section(results),
+        ],
+        f"the recordings of these runs, {datetime.now(UTC):%Y-%m-%d %H:%M} UTC",
     )
 
 
-def sweep_legend(groups: list[Group]) -> list[LegendEntry]:
-    """Return which trial each group of runs belongs to."""
+def parameters_section(picture: ChartPicture) -> Section:
+    """Return the trials for a page: along each parameter, and in parallel coordinates."""
+    along = [Figure(parameter_chart(picture, axis).svg()) for axis in picture.axes]
+    parallel = Figure(parallel_chart(picture).svg(), is_wide=True)
+    return Section("Parameters", [picture.footnote], figures=[*along, parallel])
+
+
+def learning_section(groups: Sequence[Group]) -> Section:
+    """Return the learning curves of some trials for a page."""
     parts = (group.described.partition(", ") for group in groups)
-    return [LegendEntry(trial, rest) for trial, _, rest in parts]
+    return curves_section(groups, legend=[LegendEntry(trial, rest) for trial, _, rest in parts])
+
+
+def best_section(results: Results) -> Section:
+    """Return the best configuration for a page."""
+    how = (
+        "Save it as a file, and `dualtaxi run FILE` runs it; `dualtaxi sweep show NAME --write-best FILE` "
+        "writes it."
+    )
+    file = Source(f"{results.sweep.name}_best.yaml", "", results.best_yaml or "No trial is finished yet.")
+    return Section("The best configuration", [how], sources=[file])

@@ -42,7 +42,7 @@ class MachineUse:
         return [
             Section("Time and machine", facts=machine_facts(self.clock, self.host)),
             Section(
-                "Over time", [text] if self.host is None else [], charts=machine_plots(self.clock, self.host)
+                "Over time", [text] if self.host is None else [], figures=machine_plots(self.clock, self.host)
             ),
         ]
 

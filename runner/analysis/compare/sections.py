@@ -39,7 +39,7 @@ def sections(comparison: Comparison) -> list[Section]:
     first = Section("Groups", sentences, [Grid(("group", "runs", ""), rows)])
     return [
         first,
-        *(metric_section(metric) for metric in comparison.metrics),
+        *(_metric(metric) for metric in comparison.metrics),
         Section("How to read this", [EXPLANATION]),
     ]
 
@@ -72,8 +72,8 @@ def _pair_in_words(metric: MetricResult, pair: PairResult) -> str:
     )
 
 
-def metric_section(metric: MetricResult, profile: bool = True) -> Section:
-    """Return the text of one metric, with a few points of its performance profile if that is wanted."""
+def _metric(metric: MetricResult) -> Section:
+    """Return the text of one metric, with a few points of its performance profile."""
     better = {True: "higher is better", False: "lower is better", None: "neither is better as such"}
     line = f", {metric.line.replace('_', ' ')}" if metric.line else ""
     groups = [
@@ -97,7 +97,7 @@ def metric_section(metric: MetricResult, profile: bool = True) -> Section:
             count,
         )
         grids.append(Grid(headings, [_pair(pair, together) for pair in metric.pairs]))
-    if profile and len(metric.thresholds) > 1:
+    if len(metric.thresholds) > 1:
         sign = "at most" if metric.higher_is_better is False else "at least"
         grids.append(profile_grid(metric.groups, metric.thresholds, sign))
     sentences = [f"{metric.name}, in {metric.unit}; {better[metric.higher_is_better]}."]

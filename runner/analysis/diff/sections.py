@@ -19,16 +19,19 @@ from runner.util.humanize import UNKNOWN, counted, setting
 
 _MAX_SETTINGS: Final = 4
 """Settings that are named in the first sentences."""
+_MAX_VALUES: Final = 6
+"""Q-values of each run that are listed where everything is: the highest."""
 
 
 def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
     """Return the text of a difference; `everything` includes what does not differ."""
+    most = _MAX_VALUES if everything else 1
     all_sections = [
         _runs(difference),
         _values("Configuration", difference, "config", setting),
         _environment(difference),
-        _training(difference),
-        _evaluation(difference),
+        _training(difference, most),
+        _evaluation(difference, most),
         _tables(difference),
         _metrics(difference, everything),
         _values("Costs", difference, "costs", _amount),
@@ -123,16 +126,16 @@ def _changes_grid(changes: Sequence[Change], text: Callable[[object], str] = _te
     return [Grid(("", "A", "B"), rows)] if rows else []
 
 
-def made_sections(a: Recording, b: Recording) -> tuple[str, Section, Section]:
-    """Return how differently two runs were made: in a sentence, the code, and all of the provenance."""
+def made_sections(a: Recording, b: Recording) -> tuple[str, list[Section]]:
+    """Return how differently two runs were made: in a sentence, and the code and all of the provenance."""
     files, changes = code_changes(a, b), changes_in(a.provenance, b.provenance)
-    provenance = Section("Provenance", [] if changes else ["the same"], _changes_grid(changes))
+    provenance = Section("How they were made", [] if changes else ["the same"], _changes_grid(changes))
     missing = [f"{name} has no recorded code." for name, run in (("A", a), ("B", b)) if not run.code.files]
     code = _code(files)
     if not code.sentences:
         code = Section("Code", missing or ["the same, as far as it is recorded"])
     made = ", ".join(made_in_words(files, changes))
-    return f"How they were made differs: {made}." if made else "", code, provenance
+    return f"How they were made differs: {made}." if made else "", [code, provenance]
 
 
 def _code(files: Sequence[FileChange]) -> Section:
@@ -163,17 +166,17 @@ def _environment(difference: RunDiff) -> Section:
     return Section("Environment", sentences, grids)
 
 
-def _training(difference: RunDiff) -> Section:
+def _training(difference: RunDiff, most: int) -> Section:
     divergence, cause = difference.divergence, difference.cause
     if divergence is None:
         same = [] if difference.overlap is None else ["Training is the same, step by step."]
         return Section("Training", same)
     where = divergence_in_words(divergence, cause)
-    sentences = [where, *updates_in_words(cause), *overlap_in_words(difference)]
-    return Section("Training", sentences, [*_q_rows(cause), *visits_grids(difference)])
+    sentences = [where, *_updates_in_words(cause), *_overlap_in_words(difference)]
+    return Section("Training", sentences, [*_q_rows(cause, most), *_visits_grids(difference)])
 
 
-def overlap_in_words(difference: RunDiff) -> list[str]:
+def _overlap_in_words(difference: RunDiff) -> list[str]:
     """Return how far training is the same, and how alike it visits states, if that is known."""
     overlap, visits, sentences = difference.overlap, difference.visits, []
     if overlap is not None:
@@ -191,7 +194,7 @@ def overlap_in_words(difference: RunDiff) -> list[str]:
     return sentences
 
 
-def visits_grids(difference: RunDiff) -> list[Grid]:
+def _visits_grids(difference: RunDiff) -> list[Grid]:
     """Return the states whose shares of all training steps differ most."""
     visits = difference.visits
     if visits is None or not visits.most_apart:
@@ -200,20 +203,20 @@ def visits_grids(difference: RunDiff) -> list[Grid]:
     return [Grid(("training steps in a state, where the shares differ most", "A", "B"), rows)]
 
 
-def _evaluation(difference: RunDiff) -> Section:
+def _evaluation(difference: RunDiff, most: int) -> Section:
     divergence, cause = difference.evaluation_divergence, difference.evaluation_cause
     if divergence is None:
         return Section("Evaluation")
     where = divergence_in_words(divergence, cause)
-    return Section("Evaluation", [where, *evaluation_updates(difference, cause)], _q_rows(cause))
+    return Section("Evaluation", [where, *_evaluation_updates(difference, cause)], _q_rows(cause, most))
 
 
 def divergence_in_words(divergence: Divergence, cause: Cause | None) -> str:
     """Return where two runs diverge and why, as far as that is known, in a sentence."""
-    return f"They diverge {where_in_words(divergence)}: {why_in_words(divergence, cause)}."
+    return f"They diverge {where_in_words(divergence)}: {_why_in_words(divergence, cause)}."
 
 
-def why_in_words(divergence: Divergence, cause: Cause | None) -> str:
+def _why_in_words(divergence: Divergence, cause: Cause | None) -> str:
     """Return the cause of a divergence; where how they learn is not known, the values that differ."""
     if cause is not None:
         return cause.text
@@ -226,7 +229,7 @@ def why_in_words(divergence: Divergence, cause: Cause | None) -> str:
     return f"{name} is {_text(divergence.a)} in A, {_text(divergence.b)} in B"
 
 
-def evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:
+def _evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:
     """Return how the tables came to differ that an evaluation used, in a sentence or two."""
     training_cause = difference.cause
     if cause is not None and training_cause is not None:
@@ -234,7 +237,7 @@ def evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:
             return ["The tables came to differ by the same update as above."]
         if cause.kind == "greedy_action" and cause.update is None:
             return ["Training had diverged before, so the tables are not the same."]
-    return updates_in_words(cause)
+    return _updates_in_words(cause)
 
 
 def _is_beyond_a(divergence: Divergence) -> bool:
@@ -256,7 +259,7 @@ def where_in_words(divergence: Divergence) -> str:
     return f"in {episode}, at t = {divergence.t} ({step})"
 
 
-def updates_in_words(cause: Cause | None) -> list[str]:
+def _updates_in_words(cause: Cause | None) -> list[str]:
     """Return how the tables came to differ, in a sentence or two; none if that is not the cause."""
     if cause is None or cause.update is None:
         return []
@@ -271,13 +274,19 @@ def updates_in_words(cause: Cause | None) -> list[str]:
     return sentences
 
 
-def _q_rows(cause: Cause | None) -> list[Grid]:
-    """Return the Q-values of the state in which the greedy actions differ, the best of each agent."""
+def _q_rows(cause: Cause | None, most: int) -> list[Grid]:
+    """Return the highest Q-values of both runs in the state in which the greedy actions differ."""
     grids = []
     for row in () if cause is None else cause.rows:
-        best = dict.fromkeys(values.index(max(values)) for values in (row.a, row.b))
-        cells = [(row.actions[j], f"{row.a[j]:.6g}", f"{row.b[j]:.6g}") for j in best]
-        grids.append(Grid((f"Q-values of {spoken(row.agent)} there, of the greedy actions", "A", "B"), cells))
+        orders = [sorted(range(len(values)), key=lambda j: -values[j]) for values in (row.a, row.b)]
+        shown = dict.fromkeys(j for order in orders for j in order[:most])
+        cells = []
+        for j in shown:
+            greedy = " and ".join(name for name, order in zip("AB", orders, strict=True) if j == order[0])
+            name = f"{row.actions[j]} (greedy in {greedy})" if greedy else row.actions[j]
+            cells.append((name, f"{row.a[j]:.6g}", f"{row.b[j]:.6g}"))
+        of = f", the highest of {len(row.actions)}" if len(row.actions) > len(shown) else ""
+        grids.append(Grid((f"Q-values of {spoken(row.agent)} there{of}", "A", "B"), cells))
     return grids
 
 

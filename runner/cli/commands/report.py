@@ -135,6 +135,7 @@ def _refuse_style(axis: Axis, style: CurveStyle) -> None:
 
 
 def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
+    from runner.analysis.panels import panels_of
     from runner.export.plots.image import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
@@ -142,8 +143,8 @@ def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
 
     results = results_of(read_sweep(name, recordings), recordings)
     picture = picture_of(results)
-    groups, panels = learning(results, recordings)
-    panel = panel_of(results.sweep.objective.metric, panels)
+    groups = learning(results, recordings)
+    panel = panel_of(results.sweep.objective.metric, panels_of(groups))
     with stage_line("drawing"), new_file(to.path(), to.force) as path:
         save(sweep_sheet(f"Sweep {name}", picture, groups, panel), path)
     count = len(picture.trials)

@@ -17,7 +17,7 @@ import numpy as np
 from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Group
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
-from runner.analysis.sections import Plot
+from runner.analysis.sections import Figure, LegendEntry, Section
 from runner.analysis.series import values_left_out
 from runner.drawing import palette
 from runner.environments.naming import spoken
@@ -45,20 +45,19 @@ _LETTERS: Final = 215
 """Letters of a note that fit on a line of a sheet of three columns."""
 
 
-def plots_of(groups: Sequence[Group], style: CurveStyle = PLAIN) -> tuple[list[Plot], str]:
-    """Return the learning curves of groups of runs for a page, and a note on them; none without metrics."""
+def curves_section(
+    groups: Sequence[Group], style: CurveStyle = PLAIN, legend: Sequence[LegendEntry] = ()
+) -> Section:
+    """Return the learning curves of groups of runs for a page, and a note on them."""
     try:
         panels = panels_of(groups)
     except NoMetrics:
-        return [], ""
-    return panel_plots(panels, len(groups), style), footnote(groups, panels, style)
-
-
-def panel_plots(panels: Sequence[Panel], groups: int, style: CurveStyle = PLAIN) -> list[Plot]:
-    """Return panels of a number of groups for a page."""
-    return [
-        Plot(panel.title, panel_chart(panel, groups, style).svg(), panel.metric == SHARES) for panel in panels
+        return Section("Learning curves", ["No metrics were recorded."])
+    figures = [
+        Figure(panel_chart(panel, len(groups), style).svg(), is_wide=panel.metric == SHARES)
+        for panel in panels
     ]
+    return Section("Learning curves", [footnote(groups, panels, style)], figures=figures, legend=legend)
 
 
 def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], style: CurveStyle = PLAIN) -> Canvas:

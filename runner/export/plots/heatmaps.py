@@ -8,7 +8,7 @@ import numpy as np
 
 from runner.analysis.axes import axis_of
 from runner.analysis.histograms import ValueCounts
-from runner.analysis.sections import Plot
+from runner.analysis.sections import Figure
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import shortened
@@ -30,10 +30,10 @@ EXPLANATION: Final = (
 )
 
 
-def heatmap_plots(histograms: list[ValueCounts]) -> list[Plot]:
+def heatmap_plots(histograms: list[ValueCounts]) -> list[Figure]:
     """Return the heat maps for a page, of what is not constant."""
     varying = [histogram for histogram in histograms if len(histogram.names) != 1]
-    return [Plot(title_of(histogram), heatmap_chart(histogram).svg(), False) for histogram in varying]
+    return [Figure(heatmap_chart(histogram).svg()) for histogram in varying]
 
 
 def constants_in(histograms: list[ValueCounts]) -> list[str]:

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from runner.analysis.sections import Plot
+from runner.analysis.sections import Figure
 from runner.export.plots.chart import Chart, Scale, labelled, series_colour, series_marker
 from runner.export.plots.curves import HEIGHT, WIDTH, draw_legend
 from runner.recording.clock import SAMPLE_SECONDS, Clock
@@ -46,7 +46,7 @@ def machine_facts(clock: Clock, host: HostMetrics | None) -> dict[str, str]:
     return facts | {_SIZES[name]: humanize.size(size) for name, size in largest.items()}
 
 
-def machine_plots(clock: Clock, host: HostMetrics | None) -> Iterator[Plot]:
+def machine_plots(clock: Clock, host: HostMetrics | None) -> Iterator[Figure]:
     """Yield the charts of a run over its time; those of its machine only if that was recorded."""
     edges = np.linspace(0, clock.duration, 1 + min(_INTERVALS, max(1, int(clock.duration / SAMPLE_SECONDS))))
     done = np.interp(edges, clock.seconds, clock.positions)
@@ -85,7 +85,7 @@ def _host_panels(host: HostMetrics) -> list[_Panel]:
     return [panel for panel in panels if any(np.isfinite(values).any() for values in panel.lines.values())]
 
 
-def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
+def _plot(panel: _Panel, seconds: Values, duration: float) -> Figure:
     unit, divisor = next(
         each
         for each in (("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
@@ -106,4 +106,4 @@ def _plot(panel: _Panel, seconds: Values, duration: float) -> Plot:
             chart.markers(places, shown, series_colour(number), series_marker(number), 1.7)
     if len(usable) > 1:
         draw_legend(chart, chart.x.start, y.end - 8, list(usable), [*map(series_colour, range(len(usable)))])
-    return Plot(panel.title, chart.svg(), wide=False)
+    return Figure(chart.svg())

@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from runner.analysis.compare import Comparison, MetricResult
-from runner.analysis.compare.sections import EXPLANATION, metric_section, summary
-from runner.analysis.compare.task_sections import EXPLANATION as TASKS_EXPLANATION
+from runner.analysis.compare.sections import sections, summary
 from runner.analysis.compare.task_sections import task_sections
 from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Figure, Grid, LegendEntry, Section
 from runner.export.plots.comparisons import intervals_svg, letter, profile_chart
-from runner.export.plots.curves import plots_of
+from runner.export.plots.curves import curves_section
 from runner.export.plots.tasks import task_charts
-from runner.export.reports.rendering import Figure, LegendEntry, render
+from runner.export.reports.rendering import render
 from runner.util.humanize import UNKNOWN, counted
 
-
-class ComparedMetric(NamedTuple):
-    """A metric on the page."""
-
-    id: str
-    section: Section
-    figures: list[Figure]
+_KEY = (
+    "In the plots of values, a dot is a run, the tick the median, the large sign the IQM, and the bar its "
+    "interval. A performance profile shows the share of the runs that reach a level; bands are pointwise "
+    "95 % intervals."
+)
 
 
 def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
     """Return the page of a comparison, with the learning curves of its groups."""
     labels = [group.label for group in groups]
-    plots, footnote = plots_of(groups)
+    _, *metrics, how = sections(comparison)
     rows = [
         (
             run.run_id,
@@ -44,52 +40,56 @@ def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
         for run in group.runs
     ]
     return render(
-        "compare.html",
-        title=" against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
-        lead=summary(comparison),
+        " against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
+        summary(comparison),
+        [
+            *(
+                replace(section, figures=list(_figures(metric, labels)), layout="pair")
+                for section, metric in zip(metrics, comparison.metrics, strict=True)
+            ),
+            curves_section(groups),
+            Section("Runs", grids=[Grid(("run", "group", "name", "seed", "status"), rows)]),
+            replace(how, sentences=[*how.sentences, _KEY]),
+        ],
+        f"the recordings of these runs, {comparison.moment}",
         notes=comparison.notes,
         legend=[
             LegendEntry(letter(i), f"{group.label}: {counted(len(group.runs), 'run')}")
             for i, group in enumerate(groups)
         ],
-        metrics=[_metric(metric, labels) for metric in comparison.metrics],
-        plots=plots,
-        footnote=footnote,
-        runs=Grid(("run", "group", "name", "seed", "status"), rows),
-        moment=comparison.moment,
-        explanation=EXPLANATION,
     )
 
 
-def _metric(metric: MetricResult, labels: list[str]) -> ComparedMetric:
-    section = metric_section(metric, profile=False)
-    figures = [Figure(intervals_svg(metric, labels), "Values")] if metric.groups else []
-    if metric.groups and len(metric.thresholds) > 1:
+def _figures(metric: MetricResult, labels: list[str]) -> Iterator[Figure]:
+    if not metric.groups:
+        return
+    yield Figure(intervals_svg(metric, labels), "Values")
+    if len(metric.thresholds) > 1:
         title, is_lower_better = f"{metric.title}: performance profile", metric.higher_is_better is False
         chart = profile_chart(
             "", title, metric.unit, metric.thresholds, metric.groups, labels, is_lower_better
         )
-        figures.append(Figure(chart.svg(), "Performance profile"))
-    return ComparedMetric("metric-" + re.sub(r"\W+", "-", metric.name), section, figures)
+        yield Figure(chart.svg(), "Performance profile")
 
 
 def render_tasks(comparison: TaskComparison) -> str:
     """Return the page of a comparison over environments."""
     labels = [result.label for result in comparison.algorithms]
     return render(
-        "tasks.html",
-        title=f"{' against '.join(labels)} over {len(comparison.tasks)} environments",
-        sections=task_sections(comparison)[:-1],
-        legend=tasks_legend(comparison),
-        charts=[chart.svg() for chart in task_charts(comparison)],
-        moment=comparison.moment,
-        explanation=TASKS_EXPLANATION,
+        f"{' against '.join(labels)} over {len(comparison.tasks)} environments",
+        [],
+        drawn_task_sections(comparison),
+        f"the recordings of these runs, {comparison.moment}",
     )
 
 
-def tasks_legend(comparison: TaskComparison) -> list[LegendEntry]:
-    """Return the legend of charts over environments."""
-    return [
+def drawn_task_sections(comparison: TaskComparison) -> list[Section]:
+    """Return the text of a comparison over environments with its charts."""
+    algorithms, scores, how = task_sections(comparison)
+    legend = [
         LegendEntry(letter(i), f"{result.label}: {sum(result.seeds.values())} runs")
         for i, result in enumerate(comparison.algorithms)
     ]
+    figures = [Figure(chart.svg()) for chart in task_charts(comparison)]
+    sentences = [*scores.sentences, "Bands are pointwise 95 % intervals."]
+    return [replace(scores, sentences=sentences, figures=figures, legend=legend), algorithms, how]

@@ -12,8 +12,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from runner.analysis.episodes import EpisodeRef, first_state
 from runner.analysis.qtable import recorded_tables
-from runner.drawing.svg import drawing_of
+from runner.analysis.sections import Figure, Section
+from runner.drawing.svg import BROAD, drawing_of
 from runner.drawing.svg_maps import pair_map, policy_map
 from runner.environments.mdp import Mdp
 from runner.environments.naming import spoken, states_in_words
@@ -23,6 +25,7 @@ from runner.recording.reader import Recording
 from runner.replay.steps import step_of_episode
 from runner.replay.tables import tables_at
 from runner.util.arrays import Array, Flags, Floats, Ints
+from runner.util.humanize import capitalised
 
 Values = Floats
 Bounds = tuple[float, float]
@@ -39,18 +42,6 @@ class MapStage:
     episode: int
     step: int
     tables: list[Values]
-
-
-@dataclass(frozen=True)
-class MapRow:
-    """One kind of map at every stage, with the same colours for the same values."""
-
-    title: str
-    explanation: str
-    svgs: tuple[tuple[str, str], ...]
-    """(stage, svg)."""
-    low: float
-    high: float
 
 
 class Choice(NamedTuple):
@@ -94,8 +85,24 @@ def stages_of(recording: Recording) -> list[MapStage]:
     return list(unique.values())
 
 
-def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int) -> list[MapRow]:
-    """Return the maps for the situation of a state; none without a scene or a mover."""
+def start_of(recording: Recording, at: EpisodeRef) -> int:
+    """Return the state in which an episode begins; of an unknown one, the most likely."""
+    try:
+        return first_state(recording, at.resolved(recording))
+    except RecordingError:  # it has no steps
+        return int(recording.mdp.start.argmax())
+
+
+def learned_section(recording: Recording, state: int) -> Section:
+    """Return the maps for the situation of a state, if the recording has a scene and tables."""
+    rows = maps_of(recording.mdp, recording.agents, stages_of(recording), state) if recording.tabular else []
+    text = "A Q-value is the expected return of an action in a state, if the best actions follow."
+    without = "There are no maps: the recording has no scene or no Q-table."
+    return Section("What was learned", [text if rows else without], parts=rows)
+
+
+def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state: int) -> list[Section]:
+    """Return each kind of map at every stage, for the situation of a state."""
     drawing = drawing_of(mdp)
     if drawing is None or mdp.scene is None or not stages:
         return []
@@ -162,8 +169,11 @@ def _row(
     movers: list[int],
     learner: int,
     own_actions: Ints | None = None,
-) -> MapRow:
-    """Return the maps of a learner's table at each stage; `own_actions` has a mover's part of its actions."""
+) -> Section:
+    """Return the maps of a learner's table at each stage, with the same colours for the same values.
+
+    `own_actions` has a mover's part of its actions.
+    """
     states = np.flatnonzero(situation(mdp, state, movers))
     grids, policies = [], []
     for stage in stages:
@@ -175,14 +185,18 @@ def _row(
         policies.append(on_grid(mdp, states, movers, greedy if own_actions is None else own_actions[greedy]))
     numbers = np.concatenate([grid[~np.isnan(grid)] for grid in grids])
     bounds = (float(numbers.min()), float(numbers.max())) if len(numbers) else (0.0, 0.0)
-    svgs = []
+    figures = []
     for stage, grid, policy in zip(stages, grids, policies, strict=True):
         span = "no action is preferred anywhere"
         if not np.isnan(grid).all():
             span = f"from {np.nanmin(grid):.4g} to {np.nanmax(grid):.4g}"
-        svgs.append((stage.title, drawn(mdp, grid, bounds, f"{title}, {stage.title}; {span}", policy)))
+        picture = drawn(mdp, grid, bounds, f"{title}, {stage.title}; {span}", policy)
+        figures.append(Figure(picture, capitalised(stage.title)))
     fixed = situation_in_words(mdp, state, movers)
-    return MapRow(title, explanation + (f" Situation: {fixed}." if fixed else ""), tuple(svgs), *bounds)
+    drawing = drawing_of(mdp)
+    layout = "maps broad" if drawing is not None and drawing.width > BROAD else "maps"
+    text = explanation + (f" Situation: {fixed}." if fixed else "")
+    return Section(title, [text], figures=figures, layout=layout, ramp=bounds)
 
 
 def on_grid(mdp: Mdp, states: Ints, movers: list[int], values: Array) -> Values:

@@ -9,8 +9,9 @@ from collections.abc import Callable, Sequence
 from html import escape
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
+from runner.analysis.sections import LegendEntry, Section
 from runner.drawing import palette, svg, svg_maps
 from runner.recording.metrics import METRICS
 from runner.util import humanize
@@ -23,38 +24,23 @@ if TYPE_CHECKING:
 TEMPLATES: Final = files("runner.export") / "templates"
 
 
-class LegendEntry(NamedTuple):
-    """The line of a legend that explains the colour of its place."""
-
-    letter: str
-    """What stands for it in text and plots; may be empty."""
-    text: str
-
-
-class Figure(NamedTuple):
-    """A picture with its caption."""
-
-    svg: str
-    caption: str
-    high: float | None = None
-    """The value of the lightest colour of a map whose darkest is 0."""
-
-
-class Link(NamedTuple):
-    """A link of a page."""
-
-    text: str
-    address: str
-
-
 def partials() -> Any:
     """Return the macros of `parts.html`, which reports and pages share, as functions that return HTML."""
     return templates().get_template("parts.html").module
 
 
-def render(template: str, **values: object) -> str:
-    """Return the page of a report: a template with the values that it shows."""
-    return templates().get_template(template).render(values)
+def render(
+    title: str,
+    lead: Sequence[str],
+    sections: Sequence[Section],
+    source: str,
+    *,
+    notes: Sequence[str] = (),
+    legend: Sequence[LegendEntry] = (),
+    replays: bool = False,
+) -> str:
+    """Return a self-contained page of sections, read from a source; `replays` says that some are replays."""
+    return templates().get_template("page.html").render(locals())
 
 
 @functools.cache

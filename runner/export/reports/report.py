@@ -5,79 +5,50 @@ The page needs no network: style, script, plots and data are in it. All of it is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis
 from runner.analysis.contents import shortcomings, why_no_steps
-from runner.analysis.episodes import EpisodeRef, first_state, last_whole_evaluation, ranked, ranked_trials
-from runner.analysis.evaluations import EvaluationRecord, evaluation_records, evaluations_section
+from runner.analysis.episodes import EpisodeRef, last_whole_evaluation, ranked, ranked_trials
+from runner.analysis.evaluations import (
+    EvaluationRecord,
+    evaluation_records,
+    evaluations_section,
+    metric_columns,
+)
 from runner.analysis.groups import groups_of
-from runner.analysis.sections import Section
+from runner.analysis.sections import Grid, LegendEntry, Player, Section
 from runner.analysis.series import RunSeries, read_series, values_left_out
 from runner.analysis.summary import describe_recording, random_policy_sentence
 from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.encoded import Thumbnails, picture_note, thumbnails
-from runner.export.plots.curves import plots_of
+from runner.export.plots.curves import curves_section
 from runner.export.plots.style import PLAIN, CurveStyle
-from runner.export.reports.maps import MapRow, maps_of, stages_of
+from runner.export.reports.maps import learned_section, start_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
-from runner.export.reports.rendering import LegendEntry, embedded, render, templates
-from runner.recording.metrics import METRICS
+from runner.export.reports.rendering import embedded, render, templates
 from runner.recording.reader import Recording, open_recording
-from runner.recording.run_file import RecentTraining, has_environment
+from runner.recording.run_file import has_environment
 from runner.runs.listing import run_at
+from runner.util.humanize import UNKNOWN, capitalised, number
 from runner.util.processes import Tell
 
 
-@dataclass(frozen=True)
-class ReportReplay:
-    """The episodes that the page of a run replays."""
-
-    titles: list[str]
-    picture: str
-    """The grid at the first frame; empty without a scene."""
-    key: str
-    data: str
-    """JSON for `replay.js`."""
-    has_frames: bool
-    """Whether it has pictures of the environment."""
-
-
-@dataclass(frozen=True)
-class ReportedRun:
+class ReportedRun(NamedTuple):
     """A run on the page."""
 
-    number: int
-    id: str
-    name: str
-    seed: int | None
-    title: str
-    status: str
-    environment: str
-    agents: list[str]
-    is_random: bool
-    made_by: str
-    """The program that recorded a loop; empty for a job."""
-    last: EvaluationRecord | None
-    """The last evaluation."""
-    recent: RecentTraining
-    """The last training episodes."""
-    random_policy: str
-    """A sentence on what a random policy achieves; empty if unknown."""
-    has_steps: bool
-    evaluations: Section | None
-    broad: bool
-    origin: list[Section]
+    article: Section
+    """What it is and achieved, and all about it but its learning curves."""
+    row: dict[str, str]
+    """Its row in the table of runs, by heading."""
     notes: list[str]
-    maps: list[MapRow]
-    replay: ReportReplay | None
-    has_tables: bool
 
 
 def require_packages() -> None:
@@ -104,65 +75,107 @@ def render_report(
         progress(f"reading run {count} of {len(recordings)}")
         with open_recording(path) as recording:
             series.append(read_series(recording, axis))
-            runs.append(_run(recording, len(runs), chosen, progress))
+            runs.append(_run(recording, chosen, progress))
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
-    columns = [  # the metrics of the last evaluations that any run knows
-        metric
-        for metric in METRICS
-        if not (metric.per_agent and any(run.has_tables for run in runs))
-        and any(run.last is not None and run.last.value(metric.name) is not None for run in runs)
-    ]
-    plots, footnote = plots_of(groups, style)
+    curves = curves_section(groups, style, legend if len(legend) > 1 else [])
+    articles = [run.article for run in runs]
+    first, *others = articles[0].parts
+    lead, sections, source = articles[0].sentences, [first, curves, *others], "recording"
+    if len(runs) > 1:
+        headings = tuple(dict.fromkeys(heading for run in runs for heading in run.row))
+        rows = [tuple(run.row.get(heading, UNKNOWN) for heading in headings) for run in runs]
+        links = [f"#{article.anchor}-{i}" for i, article in enumerate(articles, 2)]
+        summary = Section(
+            "Summary", ["The last evaluation of each run."], [Grid(headings, rows, links=links)]
+        )
+        lead, sections, source = [], [summary, curves, *articles], "recordings"
+    ids = ", ".join(f"run {run.row['run']}" for run in runs)
+    notes = [note for run in runs for note in run.notes]
     page = render(
-        "report.html",
-        title=_title(runs),
-        runs=runs,
-        plots=plots,
-        footnote=footnote,
-        legend=legend,
-        columns=columns,
-        max_values=MAX_VALUES,
+        _title([run.row for run in runs]),
+        lead,
+        sections,
+        f"the {source} of {ids}. The replay rounds numbers "
+        f"to five digits and shows the {MAX_VALUES} highest Q-values, and that of the action taken",
+        notes=notes,
+        replays=True,
     )
-    return page, [*(note for run in runs for note in run.notes), *values_left_out(series)]
+    return page, [*notes, *values_left_out(series)]
 
 
-def _run(recording: Recording, number: int, chosen: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
-    evaluations = evaluation_records(recording)
-    environment = recording.environment
+def _run(recording: Recording, chosen: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
+    records = evaluation_records(recording)
     episodes = _episodes(recording, chosen)
-    replay = _replay(recording, episodes, progress)
+    player = _player(recording, episodes, progress)
     notes = shortcomings(recording)
     if not recording.has_actions:
         notes.append(
             f"No episode of run {recording.run_id} can be replayed, as there are no steps: "
             f"{why_no_steps(recording)}."
         )
-    drawing = None if environment["scene"] is None else svg.SvgDrawing(environment["scene"])
-    return ReportedRun(
-        number=number,
-        id=recording.run_id,
-        name=recording.name,
-        seed=recording.seed,
-        title=recording.title,
-        status=recording.status,
-        environment=environment["env_id"].rpartition(":")[2] if has_environment(recording.config) else "",
-        agents=[spoken(agent) for agent in environment["agents"]],
-        is_random=recording.has_tables and recording.config["algorithm"] == "random",
-        made_by="" if recording.can_train_again else recording.config["made_by"],
-        last=evaluations[-1] if evaluations else None,
-        recent=recording.train.recent_means(),
-        random_policy=random_policy_sentence(recording),
-        has_steps=any(phase.steps for phase in recording.phases),
-        evaluations=evaluations_section(recording, evaluations) if evaluations else None,
-        broad=drawing is not None and drawing.width > svg.BROAD,
-        origin=describe_recording(run_at(recording.path), recording, with_results=False).origin_sections(),
-        notes=notes,
-        maps=_maps(recording, next(iter(episodes), None)),
-        replay=replay,
-        has_tables=recording.has_tables,
+    recorded = (
+        "no episode ended" if any(phase.steps for phase in recording.phases) else "no steps were recorded"
     )
+    sections = [
+        Section("Replay", [] if player else [f"There is nothing to replay: {recorded}."], player=player)
+    ]
+    start = start_of(recording, next(iter(episodes), EpisodeRef(0))) if recording.tabular else 0
+    learned = learned_section(recording, start)
+    if recording.has_tables or learned.parts:
+        sections.append(learned)
+    if records:
+        sections.append(evaluations_section(recording, records))
+    elif recording.has_tables:
+        sections.append(Section("Evaluations", ["No evaluation was recorded."]))
+    parts = describe_recording(run_at(recording.path), recording, with_results=False).origin_sections()
+    sections.append(Section("Configuration and provenance", parts=parts, layout="tables"))
+    last = records[-1] if records else None
+    row = {
+        "run": recording.run_id,
+        "name": recording.name,
+        "seed": UNKNOWN if recording.seed is None else str(recording.seed),
+        "status": recording.status,
+    }
+    if last is not None:
+        row |= {heading: texts[0] for heading, texts in metric_columns([last], is_narrow=True).items()}
+    title, lead = f"{recording.title} ({recording.run_id})", " ".join(_lead(recording, last))
+    return ReportedRun(Section(title, [lead], parts=sections, is_article=True), row, notes)
+
+
+def _lead(recording: Recording, last: EvaluationRecord | None) -> Iterator[str]:
+    """Yield what a run is, and what it achieved at last, a sentence each."""
+    config, recent = recording.config, recording.train.recent_means()
+    environment = recording.environment["env_id"].rpartition(":")[2]
+    if not has_environment(config):
+        yield f"Logged values, recorded by {config['made_by']}."
+    elif not recording.can_train_again:
+        yield f"A loop over {environment}, recorded by {config['made_by']}."
+    else:
+        agents = [spoken(agent) for agent in recording.environment["agents"]]
+        verb, how = "learn", "by trial and error"
+        if recording.has_tables and config["algorithm"] == "random":
+            verb, how = "act", "at random: nothing is learned"
+        verb += "s" if len(agents) == 1 else ""
+        yield f"{capitalised(' and '.join(agents))} {verb} in {environment} {how}."
+    if last is not None:
+        took = f"took {number(last.value('mean_length'))} steps on average"
+        after = f"After {last.episode:,} training episodes"
+        returned = last.value("mean_return")
+        if last.value("success_percent") is not None:
+            yield f"{after} {last.successes} of {last.trials} test trials ended in success; a trial {took}."
+        elif returned is not None:
+            yield f"{after} a test trial {took} and returned {number(returned)}."
+        else:
+            yield f"{after} a test trial {took}."
+        if sentence := random_policy_sentence(recording):
+            yield sentence
+    elif not recording.can_train_again and recent.mean_return is not None:
+        yield (
+            f"The last {recent.episodes:,} training episodes returned {number(recent.mean_return)} on "
+            f"average and took {number(recent.mean_length)} steps."
+        )
 
 
 def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[EpisodeRef, list[str]]:
@@ -193,23 +206,7 @@ def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[Episod
     return episodes
 
 
-def _maps(recording: Recording, episode: EpisodeRef | None) -> list[MapRow]:
-    """Return the maps, for the situation in which an episode begins."""
-    if not recording.tabular:
-        return []
-    mdp = recording.mdp
-    start = int(mdp.start.argmax())
-    try:
-        if episode is not None:
-            start = first_state(recording, episode)
-        return maps_of(mdp, recording.agents, stages_of(recording), start)
-    except RecordingError:
-        return []
-
-
-def _replay(
-    recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Tell
-) -> ReportReplay | None:
+def _player(recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Tell) -> Player | None:
     """Return what the page replays; None if no episode can be."""
     shown = []
     for at, names in episodes.items():
@@ -220,26 +217,27 @@ def _replay(
                 raise
     if not shown:
         return None
-    picture, key, first, scene = "", "", shown[0][1], recording.environment["scene"]
+    picture, key, is_broad, first, scene = "", "", False, shown[0][1], recording.environment["scene"]
     if first.grid is not None and scene is not None:
         drawing = svg.SvgDrawing(scene)
         places = np.array(first.grid.places, np.int16)[first.grid.at[:1]].reshape(1, -1, 3)
         picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
-        key = drawing.key()
+        key, is_broad = drawing.key(), drawing.width > svg.BROAD
     data, has_frames = [], False
-    for number, (at, episode) in enumerate(shown, 1):
+    for i, (at, episode) in enumerate(shown, 1):
         own = Thumbnails()
         if episode.grid is None:
-            progress(f"pictures of episode {number} of {len(shown)}")
+            progress(f"pictures of episode {i} of {len(shown)}")
             own = thumbnails(recording.path, at.phase, at.number_in(recording), len(episode.reward) + 1)
             own.picture_note = own.picture_note or picture_note(recording, at.phase)[1]
         has_frames = has_frames or bool(own.pictures)
         data.append(asdict(episode) | asdict(own))
-    return ReportReplay([episode.title for _, episode in shown], picture, key, embedded(data), has_frames)
+    titles = [episode.title for _, episode in shown]
+    return Player(titles, picture, key, embedded(data), has_frames, is_broad)
 
 
-def _title(runs: Sequence[ReportedRun]) -> str:
-    if len(runs) == 1:
-        return f"{runs[0].name}, run {runs[0].id}"
-    names = list(dict.fromkeys(run.name for run in runs))
-    return f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: {len(runs)} runs"
+def _title(rows: Sequence[Mapping[str, str]]) -> str:
+    if len(rows) == 1:
+        return f"{rows[0]['name']}, run {rows[0]['run']}"
+    names = list(dict.fromkeys(row["name"] for row in rows))
+    return f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: {len(rows)} runs"

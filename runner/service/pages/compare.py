@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final
@@ -16,6 +17,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.analysis.groups import flat_config
 from runner.errors import RunnerError
 from runner.export.plots.comparisons import letter
+from runner.export.reports.rendering import partials
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics
@@ -159,26 +161,29 @@ async def tasks(
 @router.get("/divergence")
 async def divergence(runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the first step at which two runs differ, and the cause."""
-    difference = await compute.shown(ShownDifference, fragments.difference, *runs)
-    values = {"compared": _compared(runs, "/divergence"), "found": difference}
-    return Page("compare_divergence.html", values)
+    found = await compute.shown(ShownDifference, fragments.difference, *runs)
+    return _answer(runs, "/divergence", found.body, found.lead, found.notes)
 
 
 @router.get("/tables")
 async def tables(runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the difference of the Q-tables of two runs."""
-    body = (await compute.shown(ShownDifference, fragments.difference, *runs)).tables
-    values = {"compared": _compared(runs, "/tables"), "body": body}
-    return Page("compare_tables.html", values)
+    found = await compute.shown(ShownDifference, fragments.difference, *runs)
+    return _answer(runs, "/tables", found.tables)
 
 
 @router.get("/code")
 def code(runs: TwoRuns) -> Response:
     """Show how the code of two runs differs, and how else they were made."""
     with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-        lead, files, provenance = made_sections(a, b)
-    values = {"compared": _compared(runs, "/code"), "lead": lead, "code": files, "provenance": provenance}
-    return Page("compare_code.html", values)
+        lead, sections = made_sections(a, b)
+    return _answer(runs, "/code", str(partials().answer(sections)), lead)
+
+
+def _answer(runs: list[Run], here: str, body: str, lead: str = "", notes: Sequence[str] = ()) -> Response:
+    """Return a page of a comparison whose content is HTML."""
+    values = {"compared": _compared(runs, here), "lead": lead, "notes": notes, "body": body}
+    return Page("compare_answer.html", values)
 
 
 @router.get("/replay")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
 
 from runner.analysis.episodes import EpisodeRef
-from runner.debugging.explanation import Explanation, plots, sections
+from runner.analysis.sections import Link
+from runner.debugging.explanation import Explanation, drawn_sections
 from runner.errors import RunnerError
-from runner.export.reports.rendering import Link
 from runner.service.api.comparing import Part, found_explanation
 from runner.service.api.questions import queue_explanation
 from runner.service.dependencies import JobsOf, SettingsOf
@@ -44,9 +45,9 @@ async def explain(sent: Form, jobs: JobsOf) -> Response:
 def explanation(pair: Part, metric: Part, settings: SettingsOf) -> Response:
     """Show an explanation."""
     result = found_explanation(pair, metric, settings)
-    first, *others = sections(result)
-    values = {"title": first.title, "lead": first.sentences, "links": _links(result)}
-    return Page("explanation.html", {**values, "plots": plots(result), "results": others})
+    first, *others = drawn_sections(result)
+    shown = [replace(first, title="", links=_links(result)), *others]
+    return Page("explanation.html", {"title": first.title, "answer": shown})
 
 
 def _links(found: Explanation) -> list[Link]:

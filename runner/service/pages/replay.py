@@ -17,10 +17,10 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.marking import mark, unmark
+from runner.analysis.sections import Link
 from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.encoded import picture_note
-from runner.export.reports.rendering import Link
 from runner.recording.reader import Recording, open_recording
 from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run

@@ -31,11 +31,14 @@ router = APIRouter(prefix="/sweeps", include_in_schema=False)
 Name = Annotated[str, InPath(max_length=100)]
 Part = Literal["results", "importance", "pictures"]
 PARTS: Final = {
-    "results": sweep_fragments.sweep_results,
-    "importance": sweep_fragments.sweep_importance,
-    "pictures": sweep_fragments.sweep_pictures,
+    "results": (sweep_fragments.sweep_results, "Comparing the trials"),
+    "importance": (sweep_fragments.sweep_importance, "Computing the importance of parameters"),
+    "pictures": (sweep_fragments.sweep_pictures, "Drawing parameters and learning curves"),
 }
-"""Parts of the page of a sweep in the order in which they are computed, the fastest first."""
+"""Parts of the page of a sweep in the order in which they are computed, the fastest first.
+
+For each what computes it, and what the page says meanwhile.
+"""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,7 @@ async def sweep(
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
     cached = {part: cache.get(_key(state, part)) for part in PARTS}
     parts = {part: None if body is None else body.decode() for part, body in cached.items()}
+    waiting = {part: text for part, (_, text) in PARTS.items()}
 
     def show() -> dict[str, object]:
         own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
@@ -94,6 +98,7 @@ async def sweep(
             "runs_address": link("/runs", query),
             "job": own[-1].status() if own else None,
             "parts": parts,
+            "waiting": waiting,
         }
 
     return Page("sweep_page.html", show)
@@ -110,7 +115,7 @@ async def sweep_part(
 ) -> Response:
     """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
-    make = PARTS[part]
+    make, _ = PARTS[part]
     body = await cache.get_or_await(
         _key(state, part), lambda: processes(make, state.name, state.folder, state.digest), ALWAYS
     )

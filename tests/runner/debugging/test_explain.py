@@ -17,7 +17,7 @@ from runner.analysis.compare.statistics import Estimate
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.debugging.explain import EPISODES, RUNS
-from runner.debugging.explanation import Explanation, Mixture, Setting, Side, plots, sections, signed, summary
+from runner.debugging.explanation import Explanation, Mixture, Setting, Side, sections, signed, summary
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
@@ -311,7 +311,7 @@ def test_a_run_is_explained_by_its_configuration_and_seed(tmp_path):
     assert found.mixtures[0].values[0] == run.summary.last_evaluation.values["success_percent"]
     assert any("same seeds" in note for note in found.notes)
     assert "<svg" in found._repr_html_()
-    assert plots(found)[0].title == "Shares"
+    assert "Share of each setting" in found._repr_html_()
 
 
 def test_the_first_step_reports_its_progress_and_can_be_stopped(tmp_path):

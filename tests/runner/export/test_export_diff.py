@@ -38,14 +38,14 @@ def test_the_page_of_another_discount_shows_where_and_why_the_runs_part(world, p
     check_page(page)
     text = text_of(page)
     divergence = difference.divergence
-    assert f"In training episode {divergence.episode:,}, at t = {divergence.t}" in text
+    assert f"They diverge in training episode {divergence.episode:,}, at t = {divergence.t}" in text
     assert "Why that update differs: the discount was" in text
     assert text.count("(greedy in A") >= 1
     assert text.count("(greedy in B") + text.count("greedy in A and B") >= 1
     drawn = world != "corridor"
     assert ("Before, in both: " in page) == drawn
     assert ('aria-label="Largest difference of' in page) == drawn
-    assert 'aria-label="Q-values where training diverges"' in page
+    assert '<h2 id="training-0-title">Training</h2>' in page
     assert "Difference of the Q-tables over training episodes" in page
 
 

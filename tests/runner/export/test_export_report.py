@@ -31,7 +31,7 @@ def report(*words):
 
 def data_of(page, number=0):
     found = re.search(
-        rf'<script type="application/json" id="replay-data-{number}">(.*?)</script>', page, re.DOTALL
+        rf'<script type="application/json" id="replay-{number}-data">(.*?)</script>', page, re.DOTALL
     )
     return json.loads(found[1])
 
@@ -92,7 +92,7 @@ def test_several_runs_are_one_page_with_a_summary(pictured, tmp_path):
     result = report(*(run.recording for run in runs), "-o", path)
     assert result.exit_code == 0, result.output
     page = path.read_text()
-    assert "<caption>The last evaluation of each run.</caption>" in page
+    assert "<p>The last evaluation of each run.</p>" in page
     assert all(run.run_id in page for run in runs)
     outline = Outline()
     outline.feed(page)
@@ -113,7 +113,7 @@ def test_a_run_without_any_metric_is_shown_without_curves(pictured):
     run = pictured("lake", evaluation=None, log={"every_steps": 10**6})
     page, _ = render_report([run.recording])
     assert "No metrics were recorded" in page
-    assert 'id="replay-data-0"' in page
+    assert 'id="replay-0-data"' in page
 
 
 @pytest.mark.parametrize("share", [0.6, 0.8, 0.95])

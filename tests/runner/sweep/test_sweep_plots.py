@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 from sweeping import Here, described, digests, swept
 
+from runner.analysis.panels import panels_of
 from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.config import from_mapping
@@ -62,10 +63,10 @@ def test_a_pruned_trial_is_hollow(results):
 
 
 def test_the_learning_curves_are_those_of_the_runs(results, done):
-    groups, panels = learning(results, done[0])
+    groups = learning(results, done[0])
     best = next(group for group in groups if group.label.startswith("best"))
     assert {run.run_id for run in best.runs} == set(results.ranking[0].runs.values())
-    panel = panel_of("training.mean_reward", panels)
+    panel = panel_of("training.mean_reward", panels_of(groups))
     curve = next(curve for curve in panel.curves if groups[curve.group] is best)
     assert curve.middle[-1] == pytest.approx(results.ranking[0].median)
 
@@ -149,7 +150,7 @@ def test_a_sweep_of_archived_runs_is_complete(tmp_path, monkeypatch):
     assert {run.status for run in list_runs(folder)} == {"archived"}
     results = results_of(sweep, folder)
     assert results.best.value == ended.best.value
-    assert len(learning(results, folder)[0]) == 2
+    assert len(learning(results, folder)) == 2
     nobody = Here()
     again, _ = swept(folder, sweep, nobody)
     assert (nobody.done, digests(again)) == (0, digests(before))
