@@ -17,7 +17,7 @@ import numpy as np
 from runner.analysis.compare.statistics import NEVER
 from runner.analysis.groups import Group
 from runner.analysis.panels import Panel
-from runner.analysis.sections import Figure, LegendEntry, Section, Source
+from runner.analysis.sections import Figure, LegendEntry, Section, SourceFile
 from runner.analysis.series import series_of
 from runner.archive.places import at_hand
 from runner.drawing import palette
@@ -310,5 +310,5 @@ def best_section(results: Results) -> Section:
         "Save it as a file, and `dualtaxi run FILE` runs it; `dualtaxi sweep show NAME --write-best FILE` "
         "writes it."
     )
-    file = Source(f"{results.sweep.name}_best.yaml", "", results.best_yaml or "No trial is finished yet.")
+    file = SourceFile(f"{results.sweep.name}_best.yaml", "", results.best_yaml or "No trial is finished yet.")
     return Section("The best configuration", [how], sources=[file])
