@@ -182,6 +182,8 @@ async def _runner_error(request: Request, error: Exception) -> Response:
 async def _http_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
     status = HTTPStatus(error.status_code)
+    if status == HTTPStatus.NO_CONTENT:
+        return Response(status_code=status)
     messages = {
         HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}.",
         HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} is not supported at {request.url.path}.",

@@ -4,28 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 from typing import Annotated, Final
 
 from anyio.to_thread import run_sync
-from fastapi import APIRouter, Depends, Header, Path, Query, Request, Response
-from fastapi.responses import StreamingResponse
+from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import Field
 
 from runner.client.jobs import JobEvent, JobsPage, JobState, JobStatus
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused, expecting
 from runner.service.jobs.checking import DEFAULT_SOURCE
-from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import JobEstimate, QueuedJob
 from runner.service.problems import media_docs
 
 POLL_SECONDS: Final = 0.25
 """Time between two looks for new events."""
-KEEP_ALIVE_SECONDS: Final = 15.0
-"""Time after which a watcher receives a sign of life."""
 RETRY_MILLISECONDS: Final = 1000
 """Time after which a watcher that was cut off reconnects."""
 MAX_WATCHERS: Final = 200
@@ -164,46 +160,46 @@ def resume(
     return jobs.resume(number, accept_changes).status()
 
 
-@router.get(
-    "/jobs/{number}/events",
-    response_class=StreamingResponse,
-    responses={
-        200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}},
-        204: {"description": "The job is over, and all its events were sent."},
-    },
-    summary="Watch a job: its states, runs, log and progress, as server-sent events.",
-)
-async def watch(
-    request: Request,
+async def last_event(
     jobs: JobsOf,
     number: Number,
     last_event_id: Annotated[str, Header(description="The id of the last event received.")] = "",
     after: Annotated[int, Query(ge=0, lt=2**53, description="The same, for a first connection.")] = 0,
-) -> Response:
-    """Send a job's events until it is over: all of them, or those after `Last-Event-ID` or `after`.
+) -> int:
+    """Return the id of the last event that a watcher has.
 
-    `state`, `run` and `log` have ids; `progress` has none, because only the latest counts.
+    Raises:
+        HTTPException: 204, as the job is over and it has them all; this stops a browser from reconnecting.
+        Refused: too many watch.
     """
     last = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else after
     if jobs.store.job(number).is_over and last == jobs.store.log_size(number):
-        return Response(status_code=HTTPStatus.NO_CONTENT)  # which stops a browser from reconnecting
+        raise HTTPException(HTTPStatus.NO_CONTENT)
     if jobs.watchers >= MAX_WATCHERS:
         raise Refused(
             HTTPStatus.TOO_MANY_REQUESTS, f"the maximum of {MAX_WATCHERS} event streams is open; try again."
         )
-    stopping: asyncio.Event = request.app.state.stopping
-    headers = {"cache-control": "no-store", "x-accel-buffering": "no"}
-    return StreamingResponse(
-        _events(jobs, number, last, stopping), media_type="text/event-stream", headers=headers
-    )
+    return last
 
 
-async def _events(jobs: JobQueue, number: int, last: int, stopping: asyncio.Event) -> AsyncIterator[str]:
+@router.get(
+    "/jobs/{number}/events",
+    response_class=EventSourceResponse,
+    responses={204: {"description": "The job is over, and all its events were sent."}},
+    summary="Watch a job: its states, runs, log and progress, as server-sent events.",
+)
+async def watch(
+    request: Request, jobs: JobsOf, number: Number, last: Annotated[int, Depends(last_event)]
+) -> AsyncIterator[ServerSentEvent]:
+    """Send a job's events until it is over: all of them, or those after `Last-Event-ID` or `after`.
+
+    `state`, `run` and `log` have ids; `progress` has none, because only the latest counts.
+    """
     jobs.watchers += 1
     try:
-        yield f"retry: {RETRY_MILLISECONDS}\n\n"
-        progress, sent = None, time.monotonic()
-        while not stopping.is_set():
+        yield ServerSentEvent(retry=RETRY_MILLISECONDS)
+        progress = None
+        while not request.app.state.stopping.is_set():
             job, events = jobs.store.job(number), list[JobEvent]()
             if last != jobs.store.log_size(number):
                 events, last = await run_sync(jobs.store.events, number, last)
@@ -211,25 +207,15 @@ async def _events(jobs: JobQueue, number: int, last: int, stopping: asyncio.Even
             if progress is not None and progress is not before:
                 events.insert(0, JobEvent(progress))
             for event in events:
-                yield _as_text(event)
-            if events:
-                sent = time.monotonic()
-            elif job.is_over:
+                data = json.dumps(event.as_json(), ensure_ascii=False)
+                yield ServerSentEvent(raw_data=data, event=event.kind, id=event.id or None)
+            if job.is_over and not events:
                 return
-            elif time.monotonic() - sent >= KEEP_ALIVE_SECONDS:
-                yield ": still here\n\n"
-                sent = time.monotonic()
             await asyncio.sleep(0 if events else POLL_SECONDS)
     except JobNotFound:  # it was forgotten in the meantime
         return
     finally:
         jobs.watchers -= 1
-
-
-def _as_text(event: JobEvent) -> str:
-    """Return a server-sent event."""
-    head = f"id: {event.id}\n" if event.id else ""
-    return f"{head}event: {event.kind}\ndata: {json.dumps(event.as_json(), ensure_ascii=False)}\n\n"
 
 
 def created(job: QueuedJob, request: Request, response: Response) -> JobStatus:
