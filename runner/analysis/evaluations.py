@@ -22,8 +22,6 @@ from runner.util.values import Json, finite
 
 MAX_SPREAD: Final = 20
 """Evaluations that the summary of a run shows."""
-_DISPENSABLE: Final = ("pickup",)
-"""Events that follow from others."""
 
 
 @dataclass(frozen=True)
@@ -313,35 +311,29 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
     Successes are shown for each agent (`12/9`), other events summed over the agents. Of the events, a narrow
     terminal leaves out those first that follow from others.
     """
-    columns = metric_columns(records, is_narrow=True)
+    measures = metric_columns(records, is_narrow=True)
     if records[0].training is not None:  # the returns of a job would leave no room for its events
-        columns.pop("mean return", None)
+        measures.pop("mean return", None)
+    columns = {heading.replace(" ", "\n", 1): cells for heading, cells in measures.items()}
     kinds: dict[str, list[str]] = {}
     for name in records[0].events:
         kinds.setdefault(name.rpartition(".")[2], []).append(name)
-    spare: list[str] = []
+    fixed = len(columns)
     for kind, names in sorted(kinds.items(), key=lambda own: (own[1][0] not in success_events, len(own[1]))):
         counts = [[record.events[name] for name in names] for record in records]
         heading, cells = spoken(kind), [str(sum(own)) for own in counts]
         if names[0] in success_events and len(names) > 1:
             agents = [name.rpartition(".")[0].rpartition("_")[2] for name in names]
             heading, cells = f"{heading} {'/'.join(agents)}", ["/".join(map(str, own)) for own in counts]
-        columns[heading] = cells
-        spare.insert(0, heading)
-    spare.sort(key=lambda heading: heading not in _DISPENSABLE)
+        columns[heading.replace(" ", "\n", 1)] = cells
+    events = [*columns][fixed:]
+    spare = sorted(events, key=lambda heading: (heading != "pickup", -events.index(heading)))
     filled = [list(record.training.percent_filled.values()) for record in records if record.training]
     if filled:
         digits = 0 if len(filled[0]) > 1 else 1
-        columns["filled %"] = ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled]
-    broken = {heading: heading.replace(" ", "\n", 1) for heading in columns}
-    return Grid(
-        tuple(broken.values()),
-        list(zip(*columns.values(), strict=True)),
-        left=(),
-        cut=(),
-        spare=tuple(map(broken.__getitem__, spare)),
-        gap=1,
-    )
+        columns["filled\n%"] = ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled]
+    rows = list(zip(*columns.values(), strict=True))
+    return Grid(tuple(columns), rows, left=(), cut=(), spare=tuple(spare), gap=1)
 
 
 def evaluations_section(

@@ -28,13 +28,13 @@ from runner.recording.composition import Composition, composition_of
 from runner.recording.maker import Shard
 from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording
-from runner.recording.run_file import Summary, has_environment
+from runner.recording.run_file import RecentTraining, Summary, has_environment
 from runner.recording.spaces import Description
 from runner.replay.recorded import RecordedReset, resets_of
 from runner.runs.branches import Origin, origin_in
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run
-from runner.util.humanize import UNKNOWN, counted, duration, number, size
+from runner.util.humanize import UNKNOWN, counted, duration, measure, number, size
 from runner.util.processes import Tell
 from runner.util.values import Json, JsonView
 
@@ -168,9 +168,8 @@ class RunDetails:
     def sections(self) -> list[Section]:
         """Return what people see of the run: what it is, its results, its configuration and provenance."""
         run, first, *made = self.run, *self.origin_sections()
-        has_steps = has_environment(self.config)
         results = [
-            Section("Last results", facts={} if self.loop is None else _loop_results(self.loop, has_steps)),
+            Section("Last results", facts={} if self.loop is None else results_in_words(self.loop)),
             Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
             Section("Branches", facts={name: str(origin) for name, origin in self.branches.items()}),
             Section("Greedy policy, exactly", facts=self._optimality()),
@@ -222,10 +221,10 @@ class RunDetails:
         if self.environments > 1:
             environment += f", {self.environments:,} in parallel"
         time = ""
-        if clock is not None and clock.steps_a_second is not None:
+        if clock is not None and clock.duration > 0:
+            rate = clock.steps_a_second if self.train_steps or self.eval_steps else None
             time = f"{duration(clock.duration)} recorded"
-            if self.train_steps or self.eval_steps:
-                time += f", {clock.steps_a_second:,.0f} steps a second"
+            time += "" if rate is None else f", {rate:,.0f} steps a second"
         took = "" if summary.seconds is None else f", took {duration(summary.seconds)}"
         by = self.config.get("made_by")
         return {
@@ -402,16 +401,16 @@ def _processes(shards: Sequence[Shard]) -> str:
     return "; ".join(", ".join(part) for part in (names + more, ends) if part)
 
 
-def _loop_results(loop: Summary, with_environment: bool) -> dict[str, str]:
-    """Return the means of a loop's last training episodes and the values it logged last."""
-    results = {"training": "no episode ended"} if with_environment else {}
-    if (recent := loop.recent_training) and recent.episodes:
-        episodes = f"last {recent.episodes:,} episodes" if recent.episodes > 1 else "one episode"
-        means = f"mean return {number(recent.mean_return)}, mean length {number(recent.mean_length)}"
-        results["training"] = f"{means} ({episodes})"
-    for name, value in loop.logged.items():
-        results[f"logged {name}"] = "not finite" if value is None else f"{value:,.6g}"
-    return results
+def results_in_words(loop: Summary) -> dict[str, str]:
+    """Return the known means of a loop's last training episodes, and the values it logged last."""
+    recent = loop.recent_training or RecentTraining(episodes=0)
+    episodes = counted(recent.episodes or 0, "training episode").removeprefix("1 ")
+    means = {
+        f"Mean return of the last {episodes}": number(recent.mean_return),
+        f"Mean length of the last {episodes}": f"{number(recent.mean_length)} steps",
+    }
+    logged = {f"Logged last: {name}": measure(value) for name, value in loop.logged.items()}
+    return {name: text for name, text in means.items() if UNKNOWN not in text} | logged
 
 
 def _extras_in_words(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:

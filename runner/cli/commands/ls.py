@@ -267,15 +267,9 @@ def _informative(rows: Sequence[Row], folders: int) -> list[str]:
 
 def _grid(rows: Sequence[Row], columns: Sequence[str], spare: Sequence[str] = ()) -> Grid:
     """Return a table, in which ids are never cut."""
-    headings = {column: HEADINGS.get(column, column) for column in columns}
     texts = [column for column in columns if column not in FIELDS or FIELDS[column].kind in LEFT_KINDS]
-    left, cut, out = (
-        tuple(headings[column] for column in of if column in headings) for of in (texts, _CUT, spare)
+    headings, left, cut, spare = (
+        tuple(HEADINGS.get(column, column) for column in of) for of in (columns, texts, _CUT, spare)
     )
-    return Grid(
-        tuple(headings.values()),
-        [tuple(as_text(row, column) for column in columns) for row in rows],
-        left=left,
-        cut=cut,
-        spare=out,
-    )
+    cells = [tuple(as_text(row, column) for column in columns) for row in rows]
+    return Grid(headings, cells, left=left, cut=cut, spare=spare)

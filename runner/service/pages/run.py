@@ -19,6 +19,7 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.axes import EPISODES
 from runner.analysis.contents import damage_of
 from runner.analysis.episodes import TYPICAL
+from runner.analysis.summary import results_in_words
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.export.encoder import FORMATS
@@ -26,7 +27,7 @@ from runner.recording.composition import composition_of
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics, RecentTraining, has_environment
+from runner.recording.run_file import EvaluationMetrics, has_environment
 from runner.runs.catalogue.removal import clean, plan, remove
 from runner.runs.run import Run, label
 from runner.runs.shards import shards_in_words
@@ -52,8 +53,8 @@ from runner.util.values import Json
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
-MAX_LOGGED: Final = 8
-"""Logged values on the first page of a run."""
+MAX_RESULTS: Final = 10
+"""Means of training and logged values on the first page of a run."""
 
 
 @dataclass(frozen=True)
@@ -261,20 +262,10 @@ def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
     if run.can_train_again:
         return dict(result_of(metric, last) for metric in METRICS if not metric.per_agent)
     results = last_results(run)
-    recent = results.recent_training or RecentTraining(episodes=0)
-    count = "" if recent.episodes == 1 else f"{recent.episodes:,} "
-    episodes = f"the last {count}training episode{'s' if count else ''}"
     evaluation = results.last_evaluation or EvaluationMetrics()
-    measures = {
-        **dict(result_of(metric, evaluation) for metric in METRICS),
-        f"Mean return of {episodes}": humanize.number(recent.mean_return),
-        f"Mean length of {episodes}": f"{humanize.number(recent.mean_length)} steps",
-    }
-    logged = {
-        f"Logged last: {name}": humanize.measure(value)
-        for name, value in islice(results.logged.items(), MAX_LOGGED)
-    }
-    return {name: text for name, text in measures.items() if humanize.UNKNOWN not in text} | logged
+    measures = dict(result_of(metric, evaluation) for metric in METRICS)
+    known = {name: text for name, text in measures.items() if humanize.UNKNOWN not in text}
+    return known | dict(islice(results_in_words(results).items(), MAX_RESULTS))
 
 
 def _job_of(run: Run, jobs: JobQueue) -> tuple[int | None, Json]:

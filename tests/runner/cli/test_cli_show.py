@@ -180,6 +180,6 @@ def test_a_run_of_values_alone_is_shown_without_steps_and_episodes(command_in, t
     with SummaryWriter(recordings=tmp_path, monitor_gym=False) as writer:
         writer.add_scalar("loss", 0.5, 3)
     shown = command_in(tmp_path)("show", writer.run.run_id).stdout
-    assert "logged loss  0.5" in shown
+    assert "Logged last: loss  0.5" in shown
     assert "of training" not in shown
     assert "episode" not in shown

@@ -85,8 +85,9 @@ def test_ls_and_show_have_the_returns_of_a_loop_and_what_it_logged(folder, name)
     assert recent["mean_return"] == pytest.approx(episodes["returns"].sum(axis=1).mean())
     text = dualtaxi(folder, "show", name).stdout
     assert "Evaluations" in text
-    assert f"mean return {recent['mean_return']:,.1f}" in text
-    assert "logged loss" in text
+    returns = re.search(r"^Mean return of the last ([\d,]+) training episodes +(.*)$", text, re.MULTILINE)
+    assert returns.groups() == (f"{recent['episodes']:,}", f"{recent['mean_return']:,.1f}")
+    assert "Logged last: loss" in text
 
 
 @pytest.mark.parametrize("name", ["lake", "pole", "rooms"])
