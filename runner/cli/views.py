@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from contextlib import nullcontext
 from pathlib import Path
@@ -42,7 +43,9 @@ def command_of(view: View) -> Command:
         with compilation_notice(), line(view.stage) as report, opened as subject:
             answer = view.compute(subject, **values, **({"report": report} if view.counts_steps else {}))
         if output == _STDOUT:
-            answer.write(sys.stdout.buffer)
+            file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
+            answer.write(file)
+            sys.stdout.buffer.write(file.getvalue())
             return Reply(())
         data, text = answer.as_json(), [*answer.sections()]
         if answer.step_to_look_at is not None:

@@ -49,6 +49,13 @@ def test_a_pushed_run_has_its_checkpoints_and_so_has_a_pulled_one(server, tmp_pa
     pulled = runner.find_run(run.run_id, tmp_path / "other")
     assert [each.load() for each in pulled.checkpoints()] == [bytes([k // 2]) * 1000 for k in range(5)]
     assert list((tmp_path / "other").glob(".pulling/*")) == []
+    address = f"{server.url}/runs/{run.run_id}/checkpoints"
+    page = httpx2.get(address).text
+    assert (page.count("policy@"), page.count(">here<")) == (6, 5)
+    assert str(server.recordings) not in page
+    for each in runner.find_run(run.run_id, server.recordings).checkpoints():
+        each.path.unlink(missing_ok=True)
+    assert httpx2.get(address).text.count(">missing<") == 5
 
 
 def test_a_run_that_was_removed_is_pushed_again_with_its_checkpoints(server, tmp_path):
