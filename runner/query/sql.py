@@ -11,7 +11,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -105,7 +105,10 @@ class Database:
     def close(self) -> None:
         """End the query."""
         self._runs.is_stopped = True
-        self.connection.interrupt()
+        last = self._thread.submit(bool)  # comes after what the thread does now
+        while not last.done():  # DuckDB forgets an interrupt that comes between two calls
+            self.connection.interrupt()
+            wait([last], timeout=0.1)
         self._thread.shutdown()
         self.connection.close()
 
