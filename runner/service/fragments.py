@@ -141,7 +141,8 @@ def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
 
 def answer_of_run(run: Run, question: Callable[..., Answer], values: Given) -> bytes:
     """Return the answer to a question about a run and the files stored with it as HTML."""
-    return str(partials().answer(question(run, **dict(values)).sections(), run.run_id)).encode()
+    sections = question(run, **dict(values)).sections()
+    return str(partials().answer(sections, f"/runs/{run.run_id}/")).encode()
 
 
 def _branch_part(recording: Recording, at: StepLike, action: str, start: int, steps: int) -> Json:
