@@ -246,23 +246,18 @@ def grid_table(grid: Grid, width: int) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    shown = dict(enumerate(grid.headings))
-    least = {
-        number: max(
-            cell_len(line)
-            for cell in (heading, *(row[number] for row in grid.rows))
-            for line in printable(cell).split("\n")
+    cut = grid.headings if grid.cut is None else grid.cut
+    least, left_out = [], []
+    for heading, *cells in zip(grid.headings, *grid.rows, strict=True):
+        longest = max(cell_len(line) for cell in (heading, *cells) for line in printable(cell).split("\n"))
+        least.append(
+            min(longest, _LEAST["wrapped" if grid.cut is None else "cut"]) if heading in cut else longest
         )
-        for number, heading in shown.items()
-    }
-    for number, heading in shown.items():
-        if grid.cut is None or heading in grid.cut:
-            least[number] = min(least[number], _LEAST["wrapped" if grid.cut is None else "cut"])
-    left_out = []
+    shown = [*range(len(least))]
     for heading in filter(grid.headings.__contains__, grid.spare):
-        if sum(map(least.__getitem__, shown)) + grid.gap * (len(shown) - 1) > width:
+        if sum(least[number] + grid.gap for number in shown) - grid.gap > width:
             left_out.append(heading)
-            del shown[grid.headings.index(heading)]
+            shown.remove(grid.headings.index(heading))
     drawn = Table(
         box=None,
         padding=(0, grid.gap, 0, 0),
@@ -270,20 +265,21 @@ def grid_table(grid: Grid, width: int) -> Table:
         header_style="bold",
         caption=f"No room for: {', '.join(left_out)}.".replace("\n", " ") if left_out else None,
         caption_justify="left",
-        min_width=sum(map(least.__getitem__, shown)) + grid.gap * (len(shown) - 1),
+        min_width=sum(least[number] + grid.gap for number in shown) - grid.gap,
     )
-    numeric, cut = grid.numeric, grid.cut or ()
-    for number, heading in shown.items():
+    numeric = grid.numeric
+    for number in shown:
+        heading = grid.headings[number]
         side: Literal["left", "right"] = "right" if numeric[number] else "left"
         header = Align(heading, side, vertical="bottom")
-        is_whole = grid.cut is not None and heading not in cut
-        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=is_whole)
+        drawn.add_column(header, justify=side, overflow="ellipsis", no_wrap=heading not in cut)
     for row in grid.rows:
-        cells = {number: printable(row[number]) for number in shown}
         drawn.add_row(
             *(
-                Text(on_one_line(cell), no_wrap=True) if grid.headings[number] in cut else cell
-                for number, cell in cells.items()
+                Text(on_one_line(row[number]), no_wrap=True)
+                if grid.cut and grid.headings[number] in cut
+                else printable(row[number])
+                for number in shown
             )
         )
     return drawn
