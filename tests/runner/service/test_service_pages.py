@@ -371,6 +371,16 @@ def test_the_page_of_a_run_is_live_once_a_job_will_resume_it(client, recordings,
     assert client.get("/runs/first/status?status=interrupted").status_code == 204
 
 
+def test_the_pages_of_a_finished_run_say_that_its_recording_is_cut_off(client, recordings):
+    run = find_run("first", recordings)
+    assert "cut off" not in page_of(client, "/runs/first") + page_of(client, "/runs/first/config")
+    content = run.recording.read_bytes()
+    run.recording.write_bytes(content[: len(content) * 9 // 10])
+    assert "recording.mcap: is cut off, though its run is finished" in page_of(client, "/runs/first")
+    assert "is cut off, though its run is finished" in page_of(client, "/runs/first/config")
+    assert "is cut off" in client.get("/api/v1/runs/first").json()["damage"]
+
+
 def test_the_error_of_a_run_hides_its_folder(client, recordings):
     run = find_run("first", recordings)
     error = f"{run.recording.absolute()}: cannot be written"
