@@ -60,8 +60,9 @@ class RunCode:
             sections.append(Section("Changes since the commit", left_out, diffs=[lines[:_MAX_LINES]]))
         script = self.facts.get("code.script")
         names = sorted(self.code.files, key=lambda path: path != script)
+        new = self.code.new if "git" in self.facts else ()
         sources = [
-            SourceFile(path, "not in the commit" if path in self.code.new else "", self.code.files[path])
+            SourceFile(path, "not in the commit" if path in new else "", self.code.files[path])
             for path in names[:_MAX_FILES]
         ]
         if sources:
