@@ -14,12 +14,13 @@ from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     force_option,
 )
-from runner.cli.output import Remark, Reply, files_written
+from runner.cli.output import Reply, written
 from runner.cli.parameter_types import FILE, INDEX, ExpressionText
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import command_for, compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
 from runner.runs.run import Run
+from runner.util.humanize import size
 from runner.views.view import Input, View
 
 _STDOUT: Final = Path("-")
@@ -36,27 +37,29 @@ def command_of(view: View) -> Command:
     ) -> Reply:
         if output not in (None, _STDOUT):
             require_new(output, force)
-        from runner.recording.reader import open_recording
+        from runner.analysis.contents import damage_of
+        from runner.recording.reader import Recording, open_recording
 
         line = steps_line if view.counts_steps else stage_line
         opened = nullcontext(run) if view.takes_run else open_recording(run.recording)
+        notes: list[str] = []
         with compilation_notice(), line(view.stage) as report, opened as subject:
             answer = view.compute(subject, **values, **({"report": report} if view.counts_steps else {}))
+            if isinstance(subject, Recording) and (damage := damage_of(run, subject)):
+                notes.append(damage)
         if output == _STDOUT:
             file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
             answer.write(file)
             sys.stdout.buffer.write(file.getvalue())
             return Reply(())
+        if output is not None:
+            with new_file(output, force) as temporary, temporary.open("wb") as stream:
+                answer.write(stream)
+            return written(f"{output}  {size(output.stat().st_size)}", output)
         data, text = answer.as_json(), [*answer.sections()]
         if answer.step_to_look_at is not None:
             text.append({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))})
-        if output is None:
-            return Reply(data, text)
-        with new_file(output, force) as temporary, temporary.open("wb") as stream:
-            answer.write(stream)
-        return Reply(
-            data | {"files": files_written(output)}, [*text, Remark(f"Written: {output.absolute()}")]
-        )
+        return Reply(data, text, notes=notes)
 
     declared = {
         "run": recorded_run,

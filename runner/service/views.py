@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field, create_model
 
+from runner.analysis.contents import damage_of
 from runner.errors import RecordingError, RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
@@ -146,15 +147,16 @@ def _type_of(view: View) -> type[BaseModel]:
 
 
 def _form_values(run: Run, view: View) -> dict[str, object]:
-    """Return the texts to choose from in the form of a view, or why it has none."""
+    """Return the texts to choose from in the form of a view, or why it has none, and damage of the run."""
     with open_recording(run.recording) as recording:
         refusal = view.refusal(recording) if view.refusal is not None and run.can_train_again else ""
+        damage = damage_of(run, recording).partition(": ")[2]
         choices = {
             given.name: given.values if given.choices is None else given.choices(recording)
             for given in view.inputs.values()
             if given.values or given.choices is not None
         }
-    return {"choices": choices, "refusal": refusal}
+    return {"choices": choices, "refusal": refusal, "damage": damage}
 
 
 for _view in (*VIEWS.values(), *map(view_named, installed_names())):

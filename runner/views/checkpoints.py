@@ -22,6 +22,7 @@ _HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest"
 class CheckpointRows:
     """The checkpoints of a run, in order."""
 
+    run_id: str
     checkpoints: Sequence[Checkpoint]
     step_to_look_at = None
 
@@ -46,9 +47,8 @@ class CheckpointRows:
             )
             for checkpoint in self.checkpoints
         ]
-        sentence = (
-            f"{counted(len(rows), 'checkpoint')}. `dualtaxi checkpoint get RUN {rows[-1][0]}` writes one."
-        )
+        command = f"dualtaxi checkpoint get {self.run_id} {rows[-1][0]}"
+        sentence = f"{counted(len(rows), 'checkpoint')}. `{command}` writes the last."
         return [Section("Checkpoints", [sentence], [Grid(_HEADINGS, rows)])]
 
 
@@ -59,7 +59,7 @@ def checkpoints(run: Run) -> CheckpointRows:
       dualtaxi checkpoints @latest
       dualtaxi checkpoints cartpole --json
     """
-    return CheckpointRows(run.checkpoints())
+    return CheckpointRows(run.run_id, run.checkpoints())
 
 
 VIEW: Final = View(

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal, Protocol
 
+from runner.errors import ConfigError
+
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
     from runner.analysis.sections import Section
@@ -83,7 +85,13 @@ STOP: Final = Input(
 
 
 def rows_in(start: int, stop: int | None) -> range:
-    """Return the numbers of the rows from `START` to `STOP`."""
+    """Return the numbers of the rows from `START` to `STOP`.
+
+    Raises:
+        ConfigError: there cannot be any.
+    """
+    if stop is not None and stop < start:
+        raise ConfigError(f"stop: found {stop:,}, expected a number from {start:,}, the start.")
     return range(start, start + _DEFAULT_ROWS if stop is None else stop)
 
 
