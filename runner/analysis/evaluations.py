@@ -21,7 +21,7 @@ from runner.util.arrays import Ints, Records
 from runner.util.values import Json, finite
 
 MAX_SPREAD: Final = 20
-"""Evaluations that the summary of a run shows."""
+"""Evaluations printed after a training."""
 
 
 @dataclass(frozen=True)

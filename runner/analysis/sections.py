@@ -15,7 +15,7 @@ _NUMBERS: Final = re.compile(
 """What cells of numbers consist of, such as `1,500`, `12 %`, `[0.5, 1]` and `2 to 3`."""
 
 
-NOT_DRAWN: Final = "The charts are on the page of the run: `dualtaxi serve`."
+NOT_DRAWN: Final = "`dualtaxi serve` draws the charts."
 
 
 class Figure(NamedTuple):
@@ -45,7 +45,7 @@ class Link(NamedTuple):
 
     text: str
     address: str
-    """Relative to the page of the run, so that only that page has it, or else to the server or the page."""
+    """Absolute (`/...`), within the page (`#...`), or relative to a page of the run: others leave it out."""
 
 
 class Player(NamedTuple):
@@ -89,6 +89,11 @@ class Paging:
     def next(self) -> str:
         """Address of the next page; empty on the last one."""
         return self._address(self.page + 1) if self.page < self.pages else ""
+
+    @property
+    def last(self) -> str:
+        """Address of the last page; empty on it."""
+        return self._address(self.pages) if self.page < self.pages else ""
 
     def _address(self, page: int) -> str:
         if page == 1:
@@ -190,7 +195,7 @@ class Section:
 
     @property
     def said(self) -> list[str]:
-        """Its sentences in a form without figures."""
+        """The sentences of the text form."""
         return [*self.sentences, *([NOT_DRAWN] if self.figures and not self.layout else [])]
 
 

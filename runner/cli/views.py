@@ -50,6 +50,8 @@ def command_of(view: View) -> Command:
         if output == _STDOUT:
             file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
             answer.write(file)
+            if sys.stdout.isatty():
+                return Reply((), [file.getvalue().decode(errors="replace")])
             sys.stdout.buffer.write(file.getvalue())
             return Reply(())
         if output is not None:

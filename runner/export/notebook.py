@@ -198,4 +198,4 @@ def facts_html(run: Run) -> str:
     from runner.analysis.sections import html
     from runner.analysis.summary import describe_run
 
-    return html(describe_run(run).sections())
+    return html(describe_run(run, with_results=False).sections())

@@ -35,6 +35,7 @@ from runner.errors import (
     StorageError,
     full_message,
     nearest,
+    shortened,
 )
 from runner.service.errors import EXPECTED, RequestError
 from runner.service.logs import LOG
@@ -56,6 +57,8 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
 }
 
 
+_MAX_UNKNOWN: Final = 10
+"""Unknown parameters that an error names."""
 _EXPECTED: Final = {
     **dict.fromkeys(("int_parsing", "int_parsing_size", "int_type", "int_from_float"), "a whole number"),
     **dict.fromkeys(("float_parsing", "float_type", "finite_number"), "a number"),
@@ -229,10 +232,9 @@ async def known_query(request: Request) -> None:
     fields = get_flat_params(request.scope["route"].dependant) if request.query_params else []
     known = [field.alias for field in fields if not isinstance(field.field_info, InPath | Header)]
     hint = f" Known: {', '.join(known) or 'none'}"
-    if unknown := [name for name in request.query_params if name not in known]:
-        raise _wrong(
-            (f"query.{name}", f"unknown parameter.{nearest(name, known) or hint}") for name in unknown
-        )
+    if unknown := [name for name in request.query_params if name not in known][:_MAX_UNKNOWN]:
+        names = [shortened(name, 60) for name in unknown]
+        raise _wrong((f"query.{name}", f"unknown parameter.{nearest(name, known) or hint}") for name in names)
 
 
 def _in_words(detail: ErrorDetails) -> str:

@@ -68,7 +68,6 @@ VIEW: Final = View(
     checkpoints,
     counts_steps=False,
     has_default=True,
-    is_live=True,
     needs="checkpoints",
     takes_run=True,
 )

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO, Final
 
 from runner.analysis.sections import Section, SourceFile
+from runner.errors import RecordingError
 from runner.util.humanize import counted
 from runner.views.view import View
 
@@ -29,6 +30,8 @@ _NAMES: Final = {
     "code.left_out": "Left out",
 }
 _PACKAGE: Final = "package."
+_ABOUT_CODE: Final = ("git", "code.")
+_NOTHING: Final = "The code of this run was not recorded."
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class RunCode:
     packages: Mapping[str, str]
     """Version of each installed package."""
     code: Code
+    problem: str
+    """Why the files cannot be read; empty if they can."""
     step_to_look_at = None
 
     def as_json(self) -> Json:
@@ -49,8 +54,7 @@ class RunCode:
     def sections(self) -> list[Section]:
         """Return facts, packages, the changes since the commit, and the files."""
         facts = {_NAMES.get(key, key): text for key, text in self.facts.items()}
-        nothing = ["The code of this run was not recorded."]
-        sections = [Section("Commit and command", [] if facts else nothing, facts=facts)]
+        sections = [Section("Commit and command", facts=facts)] if facts else []
         if self.packages:
             sentence = f"{counted(len(self.packages), 'package')}."
             sections.append(Section("Installed packages", [sentence], facts=self.packages, is_folded=True))
@@ -69,11 +73,19 @@ class RunCode:
             more = f"{len(names) - _MAX_FILES:,} more files: `dualtaxi code RUN --json` has all."
             left_out = [more] * (len(names) > _MAX_FILES)
             sections.append(Section("Files", left_out, sources=sources))
+        elif self.problem or not any(key.startswith(_ABOUT_CODE) for key in self.facts):
+            sections.append(Section("Files", [self.problem or _NOTHING]))
         return sections
 
     def write(self, stream: BinaryIO) -> None:
-        """Write the facts as comments, which `git apply` ignores, and a patch."""
-        for key, text in self.facts.items():
+        """Write the facts as comments, which `git apply` ignores, and a patch.
+
+        Raises:
+            RecordingError: the files cannot be read.
+        """
+        if self.problem:
+            raise RecordingError(self.problem)
+        for key, text in (self.facts or {"code.not_recorded": _NOTHING}).items():
             stream.write(f"# {key}: {' '.join(text.split())}\n".encode(errors="replace"))
         stream.write(self.code.to_patch().encode(errors="replace"))
 
@@ -91,12 +103,18 @@ def code(recording: Recording) -> RunCode:
       dualtaxi code k3v9m2xq -o - | git apply
       dualtaxi code k3v9m2xq --json
     """
-    provenance = recording.provenance
-    is_code = ("git", "code.")
+    from runner.recording.code import Code
+
+    provenance, recorded, problem = recording.provenance, Code(), ""
+    try:
+        recorded = recording.code
+    except RecordingError as error:
+        problem = str(error).removeprefix(f"{recording.path}: ")
     return RunCode(
-        {key: text for key, text in provenance.items() if key.startswith(is_code) or key == "command"},
+        {key: text for key, text in provenance.items() if key.startswith(_ABOUT_CODE) or key == "command"},
         {key.removeprefix(_PACKAGE): text for key, text in provenance.items() if key.startswith(_PACKAGE)},
-        recording.code,
+        recorded,
+        problem,
     )
 
 

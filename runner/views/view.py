@@ -105,8 +105,8 @@ class View:
     compute: Callable[..., Any]
     """Takes the recording, the inputs and `report`, called with the steps done; returns an `Answer`."""
     takes_run: bool = False
-    """Whether the function takes the run instead of its recording, for files that are stored with the
-    recordings: no answer is cached, and no route follows from the view, as answers hold paths."""
+    """Whether the function takes the run instead of its recording, to read files stored next to it. Its
+    answers are not cached, and have no API route, as they hold paths."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""

@@ -28,6 +28,7 @@ from runner.service.dependencies import (
     InTurn,
     ProcessesOf,
     RecordedRun,
+    SettingsOf,
     recording_state,
 )
 from runner.service.errors import Refused
@@ -153,9 +154,10 @@ async def replay(
 
 
 @router.get("/report.html", response_class=Response, responses=FILE, summary="The report of the run.")
-async def report(run: RecordedRun, compute: ComputationOf) -> Response:
+async def report(run: RecordedRun, compute: ComputationOf, settings: SettingsOf) -> Response:
     """Return what `dualtaxi report` writes, as a download."""
-    return attachment(await compute(computed.report, run.recording), f"{run.file_stem}.html")
+    page = (await compute(computed.report, run.recording)).decode()
+    return attachment(settings.without_folders(page).encode(), f"{run.file_stem}.html")
 
 
 @router.post("/film", response_class=Response, responses=FILE, summary="A film of an episode of the run.")

@@ -82,7 +82,7 @@ class CheckedJob(JobEstimate):
 
 @dataclass(frozen=True, kw_only=True)
 class QueuedJob(JobFacts):
-    """A job as the server stores it, but for its progress."""
+    """A stored job; its progress is kept in memory only."""
 
     kind: Kind
     deaths: int = 0

@@ -112,7 +112,12 @@ class WorkerPool:
         self._store.update(job.number, state="running", started=job.started or now(), progress=None)
         thread = threading.Thread(target=self._follow, args=(job, process, ours), daemon=True)
         self._busy[job.number] = job, thread
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError as error:  # no thread is left
+            self._start_problem, self._retry_at = str(error), time.monotonic() + RETRY_SECONDS
+            ours.close()  # its worker stops
+            self._end(job, process, None)
 
     def _next_job(self) -> QueuedJob | None:
         """Return the job that is started next: jobs start in the order of their numbers."""
@@ -156,6 +161,7 @@ class WorkerPool:
         except Exception:  # an event that cannot be read; after it the pipe is useless
             LOG.exception("jobs")
             process.kill()
+        pipe.close()
         with _logged():
             self._end(job, process, outcome)
 

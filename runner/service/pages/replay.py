@@ -49,7 +49,7 @@ router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
 MAX_BRANCHES: Final = 20
 """Branches of a run that a page lists, the newest."""
 BEFORE: Final = 250
-"""Steps before the requested one in the part that a page shows first, as in `parts.js`."""
+"""Steps before the requested one in the part that a page shows first, as in `player.js`."""
 
 T = Annotated[int, Query(ge=0, lt=2**62)]
 
