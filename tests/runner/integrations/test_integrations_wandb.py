@@ -338,7 +338,7 @@ def test_a_run_without_an_environment_is_shown_without_one(tmp_path, monkeypatch
     with SummaryWriter(str(tmp_path / "runs" / "x")) as writer:
         writer.add_scalar("loss", 1.0, 1)
     shown, verified = (CliRunner().invoke(cli, [command, "@latest"]).output for command in ("show", "verify"))
-    assert "logged loss" in shown
+    assert "Logged last: loss" in shown
     assert "id: none" not in shown
     assert "steps a second" not in shown
     assert "digest" in verified

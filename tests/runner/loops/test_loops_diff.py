@@ -116,7 +116,7 @@ def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
     assert (diverged["divergence"], diverged["evaluation_divergence"]["step"]) == (None, 0)
     page = tmp_path / "diff.html"
     dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
-    assert "In the reset before evaluation step 0 of A, in the evaluation after" in page.read_text()
+    assert "in the reset before evaluation step 0 of A, in the evaluation after" in page.read_text()
 
 
 def test_diff_names_the_topics_that_differ_between_loops_of_equal_steps(tmp_path):
@@ -227,7 +227,7 @@ def test_loops_recorded_by_their_actions_diverge_where_these_do(tmp_path):
     assert f"B holds the actions of its steps alone, which are compared; `dualtaxi rerecord {other}`" in text
     assert "all steps are the same" not in text
     dualtaxi(tmp_path, "diff", "a", "b", "--html", str(tmp_path / "diff.html"))
-    assert "Action is 0 in A, 1 in B" in (tmp_path / "diff.html").read_text()
+    assert "action is 0 in A, 1 in B" in (tmp_path / "diff.html").read_text()
     reply = dualtaxi(tmp_path, "diff", "whole", "b").stdout
     assert "action is 0 in A, 1 in B." in reply
     assert "A holds" not in reply
