@@ -14,7 +14,7 @@ from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     force_option,
 )
-from runner.cli.output import Reply, written
+from runner.cli.output import Reply, files_written
 from runner.cli.parameter_types import FILE, INDEX, ExpressionText
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import command_for, compilation_notice, recorded_run
@@ -54,13 +54,14 @@ def command_of(view: View) -> Command:
                 return Reply((), [file.getvalue().decode(errors="replace")])
             sys.stdout.buffer.write(file.getvalue())
             return Reply(())
-        if output is not None:
-            with new_file(output, force) as temporary, temporary.open("wb") as stream:
-                answer.write(stream)
-            return written(f"{output}  {size(output.stat().st_size)}", output)
         data, text = answer.as_json(), [*answer.sections()]
         if answer.step_to_look_at is not None:
             text.append({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))})
+        if output is not None:
+            with new_file(output, force) as temporary, temporary.open("wb") as stream:
+                answer.write(stream)
+            data |= {"files": files_written(output)}
+            notes.append(f"{output}  {size(output.stat().st_size)}")
         return Reply(data, text, notes=notes)
 
     declared = {
