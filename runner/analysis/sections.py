@@ -22,6 +22,7 @@ class Figure(NamedTuple):
     """A picture in a page."""
 
     svg: str
+    """The picture: SVG, or an element `img`."""
     caption: str = ""
     """A text below it."""
     title: str = ""

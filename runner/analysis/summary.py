@@ -33,7 +33,7 @@ from runner.recording.spaces import Description
 from runner.replay.recorded import RecordedReset, resets_of
 from runner.runs.branches import Origin, origin_in
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
-from runner.runs.run import Run
+from runner.runs.run import Run, command_for
 from runner.util.humanize import UNKNOWN, counted, duration, measure, number, size
 from runner.util.processes import Tell
 from runner.util.values import Json, JsonView
@@ -167,7 +167,8 @@ class RunDetails:
 
     def sections(self) -> list[Section]:
         """Return what people see of the run: what it is, its results, its configuration and provenance."""
-        run, first, *made = self.run, *self.origin_sections()
+        run = self.run
+        first, *made = self.origin_sections()
         results = [
             Section("Last results", facts={} if self.loop is None else results_in_words(self.loop)),
             Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
@@ -180,10 +181,8 @@ class RunDetails:
             results.insert(0, Section("Evaluations", grids=[grid]))
         if self.checkpoints:
             last = self.checkpoints[-1].reference
-            text = (
-                f"{len(self.checkpoints):,}, the last {last}; `dualtaxi checkpoints {run.run_id}` lists them."
-            )
-            results.append(Section("Checkpoints", [text]))
+            listing = f"`{command_for(run, 'checkpoints')}` lists them."
+            results.append(Section("Checkpoints", [f"{len(self.checkpoints):,}, the last {last}; {listing}"]))
         if run.marks:
             rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
             results.append(Section("Marks", grids=[Grid(("step", "text", "tags"), rows)]))
@@ -208,13 +207,10 @@ class RunDetails:
         return sections if self.provenance else sections[:2]
 
     def _identity(self) -> dict[str, str]:
-        run, summary, origin = self.run, self.run.summary, origin_in(self.config)
-        clock, steps, environment, folder = (
-            self.clock,
-            "",
-            str(self.environment or ""),
-            f"{run.folder}{os.sep}",
-        )
+        run, summary, clock = self.run, self.run.summary, self.clock
+        origin, environment = origin_in(self.config), str(self.environment or "")
+        folder = f"{run.folder}{os.sep}"
+        steps = ""
         if environment and None not in (self.train_steps, self.episodes, self.eval_steps):
             steps = f"{self.train_steps:,} of training in {counted(self.episodes or 0, 'episode')}, "
             steps += f"{self.eval_steps:,} of evaluation"

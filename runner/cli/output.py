@@ -247,17 +247,21 @@ def grid_table(grid: Grid, width: int) -> Table:
     from rich.text import Text
 
     cut = grid.headings if grid.cut is None else grid.cut
-    least, left_out = [], []
+    least: list[int] = []
+    left_out: list[str] = []
     for heading, *cells in zip(grid.headings, *grid.rows, strict=True):
         longest = max(cell_len(line) for cell in (heading, *cells) for line in printable(cell).split("\n"))
         least.append(
             min(longest, _LEAST["wrapped" if grid.cut is None else "cut"]) if heading in cut else longest
         )
     shown = [*range(len(least))]
+    needed = sum(least) + grid.gap * (len(least) - 1)
     for heading in filter(grid.headings.__contains__, grid.spare):
-        if sum(least[number] + grid.gap for number in shown) - grid.gap > width:
+        if needed > width:
+            number = grid.headings.index(heading)
+            needed -= least[number] + grid.gap
+            shown.remove(number)
             left_out.append(heading)
-            shown.remove(grid.headings.index(heading))
     drawn = Table(
         box=None,
         padding=(0, grid.gap, 0, 0),
@@ -265,7 +269,7 @@ def grid_table(grid: Grid, width: int) -> Table:
         header_style="bold",
         caption=f"No room for: {', '.join(left_out)}.".replace("\n", " ") if left_out else None,
         caption_justify="left",
-        min_width=sum(least[number] + grid.gap for number in shown) - grid.gap,
+        min_width=needed,
     )
     numeric = grid.numeric
     for number in shown:

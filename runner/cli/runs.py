@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import shlex
 import signal
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -18,7 +16,7 @@ from runner.cli.progress import progress_line, steps_line
 from runner.errors import ExitCode, RecordingError, RunnerError, RunNotFound
 from runner.recording.run_file import has_environment
 from runner.runs.resolve import find_run, find_runs
-from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, recordings_folder
+from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, command_for, recordings_folder
 from runner.runs.shards import are_over, shards_in_words
 from runner.util.compilation import MESSAGE, announced
 from runner.util.humanize import UNKNOWN, duration, size
@@ -127,14 +125,6 @@ def require_over(run: Run | None) -> None:
     """
     if run is not None and run.status == "running":
         raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
-
-
-def command_for(run: Run, verb: str, *options: str) -> str:
-    """Return the command line of a verb for a run, with --recordings if its folder is not the default."""
-    words, root = ["dualtaxi", verb, run.run_id, *options], run.folder.parent
-    if root.absolute() != recordings_folder().absolute():
-        words += ["--recordings", shlex.quote(os.fspath(root))]
-    return " ".join(words)
 
 
 @contextlib.contextmanager

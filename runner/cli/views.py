@@ -17,9 +17,9 @@ from runner.cli.options import (
 from runner.cli.output import Reply, files_written
 from runner.cli.parameter_types import FILE, INDEX, ExpressionText
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import command_for, compilation_notice, recorded_run
+from runner.cli.runs import compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
-from runner.runs.run import Run
+from runner.runs.run import Run, command_for
 from runner.util.humanize import size
 from runner.views.view import Input, View
 

@@ -16,6 +16,7 @@ import contextlib
 import os
 import re
 import secrets
+import shlex
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -425,3 +426,11 @@ def label(
         )
 
     return change_labels(run.folder, change)
+
+
+def command_for(run: Run, verb: str, *options: str) -> str:
+    """Return the command line of a verb for a run, with --recordings if its folder is not the default."""
+    words, root = ["dualtaxi", verb, run.run_id, *options], run.folder.parent
+    if root.absolute() != recordings_folder().absolute():
+        words += ["--recordings", shlex.quote(os.fspath(root))]
+    return " ".join(words)

@@ -18,8 +18,8 @@ from runner.cli.options import recordings_option, set_option, trust_option
 from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import COUNT, INDEX, STEP
 from runner.cli.progress import steps_line
-from runner.cli.runs import command_for, compilation_notice, recorded_run, run_facts, run_reply
-from runner.runs.run import Run
+from runner.cli.runs import compilation_notice, recorded_run, run_facts, run_reply
+from runner.runs.run import Run, command_for
 from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:

@@ -21,7 +21,6 @@ from runner.cli.output import Reply, say
 from runner.cli.parameter_types import COUNT, INDEX
 from runner.cli.progress import count_line
 from runner.cli.runs import (
-    command_for,
     found_run,
     job_progress,
     recorded_run,
@@ -31,7 +30,7 @@ from runner.cli.runs import (
     run_reply,
 )
 from runner.errors import ExitCode, RecordingError
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import Run, command_for, recordings_folder
 from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from runner.cli.options import config_argument, recordings_option, set_option, w
 from runner.cli.output import Reply, json_lines, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line
-from runner.cli.runs import command_for, compilation_notice, run_as_json, run_facts
+from runner.cli.runs import compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode
-from runner.runs.run import Run, create_run, recordings_folder, unless_empty
+from runner.runs.run import Run, command_for, create_run, recordings_folder, unless_empty
 from runner.util.humanize import amount, size
 from runner.util.values import checked_name
 

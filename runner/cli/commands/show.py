@@ -14,7 +14,7 @@ from runner.cli.command import Command
 from runner.cli.options import recordings_option, run_argument
 from runner.cli.output import Reply, say
 from runner.cli.progress import stage_line
-from runner.cli.runs import command_for, find, restored
+from runner.cli.runs import find, restored
 
 if TYPE_CHECKING:
     from runner.analysis.summary import RunDetails
@@ -58,10 +58,7 @@ def _text(details: RunDetails) -> Iterator[Part]:
     first, *others = details.sections()
     file = {"file": str(details.run.recording)} if details.bytes else {}
     yield replace(first, facts={**first.facts, **file})
-    listed = f"dualtaxi checkpoints {details.run.run_id}"
-    for section in others:
-        texts = [text.replace(listed, command_for(details.run, "checkpoints")) for text in section.sentences]
-        yield replace(section, sentences=texts)
+    yield from others
     if details.evaluations:  # after all else: it may take seconds to compute
         with stage_line("evaluating a random policy"), open_recording(details.run.recording) as recording:
             sentence = random_policy_sentence(recording)

@@ -13,10 +13,10 @@ from runner.cli.options import trust_option
 from runner.cli.output import Reply
 from runner.cli.parameter_types import COUNT
 from runner.cli.progress import bytes_line, count_line
-from runner.cli.runs import command_for, folded, job_progress, recording_and_run, require_over
+from runner.cli.runs import folded, job_progress, recording_and_run, require_over
 from runner.errors import ExitCode, RunnerError
 from runner.runs.locking import locked
-from runner.runs.run import Run
+from runner.runs.run import Run, command_for
 from runner.runs.shards import shards_in_words, shards_of
 from runner.util.humanize import UNKNOWN, counted, size
 

@@ -122,7 +122,10 @@ def _run(recording: Recording, chosen: Sequence[EpisodeRef], progress: Tell) -> 
         Section("Replay", [] if player else [f"There is nothing to replay: {recorded}."], player=player)
     ]
     start = start_of(recording, next(iter(episodes), EpisodeRef(0))) if recording.tabular else 0
-    learned = learned_section(recording, start)
+    try:
+        learned = learned_section(recording, start)
+    except RecordingError as error:  # its tables may be damaged
+        learned = Section("What was learned", [f"There are no maps: {error}"])
     if recording.has_tables or learned.parts:
         sections.append(learned)
     if records:
