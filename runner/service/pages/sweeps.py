@@ -84,7 +84,7 @@ async def sweep(
     """Show the results of a sweep, at once, with placeholders for the parts that are not ready yet."""
     state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
     cached = {part: cache.get(_key(state, part)) for part in PARTS}
-    parts = {part: None if body is None else body.decode() for part, body in cached.items()}
+    bodies = {part: None if body is None else body.decode() for part, body in cached.items()}
     waiting = {part: text for part, (_, text) in PARTS.items()}
 
     def show() -> dict[str, object]:
@@ -97,7 +97,7 @@ async def sweep(
             "runs": state.runs,
             "runs_address": link("/runs", query),
             "job": own[-1].status() if own else None,
-            "parts": parts,
+            "bodies": bodies,
             "waiting": waiting,
         }
 
