@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from importlib import metadata
 from typing import Final
 
 import numpy as np
@@ -20,7 +19,7 @@ _MAX_TEXT: Final = 1_000
 _MAX_DEPTH: Final = 10
 
 
-def require_tested(module: str, extra: str, tested: tuple[str, str]) -> object:
+def require_tested(module: str, extra: str, tested: tuple[str, str]) -> None:
     """Import the library of an adapter; warn if its version is not one of those that were tested.
 
     Args:
@@ -32,17 +31,14 @@ def require_tested(module: str, extra: str, tested: tuple[str, str]) -> object:
     Raises:
         MissingExtra: it is not installed.
     """
-    library = require(module, extra=extra, purpose=f"runner.integrations.{extra}")
-    package = metadata.packages_distributions().get(module, [module])[0]
-    version = metadata.version(package)
+    version = str(require(module, extra=extra, purpose=f"runner.integrations.{extra}").__version__)
     low, high = (_numbers(text) for text in tested)
     numbers = _numbers(version)
     if numbers[: len(low)] < low or numbers[: len(high)] > high:
         warn_user(
-            f"runner.integrations.{extra}: found {package} {version}, tested are {tested[0]} to "
+            f"runner.integrations.{extra}: found {module} {version}, tested are {tested[0]} to "
             f"{tested[1]}. Check the first recording."
         )
-    return library
 
 
 def _numbers(version: str) -> tuple[int, ...]:
