@@ -22,7 +22,6 @@ from runner.cli.parameter_types import (
     RANGES,
     SETTING,
     STEP,
-    TARGET,
     TRIAL,
     TRIAL_FROM_STEP,
     ConfigName,
@@ -135,6 +134,7 @@ def curve_options(
 
 normalise_option: Final = option(
     "--normalise",
+    type=PATH,
     metavar="FILE|minmax",
     help="Compare over environments, by a table of random and expert scores, or the worst and best values.",
 )
@@ -265,18 +265,6 @@ ray_option: Final = option(
     metavar="[ADDRESS]",
     help="Run on Ray: on the cluster at ADDRESS, or on this machine.",
 )
-
-
-def target_option(multiple: bool) -> Declared:
-    """Return the option --target: a level of a metric; runs are compared when they first reach it."""
-    return option(
-        "--target",
-        multiple=multiple,
-        metavar="METRIC=LEVEL",
-        type=TARGET,
-        help="Compare when this level is first reached, such as success_percent=80"
-        + ("; may be repeated." if multiple else "."),
-    )
 
 
 @record

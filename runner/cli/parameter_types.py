@@ -185,12 +185,6 @@ def _trial(text: str) -> EpisodeRef:
         raise ValueError(text) from None
 
 
-def _target(text: str) -> tuple[str, float]:
-    from runner.analysis.series import parse_target  # loads NumPy
-
-    return parse_target(text)
-
-
 def _axis(text: str) -> Axis:
     from runner.analysis.axes import axis_of  # loads NumPy
 
@@ -217,7 +211,6 @@ PICTURE_SIZE: Final = Parsed(
     "WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", lambda text: "{}x{}".format(*_pair(text, 8192))
 )
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
-TARGET: Final = Parsed("METRIC=LEVEL", "METRIC=LEVEL such as success_percent=80", _target)
 AXIS: Final = Parsed("axis", "episodes, steps, updates, time or a logged name", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _step)
 PATH: Final = click.Path(path_type=Path)

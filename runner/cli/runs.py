@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.archive.places import at_hand
-from runner.cli.command import record
-from runner.cli.options import recordings_option, run_argument
+from runner.cli.command import argument, record
+from runner.cli.options import compared_argument, recordings_option, run_argument
 from runner.cli.output import Reply, say
+from runner.cli.parameter_types import RunName
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import ExitCode, RecordingError, RunnerError, RunNotFound
 from runner.recording.run_file import has_environment
@@ -151,6 +152,24 @@ def found_run(run_name: str = run_argument, recordings: Path | None = recordings
 def recorded_run(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Run:
     """Return the newest run of the name that the command gives, with its recording."""
     return find_recorded(run_name, recordings)
+
+
+@record
+def two_recorded_runs(
+    a: str = argument(metavar="A", type=RunName()),
+    b: str = argument(metavar="B", type=RunName()),
+    recordings: Path | None = recordings_option,
+) -> list[Run]:
+    """Return the two runs that the command names."""
+    return [find_recorded(a, recordings), find_recorded(b, recordings)]
+
+
+@record
+def all_recorded_runs(
+    run_names: tuple[str, ...] = compared_argument, recordings: Path | None = recordings_option
+) -> list[Run]:
+    """Return all runs that the command names."""
+    return find_all_recorded(run_names, recordings)
 
 
 # --- working ----------------------------------------------------------------------------------------------

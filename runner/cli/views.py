@@ -6,47 +6,55 @@ import io
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import click
 
 from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     force_option,
+    html_option,
 )
-from runner.cli.output import Reply, files_written
-from runner.cli.parameter_types import FILE, INDEX, ExpressionText
+from runner.cli.output import Reply, files_written, require_page
+from runner.cli.parameter_types import FILE, INDEX, PATH, ExpressionText, Parsed
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import compilation_notice, recorded_run
+from runner.cli.runs import all_recorded_runs, compilation_notice, recorded_run, two_recorded_runs
 from runner.export.places import new_file, require_new
-from runner.runs.run import Run, command_for
+from runner.runs.run import command_for
 from runner.util.humanize import size
 from runner.views.view import Input, View
 
 _STDOUT: Final = Path("-")
+_SUBJECTS: Final = {"pair": two_recorded_runs, "runs": all_recorded_runs}
+"""What several runs are named by."""
 
 
 def command_of(view: View) -> Command:
     """Return the command of a view."""
 
     def call(
-        run: Run,
+        subject: Any,
         output: Path | None = None,
         force: bool = False,
         **values: object,
     ) -> Reply:
         if output not in (None, _STDOUT):
-            require_new(output, force)
+            (require_page if view.is_of_runs else require_new)(output, force)
         from runner.analysis.contents import damage_of
         from runner.recording.reader import Recording, open_recording
 
         line = steps_line if view.counts_steps else stage_line
-        opened = nullcontext(run) if view.takes_run else open_recording(run.recording)
+        is_recording = view.subject == "recording"
+        opened = open_recording(subject.recording) if is_recording else nullcontext(subject)
         notes: list[str] = []
-        with compilation_notice(), line(view.stage) as report, opened as subject:
-            answer = view.compute(subject, **values, **({"report": report} if view.counts_steps else {}))
-            if isinstance(subject, Recording) and (damage := damage_of(run, subject)):
+        with compilation_notice(), line(view.stage) as report, opened as content:
+            reported = {"report": report} if view.counts_steps or view.is_of_runs else {}
+            answer = view.compute(content, **values, **reported)
+            if isinstance(content, Recording) and (damage := damage_of(subject, content)):
                 notes.append(damage)
+            if output not in (None, _STDOUT):
+                with new_file(output, force) as temporary, temporary.open("wb") as stream:
+                    answer.write(stream)
         if output == _STDOUT:
             file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
             answer.write(file)
@@ -54,24 +62,28 @@ def command_of(view: View) -> Command:
                 return Reply((), [file.getvalue().decode(errors="replace")])
             sys.stdout.buffer.write(file.getvalue())
             return Reply(())
-        data, text = answer.as_json(), [*answer.sections()]
+        data, text, page = answer.as_json(), [*answer.sections()], ""
         if answer.step_to_look_at is not None:
-            text.append({"next": command_for(run, "view", "--at", str(answer.step_to_look_at))})
+            text.append({"next": command_for(subject, "view", "--at", str(answer.step_to_look_at))})
         if output is not None:
-            with new_file(output, force) as temporary, temporary.open("wb") as stream:
-                answer.write(stream)
-            data |= {"files": files_written(output)}
-            notes.append(f"{output}  {size(output.stat().st_size)}")
-        return Reply(data, text, notes=notes)
+            data, length = data | {"files": files_written(output)}, size(output.stat().st_size)
+            if view.is_of_runs:
+                page = f"{output}: {answer.contents or length}"
+                notes = [f"Note: {note}." for note in answer.notes]
+            else:
+                notes.append(f"{output}  {length}")
+        return Reply(data, text, page=page, notes=notes, exit_code=answer.exit_code if view.is_of_runs else 0)
 
     declared = {
-        "run": recorded_run,
+        "subject": _SUBJECTS.get(view.subject, recorded_run),
         **{name: _declared(each, view) for name, each in view.inputs.items()},
     }
     if view.file_ending:
         help_text = f"{view.file_help} FILE `-` is stdout."
         output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=help_text)
         declared |= {"output": output, "force": force_option}
+    if view.is_of_runs:
+        declared |= {"output": html_option, "force": force_option}
     return Command(view.name, call, declared, help=view.help)
 
 
@@ -82,6 +94,16 @@ def _declared(given: Input, view: View) -> Declared:
     flag = f"--{given.name}"
     if given.kind is bool:
         return option(flag, is_flag=True, help=given.help)
-    kind = click.Choice(given.values) if given.values else INDEX if given.kind is int else None
-    metavar = given.metavar or None
-    return option(flag, type=kind, default=given.default, metavar=metavar, help=given.help)
+    kind: Any = INDEX if given.kind is int else PATH if given.is_file else None
+    if given.values:
+        kind = click.Choice(given.values)
+    if (check := given.check) is not None:
+        kind = Parsed(given.name, given.metavar, lambda text: (check(text), text)[1])
+    return option(
+        flag,
+        type=kind,
+        default=given.default,
+        multiple=given.multiple,
+        metavar=given.metavar or None,
+        help=given.help,
+    )

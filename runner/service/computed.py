@@ -9,6 +9,7 @@ import math
 import os
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from http import HTTPStatus
 from itertools import islice
@@ -19,22 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
-from runner.analysis import diff as differences
 from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
-from runner.analysis.compare import compare
-from runner.analysis.compare.moments import moment_of
-from runner.analysis.compare.score_table import MIN_MAX, parse_table
-from runner.analysis.compare.statistics import require_scipy
-from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
-from runner.analysis.groups import grouped, groups_of, metrics_of, require_two
+from runner.analysis.groups import groups_of
 from runner.analysis.histograms import histograms
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.series import (
     RunSeries,
-    parse_target,
     read_series,
     series_of,
     values_left_out,
@@ -60,8 +54,6 @@ from runner.util.extras import require
 from runner.util.values import finite
 from runner.views.view import Answer, FileAnswer, Given
 
-TABLE_NAME: Final = "scores.csv"
-"""Stands for a table of scores in messages."""
 MAX_ROWS: Final = 1000
 """The most rows of a query, and the most episodes of a search."""
 MAX_FILM_STEPS: Final = 5_000
@@ -276,10 +268,10 @@ def thinned(values: NDArray[np.float64], points: int) -> NDArray[np.intp]:
     return np.unique([*lowest, *highest])
 
 
-def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
-    """Return the answer to a question about a recording, as the command prints it with --json."""
-    with open_recording(path) as recording:
-        return as_json(question(recording, **dict(values)).as_json())
+def answer(subject: Path | Sequence[Run], question: Callable[..., Answer], values: Given) -> bytes:
+    """Return the answer to a question about a recording or some runs, as --json prints it."""
+    with open_recording(subject) if isinstance(subject, Path) else nullcontext(subject) as content:
+        return as_json(question(content, **dict(values)).as_json())
 
 
 def answer_file(path: Path, question: Callable[..., FileAnswer], values: Given) -> bytes:
@@ -359,41 +351,6 @@ def plot(paths: Sequence[Path], options: FigureOptions) -> bytes:
         raise RunnerError(f"metric: found {', '.join(metrics)[:200]}, expected metrics that a run recorded.")
     style = CurveStyle(smooth=options.smooth, log_x=options.log_x, log_y=options.log_y)
     return svg_file(curves_sheet(groups, panels, style))
-
-
-def difference(a: Run, b: Run, ignore: Sequence[str], first: bool, targets: Sequence[str]) -> bytes:
-    """Return the differences between two runs, as `dualtaxi diff --json` prints them."""
-    levels = dict(parse_target(target) for target in targets)
-    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
-        result = differences.diff(ours, theirs, levels, first)
-    result = result if first else differences.with_seconds(result, a, b)
-    return as_json(differences.as_json(differences.without_ignored(result, ignore)))
-
-
-def comparison(
-    paths: Sequence[Path],
-    by: str | None,
-    metrics: Sequence[str],
-    moment: str,
-    target: str | None,
-    axis: str = EPISODES.name,
-    normalise: str | None = None,
-) -> bytes:
-    """Return a comparison of groups of runs, as `dualtaxi compare --json` prints it.
-
-    The usual metrics if none are named; `target` is a metric and its level instead of a moment; `normalise`
-    compares over environments by `minmax`, or by a table of scores as CSV.
-    """
-    require_scipy()
-    over = axis_of(axis)
-    chosen, names = moment_of(moment, parse_target(target) if target else None, metrics, over)
-    series = series_of(paths, over, names)
-    if normalise is not None:
-        table = None if normalise == MIN_MAX else parse_table(normalise, TABLE_NAME)
-        return as_json(compare_algorithms(series, table, by, names, chosen))
-    groups, notes = grouped(series, by)
-    require_two(groups, by)
-    return as_json(compare(groups, metrics_of(groups, names), chosen, notes))
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:

@@ -6,6 +6,7 @@ import base64
 import json
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -13,7 +14,7 @@ from typing import Final
 from markupsafe import escape
 
 from runner.analysis.axes import axis_of
-from runner.analysis.compare.score_table import parse_table
+from runner.analysis.compare.score_table import scores_of
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.diff.divergence import Divergence
@@ -43,7 +44,7 @@ from runner.recording.messages import media_type
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link, places_in
-from runner.service.computed import TABLE_NAME, as_json
+from runner.service.computed import as_json
 from runner.util.values import Json
 from runner.views.view import Answer, Given
 
@@ -132,17 +133,11 @@ def what_if_page(run: Run, at: EpisodeRef, action: str | None, start: int, steps
         return as_json(shown)
 
 
-def answer(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
-    """Return the answer to a question about a recording as HTML."""
-    with open_recording(path) as recording:
-        sections = question(recording, **dict(values)).sections()
-        return str(partials().answer(sections, f"/runs/{recording.run_id}/")).encode()
-
-
-def answer_of_run(run: Run, question: Callable[..., Answer], values: Given) -> bytes:
-    """Return the answer to a question about a run and the files stored with it as HTML."""
-    sections = question(run, **dict(values)).sections()
-    return str(partials().answer(sections, f"/runs/{run.run_id}/")).encode()
+def answer(subject: Path | Run, question: Callable[..., Answer], values: Given) -> bytes:
+    """Return the answer to a question about a recording or a run as HTML."""
+    with open_recording(subject) if isinstance(subject, Path) else nullcontext(subject) as content:
+        sections = question(content, **dict(values)).sections()
+        return str(partials().answer(sections, f"/runs/{content.run_id}/")).encode()
 
 
 def _branch_part(recording: Recording, at: StepLike, action: str, start: int, steps: int) -> Json:
@@ -221,7 +216,7 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
 
     Where nobody asked for scores, a reason why the runs cannot be compared is an answer, not an error.
     """
-    table = parse_table(scores, TABLE_NAME) if scores.strip() else None
+    table = scores_of(scores) if scores.strip() else None
     try:
         comparison = compare_algorithms(series_of(paths, axis_of(axis)), table)
     except RunnerError as error:

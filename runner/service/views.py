@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from http import HTTPStatus
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from pydantic import BaseModel, Field, create_model
+from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.contents import damage_of
 from runner.errors import RecordingError, RunnerError
@@ -16,19 +17,22 @@ from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed, fragments
 from runner.service.addresses import link
+from runner.service.api.comparing import RunName, RunNames, found_runs
 from runner.service.api.replay import OCTETS
 from runner.service.computed import require_few
-from runner.service.dependencies import Computation, ComputationOf, RecordedRun, SettingsOf
+from runner.service.dependencies import CatalogueOf, Computation, ComputationOf, RecordedRun, SettingsOf
 from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import filled, media_docs, status_of
-from runner.views import VIEWS, view_named
+from runner.views import OF_RUNS, VIEWS, view_named
 from runner.views.view import Given, Input, View, rows_in
 
-api = APIRouter(
-    prefix="/runs/{run}",
-    tags=["reading"],
-)
+api = APIRouter()
 pages = APIRouter(prefix="/runs/{run}", include_in_schema=False)
+_NAMES: Final[dict[str, Any]] = {
+    "pair": {"a": (RunName, ...), "b": (RunName, ...)},
+    "runs": {"run": (RunNames, ...)},
+}
+"""What a query has of several runs: the names of two, or of any number."""
 PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**9)]
 
 
@@ -48,9 +52,10 @@ def _add_routes(view: View) -> None:
 
         answer.__annotations__["given"] = Annotated[given_type, Query()]
         path, description = f"/{view.name}{ending}", f"As `dualtaxi {view.name}` returns it."
-        api.get(path, name=path[1:], summary=summary, description=description, **options)(answer)
+        described = {"name": path[1:], "summary": summary, "description": description} | options
+        api.get(f"/runs/{{run}}{path}", tags=["reading"], **described)(answer)
 
-    if not view.takes_run:
+    if view.subject == "recording":
         add(
             computed.answer,
             "",
@@ -103,14 +108,33 @@ def _add_routes(view: View) -> None:
         return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
 
 
+def _add_route_of_runs(view: View) -> None:
+    async def answer(catalogue: CatalogueOf, compute: ComputationOf, given: Any) -> Response:
+        values = given.model_dump()
+        names = [values.pop(name) for name in _NAMES[view.subject]]
+        several = view.subject == "runs"
+        runs = await run_in_threadpool(found_runs, catalogue, names[0] if several else names, several)
+        return await compute.json(computed.answer, runs, view.compute, tuple(values.items()))
+
+    answer.__annotations__["given"] = Annotated[_type_of(view), Query()]
+    api.get(
+        f"/{view.name}",
+        name=view.name,
+        tags=["comparing"],
+        response_model=dict[str, object],
+        summary=view.help.partition("\n")[0],
+        description=f"As `dualtaxi {view.name}` returns it.",
+    )(answer)
+
+
 async def _answered(compute: Computation, run: Run, view: View, given: BaseModel, number: int) -> bytes:
     """Return the answer on a page; of a long list, the rows of one page."""
     first = (number - 1) * view.rows_per_page
     rows = (("start", first), ("stop", first + view.rows_per_page)) if view.rows_per_page else ()
     more = view.page_values + rows
-    if view.takes_run:
+    if view.subject == "run":
         values = tuple((given.model_dump() | dict(more)).items())
-        return await compute.uncached(fragments.answer_of_run, run, view.compute, values)
+        return await compute.uncached(fragments.answer, run, view.compute, values)
     return await _computed(compute, fragments.answer, run, view, given, more)
 
 
@@ -132,16 +156,19 @@ def _type_of(view: View) -> type[BaseModel]:
 
     def declared(given: Input) -> tuple[Any, Any]:
         kind: Any = Literal[given.values] if given.values else given.kind
-        kind = kind if given.required or given.default is not None else kind | None
+        if not (given.required or given.multiple or given.default is not None):
+            kind |= None
         limits: dict[str, Any] = (
             {} if given.kind is bool or given.values else {"max_length": given.max_length}
         )
         if given.kind is int:
             limits = {"ge": 0, "le": given.maximum}
-        default = ... if given.required else given.default
+        default: Any = ... if given.required else given.default
+        if given.multiple:
+            kind, default = tuple[kind, ...], ()
         return kind, Field(default, alias=given.name, description=given.help, **limits)
 
-    fields: Any = {name: declared(each) for name, each in view.inputs.items()}
+    fields: Any = _NAMES.get(view.subject, {}) | {name: declared(each) for name, each in view.inputs.items()}
     made: type[BaseModel] = create_model(view.title, **fields)
     return made
 
@@ -161,3 +188,5 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
 
 for _view in (*VIEWS.values(), *map(view_named, installed_names())):
     _add_routes(_view)
+for _view in OF_RUNS.values():
+    _add_route_of_runs(_view)

@@ -1,4 +1,4 @@
-"""Views: questions about a recording, each asked once; commands, API routes and pages are derived of them.
+"""Views: questions about recorded runs, each asked once; commands, API routes and pages are derived of them.
 
 A view is a module with a `VIEW`. It imports heavy packages in its function, so that help is quick. Installed
 packages add views by entry points, see `runner.util.plugins`.
@@ -10,14 +10,28 @@ from functools import cache
 from typing import Final
 
 from runner.util import plugins
-from runner.views import checkpoints, code, console, episodes, evaluations, qtable, system, when, why
+from runner.views import (
+    checkpoints,
+    code,
+    compare,
+    console,
+    diff,
+    episodes,
+    evaluations,
+    qtable,
+    system,
+    when,
+    why,
+)
 from runner.views.view import View
 
 VIEWS: Final = {
     module.VIEW.name: module.VIEW
     for module in (episodes, evaluations, qtable, when, why, checkpoints, system, console, code)
 }
-"""Name of a view -> the view, in the order of tabs."""
+"""Name of a view of one run -> the view, in the order of tabs."""
+OF_RUNS: Final = {module.VIEW.name: module.VIEW for module in (diff, compare)}
+"""Name of a view of several runs -> the view."""
 
 
 @cache  # reading the metadata of all packages takes 0.1 s
@@ -27,4 +41,5 @@ def view_named(name: str) -> View:
     Raises:
         RunnerError: it cannot be imported.
     """
-    return VIEWS[name] if name in VIEWS else plugins.load_plugin(plugins.VIEWS, name, View)
+    shipped = VIEWS | OF_RUNS
+    return shipped[name] if name in shipped else plugins.load_plugin(plugins.VIEWS, name, View)

@@ -69,5 +69,5 @@ VIEW: Final = View(
     counts_steps=False,
     has_default=True,
     needs="checkpoints",
-    takes_run=True,
+    subject="run",
 )

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal, Protocol
 
-from runner.errors import ConfigError
+from runner.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -44,6 +44,34 @@ class FileAnswer(Answer, Protocol):
 
 
 @dataclass(frozen=True)
+class AnswerOfRuns:
+    """The answer to a question about several runs."""
+
+    data: Json
+    text: list[Section]
+    page: Callable[[], str]
+    """Returns the answer with pictures, as an HTML page of its own."""
+    contents: str = ""
+    """What the command says of the page; its size if empty."""
+    notes: Sequence[str] = ()
+    """What limits the answer: the command says it where the page stands for the text."""
+    exit_code: int = ExitCode.OK
+    step_to_look_at = None
+
+    def as_json(self) -> Json:
+        """Return the answer as JSON can hold it."""
+        return self.data
+
+    def sections(self) -> list[Section]:
+        """Return what people see of the answer."""
+        return self.text
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the page."""
+        stream.write(self.page().encode())
+
+
+@dataclass(frozen=True)
 class Input:
     """An input of a view: an option of its command, a parameter of its route, a field of its page."""
 
@@ -55,6 +83,13 @@ class Input:
     required: bool = False
     metavar: str = ""
     max_length: int = 1000
+    """The most characters, or the most values if it is `multiple`."""
+    multiple: bool = False
+    """Whether it may be repeated."""
+    is_file: bool = False
+    """Whether the command takes the path of a file instead of its text."""
+    check: Callable[[str], object] | None = None
+    """Raises a `RunnerError` if a text is no value of it, so that the command can name its option."""
     maximum: int | None = None
     label: str = ""
     """Label of the field; empty if the page has none."""
@@ -97,16 +132,17 @@ def rows_in(start: int, stop: int | None) -> range:
 
 @dataclass(frozen=True)
 class View:
-    """A question about a recording."""
+    """A question about recorded runs."""
 
     name: str
     """Name of the command, and last part of the addresses of route and page."""
     title: str
     compute: Callable[..., Any]
-    """Takes the recording, the inputs and `report`, called with the steps done; returns an `Answer`."""
-    takes_run: bool = False
-    """Whether the function takes the run instead of its recording, to read files stored next to it. Its
-    answers are not cached, and have no API route, as they hold paths."""
+    """Takes the subject, the inputs and `report`, called with the steps done; returns an `Answer`."""
+    subject: Literal["recording", "run", "pair", "runs"] = "recording"
+    """What the function takes first: a recording; or the run, to read files stored next to it, with answers
+    that are not cached and have no API route, as they hold paths; or a list of two or more runs, with an
+    `AnswerOfRuns` and no page."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
@@ -118,7 +154,7 @@ class View:
     stage: str = "reading"
     """What the command says that it does."""
     counts_steps: bool = True
-    """Whether the function has the parameter `report`."""
+    """Whether `report` is called with steps; with several runs, it is called with the next stage."""
     needs: Literal["", "checkpoints", "episodes", "tables", "training"] = ""
     """What a run needs for a tab of this page: checkpoints, an environment, Q-tables, or a training that
     the runner can repeat."""
@@ -141,6 +177,11 @@ class View:
         """The inputs, by the name of their parameter."""
         declared = inspect.signature(self.compute).parameters.values()
         return {each.name: each.default for each in declared if isinstance(each.default, Input)}
+
+    @property
+    def is_of_runs(self) -> bool:
+        """Whether it is about several runs."""
+        return self.subject in ("pair", "runs")
 
     @property
     def help(self) -> str:

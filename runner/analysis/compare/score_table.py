@@ -31,9 +31,11 @@ class Bounds:
         return (values - self.zero) / (self.one - self.zero)
 
 
-def scores_of(option: str) -> dict[str, Bounds] | None:
-    """Return the table that an option stands for: a file, or None for `minmax`."""
-    return None if option == MIN_MAX else read_table(Path(option))
+def scores_of(given: str | Path) -> dict[str, Bounds] | None:
+    """Return the table in a file, or in a text of CSV; None for `minmax`."""
+    if str(given) == MIN_MAX:
+        return None
+    return read_table(given) if isinstance(given, Path) else parse_table(given, "scores.csv")
 
 
 def read_table(path: Path) -> dict[str, Bounds]:

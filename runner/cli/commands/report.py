@@ -39,7 +39,7 @@ def plot_command(
     run_names: tuple[str, ...] = compared_argument,
     axis: Axis = axis_option,
     style: CurveStyle = curve_options,
-    normalise: str | None = normalise_option,
+    normalise: Path | None = normalise_option,
     to: Writing = writing_options("exports/plot.png", "FILE.png|svg|pdf"),
     recordings: Path | None = recordings_option,
 ) -> Reply:
@@ -107,7 +107,7 @@ def plot_command(
     return written(text, output, metrics=len(panels), runs=count)
 
 
-def _plot_tasks(series: list[RunSeries], normalise: str, to: Writing) -> Reply:
+def _plot_tasks(series: list[RunSeries], normalise: Path, to: Writing) -> Reply:
     from runner.analysis.compare.score_table import scores_of
     from runner.analysis.compare.tasks import compare_algorithms
     from runner.export.plots.image import save

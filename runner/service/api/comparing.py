@@ -10,13 +10,12 @@ from fastapi import Path as InPath
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.axes import EPISODES
 from runner.debugging.explanation import Explanation
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.errors import RunNotFound
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.reading import SVG, AxisOf
+from runner.service.api.reading import SVG
 from runner.service.catalogue import Catalogue
 from runner.service.computed import CurveOptions, Curves, FigureOptions
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
@@ -28,12 +27,12 @@ router = APIRouter(
     tags=["comparing"],
 )
 MAX_RUNS: Final = 1000
-MAX_SCORES: Final = 10_000
-"""Characters of a table of scores."""
 RunNames = Annotated[
     tuple[str, ...], Field(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")
 ]
-Name = Annotated[str, Query(max_length=200, description="A run: its id, the beginning of it, its name, ...")]
+RunName = Annotated[
+    str, Field(max_length=200, description="A run: its id, the beginning of it, its name, ...")
+]
 Part = Annotated[str, InPath(max_length=120)]
 
 
@@ -76,25 +75,6 @@ def found_explanation(pair: str, metric: str, settings: ServiceSettings) -> Expl
     return read_explanation(name, folder)
 
 
-@router.get(
-    "/diff",
-    response_model=dict[str, object],
-    summary="The differences between two runs, down to the first step that differs.",
-)
-async def diff(
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-    a: Name,
-    b: Name,
-    ignore: Annotated[list[str] | None, Query(max_length=100, description="Paths, with * and ?.")] = None,
-    target: Annotated[list[str] | None, Query(max_length=20, description="METRIC=LEVEL.")] = None,
-    first: Annotated[bool, Query(description="Only settings, and the first step that differs.")] = False,
-) -> Response:
-    """Return what `dualtaxi diff --json` prints."""
-    left, right = await run_in_threadpool(found_runs, catalogue, [a, b])
-    return await compute.json(computed.difference, left, right, ignore or [], first, target or [])
-
-
 @router.get("/curves", response_model=Curves, summary="The curves of several runs, seeds as one curve.")
 async def curves(
     catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[CurvesOfRuns, Query()]
@@ -116,38 +96,6 @@ async def curves_picture(
     """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
     paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
     return Response(await compute(computed.plot, paths, options), media_type=SVG)
-
-
-@router.get(
-    "/compare",
-    response_model=dict[str, object],
-    summary="A comparison of groups of runs, with statistics over seeds.",
-)
-async def compare(
-    catalogue: CatalogueOf,
-    compute: ComputationOf,
-    run: Annotated[RunNames, Query()],
-    by: Annotated[str | None, Query(max_length=200, description="Group by this setting.")] = None,
-    metric: Annotated[list[str] | None, Query(max_length=100)] = None,
-    moment: Annotated[
-        str, Query(max_length=20, description="`last`, `best`, `area`, or a position.")
-    ] = "last",
-    axis: AxisOf = EPISODES.name,
-    target: Annotated[
-        str | None, Query(max_length=200, description="METRIC=LEVEL, instead of `moment`.")
-    ] = None,
-    normalise: Annotated[
-        str | None,
-        Query(
-            max_length=MAX_SCORES,
-            description="Over environments: `minmax`, or CSV with the columns task, random and expert.",
-        ),
-    ] = None,
-) -> Response:
-    """Return what `dualtaxi compare --json` prints; a run's name stands for all runs of that name."""
-    paths = [one.recording for one in await run_in_threadpool(found_runs, catalogue, run, several=True)]
-    options = (by, metric or [], moment, target, axis, normalise)
-    return await compute.json(computed.comparison, paths, *options)
 
 
 def found_runs(catalogue: Catalogue, names: Sequence[str], several: bool = False) -> list[Run]:

@@ -24,7 +24,7 @@ from runner.recording.run_file import EvaluationMetrics
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link, places_in, step_in
-from runner.service.api.comparing import MAX_SCORES, found_runs
+from runner.service.api.comparing import found_runs
 from runner.service.api.reading import AxisOf
 from runner.service.dependencies import At, CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
@@ -33,6 +33,7 @@ from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
 from runner.util import humanize
 from runner.util.humanize import counted
+from runner.views.compare import MAX_SCORES
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 

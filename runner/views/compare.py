@@ -1,0 +1,144 @@
+"""`compare`: groups of runs against each other, with statistics over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from runner.errors import ConfigError
+from runner.util.humanize import counted
+from runner.views.view import AnswerOfRuns, View, view_input
+
+if TYPE_CHECKING:
+    from runner.runs.run import Run
+
+MAX_SCORES: Final = 10_000
+"""Characters of a table of scores."""
+
+
+def _target(text: str) -> object:
+    from runner.analysis.series import parse_target
+
+    return parse_target(text)
+
+
+def _axis(text: str) -> object:
+    from runner.analysis.axes import axis_of
+
+    return axis_of(text)
+
+
+def compare(
+    runs: Sequence[Run],
+    by: str | None = view_input(
+        "by", "Group by a value of the configuration, such as discount.", metavar="PATH", max_length=200
+    ),
+    metrics: Sequence[str] = view_input(
+        "metric",
+        "A metric; may be repeated.  [default: those of evaluations]",
+        metavar="METRIC",
+        multiple=True,
+        max_length=100,
+    ),
+    moment: str = view_input(
+        "moment",
+        "Compare at the last evaluation, at each run's best, the mean over all, or after N on the axis. "
+        "Values of training are means over a window, which a note states.  [default: last]",
+        default="last",
+        metavar="last|best|area|N",
+        max_length=20,
+    ),
+    axis: str = view_input(
+        "axis",
+        "Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.  "
+        "[default: episodes]",
+        default="episodes",
+        metavar="episodes|steps|updates|time",
+        check=_axis,
+    ),
+    at_step: int | None = view_input(
+        "at-step", "Compare after N training steps: --axis steps --moment N.", kind=int, metavar="N"
+    ),
+    target: str | None = view_input(
+        "target",
+        "Compare when this level is first reached, such as success_percent=80.",
+        metavar="METRIC=LEVEL",
+        max_length=200,
+        check=_target,
+    ),
+    normalise: str | Path | None = view_input(  # noqa: B008
+        "normalise",
+        "Compare over environments, by a table of random and expert scores, or the worst and best values.",
+        metavar="FILE|minmax",
+        max_length=MAX_SCORES,
+        is_file=True,
+    ),
+    report: Callable[[str], None] = lambda _: None,
+) -> AnswerOfRuns:
+    """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
+
+    Runs that differ in nothing but the seed are one group; the name of several runs stands for all of them,
+    and a filter, as in `dualtaxi ls`, for the runs that match it. Groups are compared seed by seed, as runs
+    of one seed share their draws. For each metric: median and interquartile mean (IQM) with a 95 % bootstrap
+    interval; for each pair of groups the differences, and the probability that a run of A is better than one
+    of B; and the share of runs that reach a level.
+
+    With --normalise, algorithms are compared over several environments by normalised scores: IQM, median,
+    mean and optimality gap, the probability of improvement, performance profiles and sample-efficiency
+    curves, with intervals by a bootstrap that resamples the seeds of each environment. A group then has the
+    runs that differ in nothing but environment and seed, or have the same value of --by, such as name.
+
+    Exit code 0 when groups were compared, 2 when there is nothing to compare.
+
+    Examples:
+      dualtaxi compare cooperative competitive
+      dualtaxi compare first second third --metric mean_length --moment 10000
+      dualtaxi compare ppo dqn --at-step 100000
+      dualtaxi compare 'status == "finished" and 0.9 < config.discount < 1' --by discount
+      dualtaxi compare sweep --by discount --target success_percent=80
+      dualtaxi compare ppo dqn --normalise scores.csv --metric training.mean_return
+      dualtaxi compare cooperative competitive --html comparison.html
+    """
+    from runner.analysis.axes import axis_of
+    from runner.analysis.compare import compare
+    from runner.analysis.compare.moments import moment_of
+    from runner.analysis.compare.score_table import scores_of
+    from runner.analysis.compare.sections import sections
+    from runner.analysis.compare.statistics import require_scipy
+    from runner.analysis.compare.task_sections import task_sections
+    from runner.analysis.compare.tasks import compare_algorithms
+    from runner.analysis.groups import grouped, metrics_of, require_two
+    from runner.analysis.series import parse_target, series_of
+    from runner.export.reports.compare import render_comparison, render_tasks
+
+    require_scipy()
+    if at_step is not None:
+        if moment != "last" or axis != "episodes":
+            raise ConfigError(
+                "at-step: it stands for the axis steps and the moment N, so it excludes axis and moment; "
+                "drop it or them."
+            )
+        moment, axis = str(at_step), "steps"
+    over = axis_of(axis)
+    read_at, chosen = moment_of(moment, parse_target(target) if target else None, metrics, over)
+    report("reading runs")
+    series = series_of((run.recording for run in runs), over, chosen)
+    report("computing intervals")
+    if normalise is not None:
+        tasks = compare_algorithms(series, scores_of(normalise), by, chosen, read_at)
+        contents = f"{len(tasks.algorithms)} groups in {len(tasks.tasks)} environments"
+        page = partial(render_tasks, tasks)
+        return AnswerOfRuns(asdict(tasks), task_sections(tasks), page, contents, tasks.notes)
+    groups, notes = grouped(series, by)
+    require_two(groups, by)
+    compared = compare(groups, metrics_of(groups, chosen), read_at, notes)
+    count = sum(len(group.runs) for group in groups)
+    contents = f"{counted(len(compared.metrics), 'metric')} of {count} runs in {len(groups)} groups"
+    page = partial(render_comparison, compared, groups)
+    return AnswerOfRuns(asdict(compared), sections(compared), page, contents, compared.notes)
+
+
+VIEW: Final = View("compare", "Compare", compare, subject="runs", stage="reading runs", counts_steps=False)
