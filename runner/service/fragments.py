@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from runner.analysis.compare.score_table import scores_of
 from runner.analysis.compare.tasks import compare_algorithms
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.diff.divergence import Divergence
-from runner.analysis.diff.sections import summary
+from runner.analysis.diff.sections import made_sections, summary
 from runner.analysis.episodes import TYPICAL, EpisodeRef, StepLike
 from runner.analysis.histograms import histograms
 from runner.analysis.sections import Figure, Grid, Link, Section
@@ -77,16 +77,12 @@ class ShownBranches:
 
 @dataclass(frozen=True)
 class ShownDifference:
-    """The difference of two runs."""
+    """What differs between two runs."""
 
-    lead: str
-    notes: Sequence[str]
-    first_frame: str | None
+    tabs: Mapping[str, tuple[str, Sequence[str], str]]
+    """Lead, notes and HTML of tabs: where they diverge and what else differs, their Q-tables, their code."""
+    first_frame: str | None = None
     """The first frame of the replays that differs; None if there is none."""
-    body: str
-    """Where they diverge and what else differs, as HTML."""
-    tables: str
-    """Their Q-tables, as HTML."""
 
 
 def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
@@ -262,14 +258,18 @@ def difference(a: Run, b: Run) -> bytes:
         shown[title] = replace(shown[title], links=_links([a, b], divergence))
     body = [section for title, section in shown.items() if title not in ("Metrics", "Q-tables", "Runs")]
     first = next(iter(known.values()), None)
-    shown_difference = ShownDifference(
-        lead=summary(found),
-        notes=found.notes,
-        first_frame=None if first is None else str(first.frame),
-        body=partials().answer(body),
-        tables=partials().answer([shown["Q-tables"]]),
-    )
-    return as_json(shown_difference)
+    tabs = {
+        "divergence": (summary(found), found.notes, partials().answer(body)),
+        "tables": ("", [], partials().answer([shown["Q-tables"]])),
+    }
+    return as_json(ShownDifference(tabs, None if first is None else str(first.frame)))
+
+
+def made_difference(a: Run, b: Run) -> bytes:
+    """Return how the code of two runs differs, and how else they were made, as `ShownDifference` in JSON."""
+    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+        lead, sections = made_sections(ours, theirs)
+    return as_json(ShownDifference({"code": (lead, [], partials().answer(sections))}))
 
 
 def _links(runs: list[Run], divergence: Divergence) -> list[Link]:

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import HTMLResponse
 
 from runner.analysis.axes import EPISODES
-from runner.analysis.diff.sections import made_sections
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.groups import flat_config
 from runner.errors import RunnerError
 from runner.export.plots.comparisons import letter
-from runner.export.reports.rendering import partials
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics
@@ -159,34 +156,6 @@ async def tasks(
     return HTMLResponse(await compute(fragments.tasks, paths, axis, scores))
 
 
-@router.get("/divergence")
-async def divergence(runs: TwoRuns, compute: ComputationOf) -> Response:
-    """Show the first step at which two runs differ, and the cause."""
-    found = await compute.shown(ShownDifference, fragments.difference, *runs)
-    return _answer(runs, "/divergence", found.body, found.lead, found.notes)
-
-
-@router.get("/tables")
-async def tables(runs: TwoRuns, compute: ComputationOf) -> Response:
-    """Show the difference of the Q-tables of two runs."""
-    found = await compute.shown(ShownDifference, fragments.difference, *runs)
-    return _answer(runs, "/tables", found.tables)
-
-
-@router.get("/code")
-def code(runs: TwoRuns) -> Response:
-    """Show how the code of two runs differs, and how else they were made."""
-    with open_recording(runs[0].recording) as a, open_recording(runs[1].recording) as b:
-        lead, sections = made_sections(a, b)
-    return _answer(runs, "/code", str(partials().answer(sections)), lead)
-
-
-def _answer(runs: list[Run], here: str, body: str, lead: str = "", notes: Sequence[str] = ()) -> Response:
-    """Return a page of a comparison whose content is HTML."""
-    values = {"compared": _compared(runs, here), "lead": lead, "notes": notes, "body": body}
-    return Page("compare_answer.html", values)
-
-
 @router.get("/replay")
 async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
@@ -220,6 +189,18 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
         }
 
     return Page("compare_replay.html", show)
+
+
+@router.get("/{tab}")
+async def difference(
+    tab: Literal["divergence", "tables", "code"], runs: TwoRuns, compute: ComputationOf
+) -> Response:
+    """Show the first step at which two runs differ, and why; or how their Q-tables differ, or their code."""
+    function = fragments.made_difference if tab == "code" else fragments.difference
+    found = await compute.shown(ShownDifference, function, *runs)
+    lead, notes, body = found.tabs[tab]
+    values = {"compared": _compared(runs, f"/{tab}"), "lead": lead, "notes": notes, "body": body}
+    return Page("compare_answer.html", values)
 
 
 def _compared(runs: list[Run], here: str) -> Compared:
