@@ -186,7 +186,5 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
     return {"choices": choices, "refusal": refusal, "damage": damage}
 
 
-for _view in (*VIEWS.values(), *map(view_named, installed_names())):
-    _add_routes(_view)
-for _view in OF_RUNS.values():
-    _add_route_of_runs(_view)
+for _view in (*VIEWS.values(), *OF_RUNS.values(), *map(view_named, installed_names())):
+    (_add_route_of_runs if _view.is_of_runs else _add_routes)(_view)

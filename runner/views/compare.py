@@ -19,7 +19,8 @@ MAX_SCORES: Final = 10_000
 """Characters of a table of scores."""
 
 
-def _target(text: str) -> object:
+def check_target(text: str) -> object:
+    """Return what a target names, so that a wrong one is refused."""
     from runner.analysis.series import parse_target
 
     return parse_target(text)
@@ -67,7 +68,7 @@ def compare(
         "Compare when this level is first reached, such as success_percent=80.",
         metavar="METRIC=LEVEL",
         max_length=200,
-        check=_target,
+        check=check_target,
     ),
     normalise: str | Path | None = view_input(  # noqa: B008
         "normalise",

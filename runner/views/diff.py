@@ -6,16 +6,11 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import ExitCode
+from runner.views.compare import check_target
 from runner.views.view import AnswerOfRuns, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
-
-
-def _target(text: str) -> object:
-    from runner.analysis.series import parse_target
-
-    return parse_target(text)
 
 
 def diff(
@@ -42,7 +37,7 @@ def diff(
         metavar="METRIC=LEVEL",
         multiple=True,
         max_length=20,
-        check=_target,
+        check=check_target,
     ),
     report: Callable[[str], None] = lambda _: None,
 ) -> AnswerOfRuns:

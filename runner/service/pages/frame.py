@@ -95,7 +95,7 @@ def head_of(run: Run) -> RunHead:
         note=run.note,
         tabs=(
             *(tab for tab in TABS if has_tab.get(tab[0], True)),
-            *((name, view_named(name).title) for name in installed_names()),
+            *((view.name, view.title) for view in map(view_named, installed_names()) if not view.is_of_runs),
         ),
         lacking={
             name: "Q-tables" if not has_tables else "training that the runner can repeat"

@@ -107,6 +107,6 @@ def test_with_a_page_stdout_is_json_alone(command, pictured, tmp_path):
     page = tmp_path / "page.html"
     words = [command, *(str(run.recording) for run in runs), "--html", str(page), "--json"]
     made = CliRunner().invoke(cli, words)
-    assert isinstance(json.loads(made.stdout), dict)
+    assert json.loads(made.stdout)["files"] == [{"path": str(page), "bytes": page.stat().st_size}]
     assert f"{page}: " in made.stderr
     assert page.stat().st_size > 1000

@@ -167,6 +167,9 @@ def test_runs_are_compared_over_environments(recordings, client):
     found = client.get("/api/v1/compare", params=params).json()
     assert set(found["tasks"]) == {"FrozenLake-v1", "FrozenLake8x8-v1"}
     assert [sum(own["seeds"].values()) for own in found["algorithms"]] == [4, 4]
+    unread = client.get("/api/v1/compare", params=params | {"normalise": str(runs[0].recording)})
+    assert unread.status_code == 400  # a text, never the path of a file
+    assert "expected task, random, expert" in unread.json()["error"]["message"]
     part = client.get("/compare/tasks", params={"run": ids, "scores": table})
     assert part.text.count("<svg") == 3
     assert 'data-later="/compare/tasks?' in client.get("/compare", params={"run": ids}).text
