@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -31,6 +32,8 @@ if TYPE_CHECKING:  # imported when something is drawn
 
 _LEAST: Final = {"cut": 14, "wrapped": 10}
 """Characters that a column keeps where it does not fit a terminal."""
+
+_FORCING: Final = frozenset({"FORCE_COLOR", "TTY_COMPATIBLE"})
 
 MAX_DRAWN: Final = 1000
 """Rows drawn in the style of a terminal, which takes a second for every few thousand."""
@@ -180,6 +183,11 @@ def console(stderr: bool = False) -> Console:
     return drawn
 
 
+def _may_be_terminal() -> bool:
+    """Return whether stdout is a terminal, or a variable makes Rich take it for one; Rich is not loaded."""
+    return sys.stdout.isatty() or not _FORCING.isdisjoint(os.environ)
+
+
 def draw(part: Part, is_first: bool = False) -> None:
     """Print a part of a text on stdout, a remark on stderr; facts that come first need no title."""
     if isinstance(part, Remark):
@@ -195,10 +203,10 @@ def draw(part: Part, is_first: bool = False) -> None:
     for sentence in section.said:
         echo(sentence) if "\n" in sentence else _render(sentence)
     for grid in section.tables:
-        if not console().is_terminal or len(grid.rows) > MAX_DRAWN:
-            echo("\n".join(aligned(grid)))
+        if _may_be_terminal() and len(grid.rows) <= MAX_DRAWN and (terminal := console()).is_terminal:
+            _render(grid_table(grid, terminal.width))
         else:
-            _render(grid_table(grid, console().width))
+            echo("\n".join(aligned(grid)))
     _render(*map(patch_text, section.diffs))
 
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runner.archive.places import at_hand
 from runner.cli.command import argument, record
 from runner.cli.options import compared_argument, recordings_option, run_argument
 from runner.cli.output import Reply, say
@@ -97,6 +96,8 @@ def restored(run: Run) -> Run:
     """Return a run, restored into the cache if it is archived."""
     if run.status != "archived":
         return run
+    from runner.archive.places import at_hand
+
     with steps_line(f"restoring {run.run_id}") as report:
         return at_hand(run, say, report)
 
