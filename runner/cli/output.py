@@ -21,7 +21,7 @@ import click
 from runner.analysis.sections import Grid, Section, markdown
 from runner.errors import ExitCode
 from runner.export.places import require_new
-from runner.util.humanize import printable
+from runner.util.humanize import printable, size
 from runner.util.values import finite
 
 if TYPE_CHECKING:  # imported when something is drawn
@@ -141,6 +141,11 @@ def written(text: str, *paths: Path, **more: object) -> Reply:
     All files of a folder are listed; `more` are further keys of the object.
     """
     return Reply({"files": files_written(*paths)} | more, [text])
+
+
+def path_and_size(path: Path) -> str:
+    """Return the path of a file and its size as a text."""
+    return f"{path}  {size(path.stat().st_size)}"
 
 
 def files_written(*paths: Path) -> list[dict[str, object]]:

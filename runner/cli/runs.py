@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from runner.cli.command import argument, record
 from runner.cli.options import compared_argument, recordings_option, run_argument
-from runner.cli.output import Reply, say
+from runner.cli.output import Reply, path_and_size, say
 from runner.cli.parameter_types import RunName
 from runner.cli.progress import progress_line, steps_line
 from runner.errors import ExitCode, RecordingError, RunnerError, RunNotFound
@@ -19,7 +19,7 @@ from runner.runs.resolve import find_run, find_runs
 from runner.runs.run import RECORDING_FILE, RUN_FILE, SHARDS_FOLDER, Run, command_for, recordings_folder
 from runner.runs.shards import are_over, shards_in_words
 from runner.util.compilation import MESSAGE, announced
-from runner.util.humanize import UNKNOWN, duration, size
+from runner.util.humanize import UNKNOWN, duration
 from runner.util.values import Json, JsonView
 
 if TYPE_CHECKING:
@@ -229,7 +229,7 @@ def run_facts(run: Run) -> dict[str, str]:
         "run": f"{run.run_id}  {run.title}, {run.status}",
         "steps": f"{summary['train_steps']:,} of training, {summary['eval_steps']:,} of evaluation{took}",
         "digest": summary.get("content_digest") or UNKNOWN,
-        "file": f"{run.recording}  {size(run.recording.stat().st_size)}",
+        "file": path_and_size(run.recording),
     }
 
 
@@ -252,6 +252,15 @@ def received(run: Run, digest: str, existing: str, **more: object) -> Reply:
     if existing:
         say(f"Run {run.run_id} is there already with {existing}; nothing was written.")
     values = identity(run) | {"already": bool(existing), "content_digest": digest} | more
-    file = f"{run.recording}  {size(run.recording.stat().st_size)}"
     title = f"{run.run_id}  {run.title}, {run.status}"
-    return Reply(values, [{"run": title, "digest": digest, "file": file, "next": command_for(run, "show")}])
+    return Reply(
+        values,
+        [
+            {
+                "run": title,
+                "digest": digest,
+                "file": path_and_size(run.recording),
+                "next": command_for(run, "show"),
+            }
+        ],
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, Final
@@ -11,18 +12,15 @@ from typing import Any, Final
 import click
 
 from runner.cli.command import Command, Declared, argument, option
-from runner.cli.options import (
-    force_option,
-    html_option,
-)
-from runner.cli.output import Reply, files_written, require_page
+from runner.cli.options import force_option, html_option
+from runner.cli.output import Part, Reply, files_written, path_and_size, require_page
 from runner.cli.parameter_types import FILE, INDEX, PATH, ExpressionText, Parsed
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import all_recorded_runs, compilation_notice, recorded_run, two_recorded_runs
 from runner.export.places import new_file, require_new
-from runner.runs.run import command_for
+from runner.runs.run import Run, command_for
 from runner.util.humanize import size
-from runner.views.view import Input, View
+from runner.views.view import Answer, Input, View
 
 _STDOUT: Final = Path("-")
 _SUBJECTS: Final = {"pair": two_recorded_runs, "runs": all_recorded_runs}
@@ -62,17 +60,16 @@ def command_of(view: View) -> Command:
                 return Reply((), [file.getvalue().decode(errors="replace")])
             sys.stdout.buffer.write(file.getvalue())
             return Reply(())
-        data, text, page = answer.as_json(), [*answer.sections()], ""
-        if answer.step_to_look_at is not None:
-            text.append({"next": command_for(subject, "view", "--at", str(answer.step_to_look_at))})
+        data, page = answer.as_json(), ""
         if output is not None:
-            data, length = data | {"files": files_written(output)}, size(output.stat().st_size)
+            data |= {"files": files_written(output)}
             if view.is_of_runs:
-                page = f"{output}: {answer.contents or length}"
+                page = f"{output}: {answer.contents or size(output.stat().st_size)}"
                 notes = [f"Note: {note}." for note in answer.notes]
             else:
-                notes.append(f"{output}  {length}")
-        return Reply(data, text, page=page, notes=notes, exit_code=answer.exit_code if view.is_of_runs else 0)
+                notes.append(path_and_size(output))
+        exit_code = answer.exit_code if view.is_of_runs else 0
+        return Reply(data, _text(subject, answer), page=page, notes=notes, exit_code=exit_code)
 
     declared = {
         "subject": _SUBJECTS.get(view.subject, recorded_run),
@@ -85,6 +82,12 @@ def command_of(view: View) -> Command:
     if view.is_of_runs:
         declared |= {"output": html_option, "force": force_option}
     return Command(view.name, call, declared, help=view.help)
+
+
+def _text(run: Run, answer: Answer) -> Iterator[Part]:
+    yield from answer.sections()
+    if answer.step_to_look_at is not None:
+        yield {"next": command_for(run, "view", "--at", str(answer.step_to_look_at))}
 
 
 def _declared(given: Input, view: View) -> Declared:

@@ -21,13 +21,12 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import Reply, csv_lines, written
+from runner.cli.output import Reply, csv_lines, path_and_size, written
 from runner.cli.parameter_types import PATH
 from runner.cli.progress import stage_line
 from runner.cli.runs import recorded_run
 from runner.export.places import new_file, write_text_new
 from runner.runs.run import Run
-from runner.util.humanize import size
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -66,7 +65,7 @@ def get_command(
     checkpoint.check()
     with new_file(path, force) as temporary:
         shutil.copyfile(checkpoint.path, temporary)
-    text = f"{path}  {size(checkpoint.size)}, {checkpoint.reference}, {checkpoint.format}"
+    text = f"{path_and_size(path)}, {checkpoint.reference}, {checkpoint.format}"
     return written(text, path, **checkpoint.as_json())
 
 
@@ -119,7 +118,7 @@ def values_command(
     }
     if output is not None:
         write_text_new(output, force, "".join(csv_lines(columns, rows)))
-        return written(f"{output}  {size(output.stat().st_size)}, {len(rows):,} steps", output, **about)
+        return written(f"{path_and_size(output)}, {len(rows):,} steps", output, **about)
     shown = [tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows]
     return Reply(about | {"files": []}, [Grid(tuple(columns), shown, left=(), cut=())])
 

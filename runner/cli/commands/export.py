@@ -10,14 +10,14 @@ import click
 from runner.cli.command import Command, CommandGroup, option
 from runner.cli.commands import export_film, export_tables, export_tools
 from runner.cli.options import Writing, selection_options, writing_options
-from runner.cli.output import Reply, say, written
+from runner.cli.output import Reply, path_and_size, say, written
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
 from runner.export.plugin import installed_export
 from runner.export.rerun.viewer import require_rerun
 from runner.runs.run import Run
-from runner.util.humanize import duration, size
+from runner.util.humanize import duration
 from runner.util.plugins import EXPORTS
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class ExportGroup(CommandGroup):
                 stage_line(f"exporting {run.run_id}"),
             ):
                 added.write(recording, temporary)
-            return written(f"{path}  {size(path.stat().st_size)}", path)
+            return written(path_and_size(path), path)
 
         to = writing_options(f"NAME-RUN{added.ending}", f"FILE{added.ending}")
         return Command(name, call, {"run": recorded_run, "to": to}, help=added.help)
@@ -85,7 +85,7 @@ def rerun(
         (selection,) = export([run], selected, path, stage)
     print_selection(selection)
     took = duration(time.monotonic() - started)
-    text = f"{path}  {size(path.stat().st_size)}, {selection.steps:,} steps, in {took}"
+    text = f"{path_and_size(path)}, {selection.steps:,} steps, in {took}"
     return written(text, path, steps=selection.steps, left_out=selection.left_out)
 
 
@@ -123,7 +123,7 @@ def mcap(
         exported = export_mcap(run, path, anonymous, to.force)
     for warning in exported.warnings:
         say(warning)
-    text = f"{path}  {size(path.stat().st_size)}; `dualtaxi import {path}` takes it in"
+    text = f"{path_and_size(path)}; `dualtaxi import {path}` takes it in"
     return written(text, path, anonymous=anonymous)
 
 

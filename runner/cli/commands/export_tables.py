@@ -6,13 +6,12 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import Writing, episodes_option, writing_options
-from runner.cli.output import Reply, say, written
+from runner.cli.output import Reply, path_and_size, say, written
 from runner.cli.progress import count_line
 from runner.cli.runs import open_for_export, recorded_run
 from runner.export.places import new_folder
 from runner.runs.run import Run
 from runner.util.extras import require
-from runner.util.humanize import size
 from runner.util.values import Ranges
 
 _HELP = "Steps, episodes and metrics as tables."
@@ -76,5 +75,5 @@ def _export(form: str, run: Run, phase: str | None, episodes: Ranges | None, gz:
             rows = write_tables(recording, folder, form, phase, episodes or (), gz, report)
         if form == "csv" and (large := left_out(recording)):
             say(f"Left out, as CSV cannot hold bytes: {', '.join(large)}; `export parquet` has them.")
-    lines = [f"{path / name}  {size((path / name).stat().st_size)}, {n:,} rows" for name, n in rows.items()]
+    lines = [f"{path_and_size(path / name)}, {n:,} rows" for name, n in rows.items()]
     return written("\n".join(lines), *(path / name for name in rows), rows=rows)

@@ -15,12 +15,12 @@ from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
 from runner.cli.options import folders_option, force_option, limit_option, require_one, tags_option
-from runner.cli.output import Remark, Reply, csv_lines, json_list
+from runner.cli.output import Remark, Reply, csv_lines, json_list, path_and_size
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
 from runner.util.extras import require
-from runner.util.humanize import counted, size
+from runner.util.humanize import counted
 
 if TYPE_CHECKING:
     from runner.cli.output import Part
@@ -86,7 +86,7 @@ def sql_command(
             if parquet is not None:
                 with new_file(parquet, force) as temporary:
                     count = result.write_parquet(temporary)
-                text = f"{parquet}  {size(parquet.stat().st_size)}, {count:,} rows"
+                text = f"{path_and_size(parquet)}, {count:,} rows"
                 yield Reply(text=[text], notes=_left_out(result))
                 return
             rows, names = result.rows(), result.columns.names
