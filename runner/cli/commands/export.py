@@ -15,7 +15,6 @@ from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
 from runner.export.plugin import installed_export
-from runner.export.rerun.viewer import require_rerun
 from runner.runs.run import Run
 from runner.util.humanize import duration
 from runner.util.plugins import EXPORTS
@@ -75,6 +74,8 @@ def rerun(
       dualtaxi export rerun k3v9m2xq --all --force
       dualtaxi export rerun my-loop --episodes 0..5 --frames
     """
+    from runner.export.rerun.viewer import require_rerun
+
     require_rerun("export rerun")
     from runner.export.rerun.writing import export
 
