@@ -7,7 +7,7 @@ The scalars are those of YAML 1.2's core schema, which editors use too: `1e-3` i
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -15,26 +15,12 @@ import yaml
 
 from runner.config.values import MAX_DEPTH, Path
 from runner.errors import ConfigError, shortened
+from runner.util.yaml_text import INT, SCALARS, TAG
 
 MAX_NODES = 100_000
 """The most values of a text, with its aliases expanded."""
 
 _LONGEST = 60
-_TAG = "tag:yaml.org,2002:"
-_INT = re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$")
-_SCALARS = (
-    ("null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
-    ("bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
-    ("int", _INT, list("-+0123456789")),
-    (
-        "float",
-        re.compile(
-            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
-            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-        ),
-        list("-+.0123456789"),
-    ),
-)
 
 
 class Place(NamedTuple):
@@ -94,21 +80,8 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
-class _Dumper(yaml.SafeDumper):
-    """Quotes what YAML 1.1 or 1.2 would not read as text."""
-
-    def ignore_aliases(self, data: object) -> bool:  # noqa: ARG002 - PyYAML's signature
-        return True
-
-
-def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    return dumper.represent_scalar(_TAG + "str", text, style=None if text.isprintable() else '"')
-
-
-_Dumper.add_representer(str, _represent_text)
-for _name, _pattern, _first in _SCALARS:
-    _Loader.add_implicit_resolver(_TAG + _name, _pattern, _first)
-    _Dumper.add_implicit_resolver(_TAG + _name, _pattern, _first)
+for _name, _pattern, _first in SCALARS:
+    _Loader.add_implicit_resolver(TAG + _name, _pattern, _first)
 
 
 def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
@@ -131,15 +104,6 @@ def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
     return Document(value, builder.places, builder.problems)
 
 
-def write_yaml(value: Mapping[str, object], is_compact: bool = False) -> str:
-    """Return `value` as YAML, from which `read_yaml` returns an equal value; compact with `{a: 1, b: 2}`."""
-    style = None if is_compact else False
-    text: str = yaml.dump(
-        value, Dumper=_Dumper, sort_keys=False, default_flow_style=style, allow_unicode=True, width=110
-    )
-    return text
-
-
 class _Builder:
     """Turns nodes into plain values, and keeps the place of each."""
 
@@ -158,7 +122,7 @@ class _Builder:
             )
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
         self.places.setdefault(tuple(map(str, path)), self._place(node))
-        tag_name = node.tag.removeprefix(_TAG)
+        tag_name = node.tag.removeprefix(TAG)
         if isinstance(node, yaml.MappingNode) and tag_name == "map":
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode) and tag_name == "seq":
@@ -191,7 +155,7 @@ class _Builder:
             message = "found a list or mapping for a key, expected text"
         elif node.value == "<<" and node.style is None:
             message = "found the merge key <<, expected the keys themselves"
-        elif node.tag != _TAG + "str":
+        elif node.tag != TAG + "str":
             message = f"found the key {_shown(node.value)}, expected text: quote it"
         else:
             return str(node.value)
@@ -218,7 +182,7 @@ def _shown(text: str) -> str:
 
 
 def _whole_number(text: str) -> int:
-    if not _INT.match(text):
+    if not INT.match(text):
         raise ValueError(text)
     return int(text, 0) if text.startswith(("0o", "0x")) else int(text)
 

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Final, Literal, Self, get_args
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from runner.config.document import write_yaml
 from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
     Algorithm,
@@ -32,6 +31,7 @@ from runner.config.sections import (
 )
 from runner.config.values import ConfigSection, Optional, refusal
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json
+from runner.util.yaml_text import write_yaml
 
 Mode = Literal["cooperative", "competitive"]
 Tables = Literal["joint", "per_agent"]

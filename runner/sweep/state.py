@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from runner.config.document import read_yaml, write_yaml
+from runner.config.document import read_yaml
 from runner.config.job import identity_of
 from runner.config.loading import read_text
 from runner.errors import ConfigError, RunnerError, nearest
@@ -25,6 +25,7 @@ from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
 from runner.util.files import read_object, replacing, storage_errors, write_object
 from runner.util.values import JsonView, flatten
+from runner.util.yaml_text import write_yaml
 
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20

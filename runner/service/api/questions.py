@@ -8,7 +8,6 @@ from fastapi import APIRouter, Request, Response
 from starlette.concurrency import run_in_threadpool
 
 from runner.client.jobs import JobStatus
-from runner.config.document import write_yaml
 from runner.runs.run import Run
 from runner.service.api.jobs import created
 from runner.service.dependencies import JobsOf, RecordedRun, require_written
@@ -16,6 +15,7 @@ from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.explanations import ExplainQuestion, check_explanation
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob, QueuedJob
+from runner.util.yaml_text import write_yaml
 
 router = APIRouter(tags=["jobs"])
 

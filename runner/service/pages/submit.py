@@ -13,7 +13,6 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel
 from starlette.concurrency import run_in_threadpool
 
-from runner.config.document import write_yaml
 from runner.config.schema import branches, expected, json_schema, without_references
 from runner.errors import RunnerError
 from runner.service.api.jobs import Workers
@@ -25,6 +24,7 @@ from runner.service.pages.rendering import Form, Page, to_job, viewer_of
 from runner.service.problems import error_body, filled
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
+from runner.util.yaml_text import write_yaml
 
 router = APIRouter(prefix="/submit", include_in_schema=False)
 TEMPLATE: Final = "submit.html"
