@@ -12,7 +12,7 @@ import functools
 import os
 import sys
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from types import FrameType, MethodType
 from typing import Any, Final, Protocol
 
@@ -67,28 +67,12 @@ class WatchedEnvironment:
 
     def __init__(self, env: object, recorded: Recorded) -> None:
         self._env = env
-        self._recorded: Any = recorded
+        self.recorded: Any = recorded
         self.is_inside = False
         """Whether the twin is calling the environment."""
         _watched[id(env)] = self
         for name, method in _METHODS.items():
             object.__setattr__(env, name, MethodType(method, env))
-
-    def call(
-        self,
-        name: str,
-        original: Callable[..., object],
-        arguments: Sequence[object],
-        named: Mapping[str, object],
-    ) -> object:
-        """Call `step` or `reset` of the twin, or the original one if the twin is calling."""
-        if self.is_inside:
-            return original(*arguments, **named)
-        self.is_inside = True
-        try:
-            return getattr(self._recorded, name)(*arguments, **named)
-        finally:
-            self.is_inside = False
 
     def release(self) -> None:
         """Record nothing more."""
@@ -110,30 +94,20 @@ def _own(name: str) -> Callable[..., object]:
     """Return the `step` or `reset` of a recorded environment; a copy is not recorded."""
 
     def call(env: Any, *arguments: object, **named: object) -> object:
-        original = MethodType(getattr(type(env), name), env)
         watched = _watched.get(id(env))
-        if watched is None:
-            return original(*arguments, **named)
-        return watched.call(name, original, arguments, named)
+        if watched is None or watched.is_inside:
+            return getattr(type(env), name)(env, *arguments, **named)
+        watched.is_inside = True
+        try:
+            return getattr(watched.recorded, name)(*arguments, **named)
+        finally:
+            watched.is_inside = False
 
     call.__name__ = name  # pickle finds the method of an unpickled environment by it
     return call
 
 
 _METHODS: Final = {"step": _own("step"), "reset": _own("reset")}
-
-
-def _reset(
-    env: object, original: Callable[..., object], arguments: Sequence[object], named: Mapping[str, object]
-) -> object:
-    """Reset an environment; begin to record it if a run waits for one."""
-    if id(env) in _watched or any(watched.is_inside for watched in _watched.values()):
-        return original(env, *arguments, **named)
-    _find_run(env)
-    watched = _watched.get(id(env))
-    if watched is None:
-        return original(env, *arguments, **named)
-    return watched.call("reset", MethodType(original, env), arguments, named)
 
 
 def _find_run(env: object) -> None:
@@ -203,8 +177,12 @@ def _hook(cls: Any) -> None:
     original = vars(owner)["reset"]
 
     @functools.wraps(original)
-    def reset(self: object, *arguments: object, **named: object) -> object:
-        return _reset(self, original, arguments, named)
+    def reset(self: Any, *arguments: object, **named: object) -> object:
+        if id(self) not in _watched and not any(watched.is_inside for watched in _watched.values()):
+            _find_run(self)
+            if id(self) in _watched:
+                return self.reset(*arguments, **named)
+        return original(self, *arguments, **named)
 
     _hooked[cls] = reset, owner is cls
     cls.reset = reset
