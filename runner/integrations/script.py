@@ -30,7 +30,7 @@ from runner.loops.flushing import open_loops
 from runner.loops.loop import Loop
 from runner.loops.media import Picture
 from runner.loops.options import CallbackOptions
-from runner.loops.recorded import ending_of
+from runner.loops.recorded import Recorded, ending_of
 from runner.loops.values import arrays_of, warn_user
 from runner.loops.vector import record_vector
 from runner.recording.labels import MAX_NOTE, is_tag
@@ -395,6 +395,7 @@ class ScriptRun:
         open_runs.remove(self)
         update_hooks()
         atexit.unregister(self._close_at_exit)
+        _end_recordings()
 
     def _close_at_exit(self) -> None:
         self.close(*ending_of(getattr(sys, "last_value", None)))
@@ -402,6 +403,21 @@ class ScriptRun:
     def disown(self) -> None:
         """Leave the run to the process that this one was just forked from."""
         self._is_foreign = True
+
+
+_to_end: list[Recorded] = []
+"""What records environments that are closed, and takes values until the runs of scripts are closed too."""
+
+
+def end_with_scripts(recorded: Recorded) -> None:
+    """End the recording of a closed environment, once no run of a script may log into it any more."""
+    _to_end.append(recorded)
+    _end_recordings()
+
+
+def _end_recordings() -> None:
+    while _to_end and not open_runs:
+        _to_end.pop(0)._loop.close()  # processes of a run before the run
 
 
 def _elapsed_steps(env: Any) -> int:

@@ -8,7 +8,6 @@ logger = runner.integrations.torchrl.Logger("ppo")
 from __future__ import annotations
 
 import os
-import weakref
 from collections.abc import Iterator
 from functools import partial
 from typing import Any, Final, Unpack
@@ -17,17 +16,15 @@ from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError
 from runner.integrations.libraries import require_tested
-from runner.integrations.script import ScriptRun
+from runner.integrations.script import ScriptRun, end_with_scripts
 from runner.integrations.shapes import logs
 from runner.integrations.tensorboard import SummaryWriter, log_text
 from runner.integrations.workers import Workers
 from runner.loops.batches import RecordedBatches, record_batches
 from runner.loops.env import record as record_env
-from runner.loops.loop import Loop
 from runner.loops.media import film_of, histogram_of
 from runner.loops.options import RunOptions
 from runner.loops.recorded import Recorded
-from runner.loops.values import as_array
 from runner.loops.vector import record_vector
 from runner.util.jsonable import as_mapping
 
@@ -61,30 +58,30 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
         EnvironmentNotUsable: a space cannot be recorded.
         StorageError: the recordings folder cannot be written.
     """
-    wrapper = _wrapper_in(env)
+    wrapper = _without_transforms(env)
+    if not isinstance(wrapper, GymWrapper):
+        raise ConfigError(
+            f"found {type(wrapper).__name__}, expected GymEnv or GymWrapper. Steps of other environments are "
+            "recorded where they are collected: for data in runner.integrations.torchrl.recorded(collector)"
+        )
     if isinstance(wrapper._env, Recorded):
         raise ConfigError("found an environment that is recorded already, expected one that is not")
     recorder: Any = record_vector if isinstance(wrapper._env, VectorEnv) else record_env
-    made = recorder(wrapper._env, recordings, **options)
-    wrapper._env = made
-    made.close = partial(_close, made)
+    wrapper._env = recorder(wrapper._env, recordings, **options)
+    wrapper._env.close = partial(_close, wrapper._env)
     return env
 
 
-def _wrapper_in(env: Any) -> GymWrapper:
-    """Return what wraps the Gymnasium environment inside of TorchRL's.
-
-    Raises:
-        ConfigError: it has none.
-    """
-    while not isinstance(env, GymWrapper) and hasattr(env, "base_env"):
+def _without_transforms(env: Any) -> Any:
+    while isinstance(env, TransformedEnv):
         env = env.base_env
-    if not isinstance(env, GymWrapper):
-        raise ConfigError(
-            f"found {type(env).__name__}, expected GymEnv or GymWrapper. Steps of other environments are "
-            "recorded where they are collected: for data in runner.integrations.torchrl.recorded(collector)"
-        )
     return env
+
+
+def _close(recorded: Recorded, **arguments: object) -> None:
+    """Close an environment: a collector does it before it yields the last batch, whose losses follow."""
+    recorded.env.close(**arguments)
+    end_with_scripts(recorded)
 
 
 class Recording(Workers):
@@ -99,26 +96,7 @@ class Recording(Workers):
     @staticmethod
     def inside(env: Any) -> Recorded:
         """Return the recorded environment inside of TorchRL's."""
-        return _wrapper_in(env)._env  # type: ignore[no-any-return]
-
-
-_loggers: weakref.WeakSet[object] = weakref.WeakSet()
-"""The loggers that are not closed."""
-_to_close: list[Loop] = []
-"""The recordings of closed environments, which end with the logger."""
-
-
-def _close(made: Recorded, **arguments: object) -> None:
-    """Close an environment, and the recording if no logger needs it any more.
-
-    A collector closes its environment before it yields the last batch, whose losses are logged after that.
-    """
-    made.env.close(**arguments)
-    if _loggers:
-        _to_close.append(made._loop)
-        weakref.finalize(made, made._loop.close)
-    else:
-        made._loop.close()
+        return _without_transforms(env)._env  # type: ignore[no-any-return]
 
 
 def recorded(
@@ -181,24 +159,20 @@ def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, env: Any) -> No
     number = env.batch_size.numel()
     data = data.reshape(number, -1).transpose(0, 1)
     after, done = data["next"], data["next", "done"]
-    rewards, actions = after["reward"], as_array(data[env.action_key])
-    if rewards.shape[2:] != (1,):
-        raise ConfigError(
-            f"found rewards of shape {tuple(rewards.shape[2:])}, expected one for each environment"
-        )
     keys = list(env.observation_spec.keys(include_nested=True, leaves_only=True))
     finals = after.select(*keys)
     last = finals[-1:]
     if carrier is not None:  # its observations are those after a reset, if the episode ended
         last = last.update(carrier.select(*keys, strict=False).reshape(1, number))
+    actions = data[env.action_key]
     if isinstance(env.action_spec_unbatched, OneHot):
-        actions = actions.argmax(-1)
+        actions = actions.long().argmax(-1)
     terminated = after.get("terminated", done)
     truncated = after.get("truncated", done & ~terminated)
     rec.batch(
         _by_name(torch.cat([data.select(*keys), last])),
         actions,
-        rewards[..., 0],
+        after["reward"].squeeze(-1),
         terminated[..., 0],
         truncated[..., 0],
         final_observations=_by_name(finals),
@@ -213,15 +187,11 @@ def _by_name(observations: Any) -> object:
 
 def _name_of(env: object) -> str:
     """Return the name of an environment, or of the first of several, without transforms."""
-    while True:  # a `SerialEnv` looks up what it does not have in its environments, `base_env` too
-        if isinstance(env, TransformedEnv):
-            env = env.base_env
-        elif inside := vars(env).get("_envs"):
-            env = inside[0]
-        else:
-            break
-    name = getattr(env, "env_name", None)
-    return name if isinstance(name, str) and name else type(env).__name__
+    inside = _without_transforms(env)
+    while several := vars(inside).get("_envs"):
+        inside = _without_transforms(several[0])
+    name = getattr(inside, "env_name", None)
+    return name if isinstance(name, str) and name else type(inside).__name__
 
 
 class Logger(_Logger):  # type: ignore[misc]
@@ -236,8 +206,7 @@ class Logger(_Logger):  # type: ignore[misc]
     """
 
     def __init__(self, exp_name: str, log_dir: str | os.PathLike[str] | None = None) -> None:
-        super().__init__(exp_name=exp_name, log_dir=log_dir)
-        _loggers.add(self)
+        super().__init__(exp_name, log_dir)
 
     def _create_experiment(self) -> SummaryWriter:
         writer = SummaryWriter(recordings=self.log_dir)
@@ -256,13 +225,6 @@ class Logger(_Logger):  # type: ignore[misc]
     def log_hparams(self, cfg: object) -> None:
         """Record settings."""
         self.experiment.add_hparams(as_mapping(cfg) or {"config": str(cfg)}, {})
-
-    def shutdown(self, timeout: float | None = None) -> None:
-        """Close the logger, and the recordings of environments that are closed."""
-        super().shutdown(timeout)
-        _loggers.discard(self)
-        while _to_close:
-            _to_close.pop(0).close()  # processes of a run before the run
 
     def __repr__(self) -> str:
         return f"Logger({self.exp_name!r})"
