@@ -5,15 +5,16 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, Unpack
 
 import numpy as np
 
 from runner.errors import ConfigError
-from runner.loops.options import CallbackOptions, options_of
+from runner.loops.makers import checked_make
+from runner.loops.options import Arguments, CallbackOptions, options_of, settings_in
 from runner.loops.values import warn_user
 from runner.util.extras import require
-from runner.util.values import is_whole
+from runner.util.values import Json, is_whole
 
 _MAX_TEXT: Final = 1_000
 _MAX_DEPTH: Final = 10
@@ -46,18 +47,36 @@ def _numbers(version: str) -> tuple[int, ...]:
     return tuple(map(int, re.findall(r"\d+", re.match(r"[\d.]*", version)[0])))  # type: ignore[index]
 
 
-def check_callback(
-    recordings: str | os.PathLike[str] | None, checkpoint_every: int, options: CallbackOptions
-) -> None:
-    """Check the arguments of a callback before the library calls it.
+class Callback:
+    """The arguments of a `Recording` that a library calls back, checked before it does.
+
+    A class of an adapter derives from this first, and from the library's class of callbacks.
 
     Raises:
-        ConfigError: one cannot be used.
+        ConfigError: an argument cannot be used.
         MissingExtra: frames need Pillow, which is not installed.
     """
-    options_of(recordings, options, valid=CallbackOptions.__annotations__)
-    if not is_whole(checkpoint_every, 0, 2**62):
-        raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
+
+    def __init__(
+        self,
+        recordings: str | os.PathLike[str] | None = None,
+        *,
+        checkpoint_every: int = 0,
+        **options: Unpack[CallbackOptions],
+    ) -> None:
+        super().__init__()
+        options_of(recordings, options, valid=CallbackOptions.__annotations__)
+        if not is_whole(checkpoint_every, 0, 2**62):
+            raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
+        self._recordings, self._checkpoint_every = recordings, checkpoint_every
+        self._options: Arguments = {name: value for name, value in options.items() if value is not None}
+        if make := checked_make(options.get("make")):
+            self._options["make"] = make
+
+    def _arguments(self, settings: Json, seed: int | None) -> Arguments:
+        """Return the arguments of `runner.record`: those given, and what the library knows."""
+        config = {**settings, **settings_in(self._options.get("config"))}
+        return {"seed": seed} | self._options | {"config": config}
 
 
 def as_setting(value: object, depth: int = 0) -> object:

@@ -6,6 +6,7 @@ a shard of that run; they are put together when the algorithm is stopped.
 
 from __future__ import annotations
 
+import copy
 import inspect
 import os
 import re
@@ -19,12 +20,12 @@ import numpy as np
 
 from runner.environments.games import MultiAgent
 from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
-from runner.integrations.libraries import as_setting, check_callback, require_tested
+from runner.integrations.libraries import Callback, as_setting, require_tested
 from runner.integrations.shapes import as_run_name
 from runner.loops.description import Described
 from runner.loops.loop import Loop
-from runner.loops.makers import checked_make, game_maker_of, vector_maker_of
-from runner.loops.options import CallbackOptions, options_of, settings_in
+from runner.loops.makers import game_maker_of, vector_maker_of
+from runner.loops.options import CallbackOptions, options_of
 from runner.loops.parallel import described_game, record_parallel
 from runner.loops.recorded import Recorded
 from runner.loops.values import warn_user
@@ -53,7 +54,7 @@ _OF_THE_RUN: Final = ("name", "seed", "config")
 _STEPS: Final = "num_env_steps_sampled_lifetime"
 
 
-class Recording:
+class Recording(Callback, RLlibCallback):  # type: ignore[misc]
     """Records what the env runners of an algorithm do, and the results of its iterations.
 
         config = PPOConfig().environment("CartPole-v1").callbacks(runner.integrations.rllib.Recording())
@@ -75,6 +76,9 @@ class Recording:
         ConfigError: an argument cannot be used.
     """
 
+    _run: _Run | None = None
+    _iterations = 0
+
     def __init__(
         self,
         recordings: str | os.PathLike[str] | None = None,
@@ -82,37 +86,13 @@ class Recording:
         checkpoint_every: int = 0,
         **options: Unpack[CallbackOptions],
     ) -> None:
-        check_callback(recordings, checkpoint_every, options)
-        self.name, self.seed, self.config = (options.get(name) for name in _OF_THE_RUN)
-        self.options = {name: value for name, value in options.items() if name not in _OF_THE_RUN}
-        self.make = checked_make(self.options.get("make"))
-        folder = recordings if recordings is None else os.fspath(recordings)
-        self.recordings = folder if folder is None or "://" in folder else os.path.abspath(folder)  # noqa: PTH100
-        """Ray runs some of the processes in folders of its own."""
-        self.checkpoint_every = checkpoint_every
+        if recordings is not None and "://" not in os.fspath(recordings):
+            recordings = os.path.abspath(recordings)  # noqa: PTH100 - Ray runs processes in other folders
+        super().__init__(recordings, checkpoint_every=checkpoint_every, **options)
 
-    def __call__(self) -> RLlibCallback:
-        """Return the callbacks; called by RLlib, once in each process."""
-        return _Callbacks(self)
-
-
-class _Run(Recorded):
-    """The run of an algorithm, whose process takes no steps."""
-
-    def __init__(self, loop: Loop) -> None:
-        self.env = SimpleNamespace(close=lambda **_: None)
-        self._record_into(loop)
-        self._enter("train")
-
-
-class _Callbacks(RLlibCallback):  # type: ignore[misc]
-    """What RLlib calls, in the process of the algorithm and in the processes of env runners."""
-
-    def __init__(self, recording: Recording) -> None:
-        super().__init__()
-        self._recording = recording
-        self._run: _Run | None = None
-        self._iterations = 0
+    def __call__(self) -> Recording:
+        """Return the callbacks of an algorithm; called by RLlib, once in each process."""
+        return copy.copy(self)
 
     # --- in the process of the algorithm --------------------------------------------------------------
 
@@ -146,8 +126,8 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         Raises:
             EnvironmentNotUsable: they cannot be recorded.
         """
-        recording, config = self._recording, algorithm.config
-        describe = partial(_described, recording.make)
+        config = algorithm.config
+        describe = partial(_described, self._options.get("make", ""))
         described_by = next(filter(None, algorithm.env_runner_group.foreach_env_runner(describe)), None)
         if described_by is None:
             raise EnvironmentNotUsable(
@@ -159,17 +139,9 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
             name = re.sub(r"_[\d-]{10}_[\d-]{8}$", "", trial)  # RLlib keeps no other name of a trial
         settings = {key: as_setting(value) for key, value in config.to_dict().items() if key != "callbacks"}
         options = options_of(
-            recording.recordings,
-            {
-                **recording.options,
-                "name": recording.name or as_run_name(name),
-                "seed": config.seed if recording.seed is None else recording.seed,
-                "config": {
-                    "algorithm": type(algorithm).__name__,
-                    **settings,
-                    **settings_in(recording.config),
-                },
-            },
+            self._recordings,
+            {"name": as_run_name(name)}
+            | self._arguments({"algorithm": type(algorithm).__name__, **settings}, config.seed),
             valid=CallbackOptions.__annotations__,
         )
         return _Run(Loop(described, options, maker))
@@ -177,7 +149,8 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
     def _join(self, run: _Run, group: Any, is_evaluation: bool, **runners: object) -> str:
         """Have env runners record their environments; return why one of them cannot."""
         phase = "eval" if is_evaluation else "train"
-        join = partial(_why_not_joined, {"join": run.run, "phase": phase, **self._recording.options})
+        shared = {name: value for name, value in self._options.items() if name not in _OF_THE_RUN}
+        join = partial(_why_not_joined, {"join": run.run, "phase": phase, **shared})
         return next(filter(None, group.foreach_env_runner(join, **runners)), "")
 
     def on_env_runners_recreated(
@@ -204,7 +177,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         self._run.at_step(int(steps))
         self._run.log(_numbers({key: result[key] for key in _RESULTS if key in result}))
         self._iterations += 1
-        every = self._recording.checkpoint_every
+        every = self._checkpoint_every
         if every and self._iterations % every == 0:
             _checkpoint(self._run, algorithm)
 
@@ -213,7 +186,7 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         run, self._run = self._run, None
         if run is None:
             return
-        every = self._recording.checkpoint_every
+        every = self._checkpoint_every
         try:
             if every and self._iterations % every:
                 _checkpoint(run, algorithm)
@@ -232,6 +205,15 @@ class _Callbacks(RLlibCallback):  # type: ignore[misc]
         """Record environments that an env runner made again."""
         if (join := getattr(env_runner, "_recorded_join", None)) is not None:
             _join(join, env_runner)
+
+
+class _Run(Recorded):
+    """The run of an algorithm, whose process takes no steps."""
+
+    def __init__(self, loop: Loop) -> None:
+        self.env = SimpleNamespace(close=lambda **_: None)
+        self._record_into(loop)
+        self._enter("train")
 
 
 def _checkpoint(run: _Run, algorithm: Algorithm) -> None:

@@ -9,15 +9,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import inspect
-import os
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, Protocol, Self, Unpack
+from typing import Any, Final, Protocol, Self
 
 import numpy as np
 
 from runner.errors import ConfigError, EnvironmentNotUsable, RunnerError
-from runner.integrations.libraries import as_setting, check_callback, require_tested
-from runner.loops.options import CallbackOptions, settings_in
+from runner.integrations.libraries import Callback, as_setting, require_tested
 from runner.loops.recorded import ending_of
 from runner.loops.values import warn_user
 from runner.loops.vector import RecordedVector
@@ -37,7 +35,7 @@ _CLOCKS: Final = ("time/fps", "time/time_elapsed")
 _NOT_SETTINGS: Final = ("self", "env", "verbose", "tensorboard_log", "_init_setup_model", "logger")
 
 
-class Recording(BaseCallback):  # type: ignore[misc]
+class Recording(Callback, BaseCallback):  # type: ignore[misc]
     """A callback that records what a model learns from, and what it logs.
 
         model = PPO("MlpPolicy", "CartPole-v1", seed=0)
@@ -62,24 +60,12 @@ class Recording(BaseCallback):  # type: ignore[misc]
         ConfigError: an argument cannot be used.
     """
 
-    def __init__(
-        self,
-        recordings: str | os.PathLike[str] | None = None,
-        *,
-        checkpoint_every: int = 0,
-        **options: Unpack[CallbackOptions],
-    ) -> None:
-        super().__init__()
-        check_callback(recordings, checkpoint_every, options)
-        self._options = {name: value for name, value in options.items() if value is not None}
-        self._recordings, self._checkpoint_every = recordings, checkpoint_every
-        self._envs: RecordedVecEnv | None = None
-        self._is_own = False
-        """Whether this callback recorded the environments, and not `runner.record` before it."""
-        self._evaluations: list[RecordedVecEnv] = []
-        """The environments of `EvalCallback`s, recorded into the run too."""
-        self._stays_open = False
-        self._next_checkpoint = 0
+    _envs: RecordedVecEnv | None = None
+    _is_own = False
+    """Whether this callback recorded the environments, and not `runner.record` before it."""
+    _stays_open = False
+    _evaluations: tuple[RecordedVecEnv, ...] = ()
+    """The environments of `EvalCallback`s, recorded into the run too."""
 
     @property
     def recorded(self) -> RecordedVector:
@@ -107,8 +93,9 @@ class Recording(BaseCallback):  # type: ignore[misc]
 
     def _end(self, error: BaseException | None = None) -> None:
         """End the run, unless `runner.record` began it."""
-        while self._evaluations:
-            self._evaluations.pop().end(*ending_of(error))
+        evaluations, self._evaluations = self._evaluations, ()
+        for envs in evaluations:
+            envs.end(*ending_of(error))
         if self._is_own and self._envs is not None:
             self._envs.end(*ending_of(error))
 
@@ -139,10 +126,8 @@ class Recording(BaseCallback):  # type: ignore[misc]
                 return
             earlier.end("interrupted")  # an error ended the `learn` before
         observations = _observations_in_progress(model, base) if is_continued else None
-        options: dict[str, Any] = {"recordings": self._recordings, **self._options}
-        options.setdefault("seed", model.seed)
-        options["config"] = {**settings_of(model), **settings_in(options.get("config"))}
-        self._envs = RecordedVecEnv(base, options)
+        arguments = self._arguments(settings_of(model), model.seed)
+        self._envs = RecordedVecEnv(base, {"recordings": self._recordings} | arguments)
         self._is_own = True
         self._envs.replace_methods()
         if is_continued:
@@ -208,7 +193,7 @@ class Recording(BaseCallback):  # type: ignore[misc]
             return
         evaluated.training_steps = lambda: self.recorded._rows.progress[0]
         evaluated.replace_methods()
-        self._evaluations.append(evaluated)
+        self._evaluations += (evaluated,)
 
     def _checkpoint(self) -> None:
         self.recorded.checkpoint("policy", self.model.policy.state_dict())
@@ -251,10 +236,8 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
     def log(self, key_values: Mapping[str, Any]) -> None:
         """Record numbers and texts by name; figures, pictures, films and histograms are left out."""
         for name, value in key_values.items():
-            is_number = isinstance(value, int | float | np.number) or (
-                hasattr(value, "item") and np.size(value) == 1
-            )
-            if (is_number or isinstance(value, str)) and name not in _CLOCKS:
+            is_array_of_one = hasattr(value, "item") and np.size(value) == 1
+            if (is_array_of_one or isinstance(value, int | float | str)) and name not in _CLOCKS:
                 self._recorded.log(name, value)
 
     def close(self) -> None:
