@@ -28,10 +28,10 @@ from runner.integrations.values import ValueRows, begin_values
 from runner.loops.env import record
 from runner.loops.flushing import open_loops
 from runner.loops.loop import Loop
-from runner.loops.media import Picture
+from runner.loops.media import Media
 from runner.loops.options import CallbackOptions
 from runner.loops.recorded import Recorded, ending_of
-from runner.loops.values import arrays_of, warn_user
+from runner.loops.values import warn_user
 from runner.loops.vector import record_vector
 from runner.recording.labels import MAX_NOTE, is_tag
 from runner.runs.run import Run, label, new_run_id, recordings_folder
@@ -103,7 +103,7 @@ class ScriptRun:
         self.run_id = self._new_run_id()
         self.calls: int | None = None
         """The number of calls so far, where the script's tracker counts them; None where it does not."""
-        self._waiting: list[tuple[str, str, object, int | None, int | None]] = []
+        self._waiting: list[tuple[str, object, int | None, int | None]] = []
         self._since, self._waiting_bytes = 0.0, 0
         self._loop: Loop | None = None
         self._is_own = False
@@ -126,22 +126,13 @@ class ScriptRun:
     # --- what is logged -----------------------------------------------------------------------------------
 
     def log(self, name: str, value: object, step: object = None) -> None:
-        """Log a number or a text, with the script's own step."""
-        self._do("log", name, value, step)
+        """Log a number, a text or a `Media`, with the script's own step.
 
-    def snapshot(self, name: str, array: object, step: object = None) -> None:
-        """Record an array of numbers, or each of a mapping of arrays."""
-        for full_name, values in arrays_of(name, array):
-            self._waiting_bytes += values.nbytes
-            self._do("snapshot", full_name, values.copy() if self._loop is None else values, step)
-
-    def picture(self, name: str, picture: Picture, step: object = None) -> None:
-        """Record a picture or a film under a name."""
-        self._waiting_bytes += picture.frames.nbytes
-        self._do("picture", name, picture, step)
-
-    def _do(self, method: str, name: str, value: object, step: object) -> None:
-        """Call a method of the recording's `Messages`, now or when there is a recording."""
+        Raises:
+            ConfigError: the name, or the content of the `Media`, cannot be recorded.
+        """
+        if isinstance(value, Media):
+            self._waiting_bytes += value.nbytes
         if (self.closed or self._is_foreign or name not in self._names) and self._refuses(name):
             return
         whole = step if step.__class__ is int and 0 <= step < _MAX_STEP else self.step_of(step)
@@ -155,9 +146,9 @@ class ScriptRun:
             self._leave_loop()
             loop = None
         if loop is not None:
-            self._record(loop, method, name, value, whole, call)
+            self._record(loop, name, value, whole, call)
             return
-        self._waiting.append((method, name, value, whole, call))
+        self._waiting.append((name, value, whole, call))
         self._since = self._since or time.monotonic()
         has_room = len(self._waiting) < _MAX_WAITING and self._waiting_bytes < _MAX_WAITING_BYTES
         is_early = has_room and time.monotonic() - self._since < _WAITING_SECONDS
@@ -209,9 +200,7 @@ class ScriptRun:
             self.warn_once(f"run {before} has ended: further values go into run {self.run_id}.")
         update_hooks()
 
-    def _record(
-        self, loop: Loop, method: str, name: str, value: Any, step: int | None, call: int | None
-    ) -> None:
+    def _record(self, loop: Loop, name: str, value: object, step: int | None, call: int | None) -> None:
         """Record a value in the recording, at the script's own step, or its number where it gave none."""
         try:
             if self._values is not None:
@@ -219,17 +208,14 @@ class ScriptRun:
             elif step is not None and step != self._step:
                 self._step = step
                 loop.messages.log(loop.active_phase, STEP_NAME, step)
-            if method == "picture":
-                loop.messages.picture(name, value)
-            else:
-                getattr(loop.messages, method)(loop.active_phase, name, value)
+            loop.messages.log(loop.active_phase, name, value)
         except ConfigError as error:
-            self.leave_out(error, method)
+            self.leave_out(error, type(value).__name__)
         except Exception as error:
             loop.fail(error)
 
     def leave_out(self, error: Exception, about: str, what: str = "a value") -> None:
-        """Warn of what cannot be recorded, once for each method that it is about; or raise the error.
+        """Warn of what cannot be recorded, once for each kind that it is about; or raise the error.
 
         It is called where the error is handled.
         """

@@ -14,6 +14,7 @@ import numpy as np
 
 from runner.errors import ConfigError
 from runner.integrations.script import ScriptRun
+from runner.loops.media import Media
 from runner.loops.recorded import ending_of
 from runner.loops.values import as_array, warn_user
 
@@ -58,16 +59,13 @@ def forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def logs(
-    log: Callable[..., None], convert: Callable[..., object], arguments: str, **layout: object
-) -> Callable[..., None]:
-    """Return a method of a tracker that logs a value, and leaves out what cannot be recorded.
+def logs(convert: Callable[..., object], arguments: str, **layout: object) -> Callable[..., None]:
+    """Return a method of a tracker that logs a picture, film or array, and leaves out what is none.
 
-        add_video = logs(ScriptRun.picture, film_of, "tag vid_tensor global_step fps", dataformats="NTCHW")
+        add_video = logs(film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
 
     Args:
-        log: a method of `ScriptRun`, or what takes the same arguments.
-        convert: returns what `log` takes for the script's value, and for the layout by name.
+        convert: returns the content of a `Media` for the script's value, and for the layout by name.
         arguments: what the tracker calls the name, the value, the step and further arguments, in its order.
         layout: the arguments that say how to read the value, with their defaults; others are ignored.
     """
@@ -77,7 +75,7 @@ def logs(
         by_name = dict(zip(names, given, strict=False)) | named
         name, value, step = map(by_name.get, names[:3])
         chosen = {key: by_name.get(key, default) for key, default in layout.items()}
-        log(self.script, name, convert(value, **chosen), step)
+        self.script.log(name, Media(convert, value, **chosen), step)
 
     method.__name__, method.__doc__ = arguments, f"Log a value; takes {', '.join(names)}."
     return forgiving(method)

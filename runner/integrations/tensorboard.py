@@ -24,20 +24,13 @@ from typing import Any, Final
 from runner.integrations.hooks import open_runs
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import Tracker, as_number, as_run_name, forgiving, logs
-from runner.loops.media import film_of, histogram_of, picture_of
+from runner.loops.media import Media, array_of, film_of, histogram_of, picture_of
 from runner.runs.run import Run
 
 _HYPERPARAMETERS: Final = re.compile(r"\|param\|value\|\n\|-\|-\|\n", re.ASCII)
 """How the tables begin in which CleanRL's scripts write their settings."""
 _WRITERS: Final = ("torch.utils.tensorboard.writer", "tensorboardX.writer")
 """The modules of the writers from which `forward` takes values."""
-
-
-def log_text(script: ScriptRun, name: str, text: str, step: object) -> None:
-    """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
-    if script.is_waiting and (match := _HYPERPARAMETERS.search(text)):
-        script.settings = _settings(text[match.end() :]) | script.settings
-    script.log(name, text, step)
 
 
 def _settings(table: str) -> dict[str, object]:
@@ -132,16 +125,21 @@ class SummaryWriter(Tracker):
         except Exception as error:  # as `logs` does, which would double the time
             self.script.leave_out(error, "add_scalar")
 
-    add_text = logs(log_text, str, "tag text_string global_step")
-    add_histogram = logs(ScriptRun.snapshot, histogram_of, "tag values global_step")
-    add_tensor = logs(ScriptRun.snapshot, lambda tensor: tensor, "tag tensor global_step")
-    add_image = logs(
-        ScriptRun.picture, picture_of, "tag img_tensor global_step walltime dataformats", dataformats="CHW"
-    )
-    add_images = logs(
-        ScriptRun.picture, picture_of, "tag img_tensor global_step walltime dataformats", dataformats="NCHW"
-    )
-    add_video = logs(ScriptRun.picture, film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
+    @forgiving
+    def add_text(
+        self, tag: str, text_string: object, global_step: object = None, *_: object, **__: object
+    ) -> None:
+        """Log a text; a table of hyperparameters, as CleanRL writes it, also becomes the settings."""
+        text = str(text_string)
+        if self.script.is_waiting and (match := _HYPERPARAMETERS.search(text)):
+            self.script.settings = _settings(text[match.end() :]) | self.script.settings
+        self.script.log(tag, text, global_step)
+
+    add_histogram = logs(histogram_of, "tag values global_step")
+    add_tensor = logs(array_of, "tag tensor global_step")
+    add_image = logs(picture_of, "tag img_tensor global_step walltime dataformats", dataformats="CHW")
+    add_images = logs(picture_of, "tag img_tensor global_step walltime dataformats", dataformats="NCHW")
+    add_video = logs(film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
 
     @forgiving
     def add_figure(
@@ -154,7 +152,7 @@ class SummaryWriter(Tracker):
     ) -> None:
         """Record a figure of Matplotlib, or a list of them, as pictures."""
         for part in figure if isinstance(figure, list) else [figure]:
-            self.script.picture(tag, picture_of(part), global_step)
+            self.script.log(tag, Media(picture_of, part), global_step)
             if close and (pyplot := sys.modules.get("matplotlib.pyplot")):
                 pyplot.close(part)
 

@@ -16,9 +16,9 @@ from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError
 from runner.integrations.libraries import require_tested
-from runner.integrations.script import ScriptRun, end_with_scripts
+from runner.integrations.script import end_with_scripts
 from runner.integrations.shapes import logs
-from runner.integrations.tensorboard import SummaryWriter, log_text
+from runner.integrations.tensorboard import SummaryWriter
 from runner.integrations.workers import Workers
 from runner.loops.batches import RecordedBatches, record_batches
 from runner.loops.env import record as record_env
@@ -46,7 +46,7 @@ def record(env: Any, recordings: str | os.PathLike[str] | None = None, **options
 
     Its actions, observations and rewards are recorded as they are before TorchRL's transforms, with seeds, so
     that the run can be reproduced. The run ends when the environment is closed, as a collector does at its
-    end, and the `Logger` if there is one.
+    end, and what logs into it too, such as a `Logger`.
 
     Args:
         env: a `GymEnv` or `GymWrapper`, with or without transforms, that this process steps.
@@ -214,13 +214,16 @@ class Logger(_Logger):  # type: ignore[misc]
         self.script.name = self.exp_name
         return writer
 
-    log_str = logs(log_text, str, "name value step")
-    log_histogram = logs(ScriptRun.snapshot, histogram_of, "name data step")
-    log_video = logs(ScriptRun.picture, film_of, "name video step", dataformats="NTCHW", fps=30)
+    log_histogram = logs(histogram_of, "name data step")
+    log_video = logs(film_of, "name video step", dataformats="NTCHW", fps=30)
 
     def log_scalar(self, name: str, value: object, step: int | None = None) -> None:
         """Log a number."""
         self.experiment.add_scalar(name, value, step)
+
+    def log_str(self, name: str, value: object, step: int | None = None) -> None:
+        """Log a text."""
+        self.experiment.add_text(name, value, step)
 
     def log_hparams(self, cfg: object) -> None:
         """Record settings."""

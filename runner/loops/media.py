@@ -45,6 +45,11 @@ class Picture:
             )
 
     @property
+    def nbytes(self) -> int:
+        """The size of its pixels."""
+        return self.frames.nbytes
+
+    @property
     def format(self) -> str:
         """`png`, or `webp` for a film."""
         return "png" if len(self.frames) == 1 else "webp"
@@ -121,6 +126,15 @@ def histogram_of(values: object) -> dict[str, Array]:
     return {"counts": counts, "edges": edges}
 
 
+def array_of(values: object) -> Array:
+    """Return a copy of an array, a tensor or a list of numbers.
+
+    Raises:
+        ConfigError: it holds something else.
+    """
+    return _numbers(values).copy()
+
+
 def _numbers(value: object) -> Array:
     return numbers_of(value, "media", "as data", "an array of numbers")
 
@@ -181,16 +195,16 @@ def media_of(value: Any) -> Any:
 class Media:
     """What was made of a script's data; if nothing could be, the error comes when it is logged."""
 
-    def __init__(self, convert: Callable[..., Any], *arguments: object) -> None:
+    def __init__(self, convert: Callable[..., Any], *arguments: object, **layout: object) -> None:
         self._error: Exception | None = None
         try:
-            self._content = convert(*arguments)
+            self._content = convert(*arguments, **layout)
         except Exception as error:
             self._error = error
 
     @property
     def content(self) -> Any:
-        """A `Picture`, or arrays by name.
+        """A `Picture`, an array, or arrays by name.
 
         Raises:
             ConfigError: the data cannot be recorded.
@@ -198,6 +212,13 @@ class Media:
         if self._error is not None:
             raise self._error
         return self._content
+
+    @property
+    def nbytes(self) -> int:
+        """The size of the content; raises what it raises."""
+        content = self.content
+        parts = content.values() if isinstance(content, dict) else (content,)
+        return sum(part.nbytes for part in parts)
 
 
 class Image(Media):

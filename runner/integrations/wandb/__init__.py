@@ -36,7 +36,8 @@ from runner.integrations.shapes import (
 )
 from runner.integrations.tensorboard import end_forwarding, forward
 from runner.integrations.wandb.settings import Config, Summary
-from runner.loops.media import Histogram, Image
+from runner.loops.media import Histogram as Histogram
+from runner.loops.media import Image, Media, array_of
 from runner.loops.options import settings_in
 from runner.runs.listing import list_runs
 from runner.util.jsonable import as_json
@@ -128,18 +129,16 @@ class Tracked(Tracker):
         if isinstance(value, Mapping):
             for key, inner in value.items():
                 self._log(f"{name}/{key}", inner, step)
-        elif isinstance(value, Image):
-            self.script.picture(name, value.content, step)
-            if value.caption:
-                self.script.log(f"{name}/caption", str(value.caption), step)
-        elif isinstance(value, Histogram):
-            self.script.snapshot(name, value.content, step)
+        elif isinstance(value, Media):
+            self.script.log(name, value, step)
+            if caption := getattr(value, "caption", None):
+                self.script.log(f"{name}/caption", str(caption), step)
         elif value is None or isinstance(value, WithoutEffect):
             self.script.warn_once(
                 f"log: {value} is not recorded, first found for {name!r}.", about=str(value)
             )
         elif np.ndim(value) and np.size(value) != 1:
-            self.script.snapshot(name, value, step)
+            self.script.log(name, Media(array_of, value), step)
         else:
             try:
                 value = value if isinstance(value, str) else as_number(name, value)
