@@ -29,6 +29,7 @@ import runner
 from runner.cli import cli
 from runner.errors import ConfigError
 from runner.integrations import torchrl
+from runner.integrations.tensorboard import SummaryWriter
 
 
 def policy(env):
@@ -205,3 +206,14 @@ def test_the_workers_of_a_parallel_environment_are_one_run(recordings):
     (run,) = runner.list_runs(recordings)
     assert (run.status, run.summary["train_steps"]) == ("finished", 200)
     assert "reproduced" in verified(run)
+
+
+def test_values_after_the_environment_is_closed_are_in_its_run(recordings):
+    env = torchrl.record(GymEnv("CartPole-v1"), name="x")
+    with SummaryWriter() as writer:
+        collecting = collector(env, batches=1)
+        assert sum(data.numel() for data in collecting) == 90
+        collecting.shutdown()
+        writer.add_scalar("loss", 0.5, 90)
+    (run,) = runner.list_runs(recordings)
+    assert (run.status, run.summary["train_steps"], run.summary["logged"]["loss"]) == ("finished", 90, 0.5)
