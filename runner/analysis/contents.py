@@ -13,6 +13,7 @@ from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
+from runner.runs.listing import run_at
 from runner.runs.run import Run
 from runner.util.values import is_whole
 
@@ -33,7 +34,9 @@ Step = np.void | Message
 def shortcomings(recording: Recording) -> list[str]:
     """Return what is missing from a recording, a sentence each; nothing if it is complete."""
     sentences, status = [], recording.status
-    if status != "finished":
+    if damage := damage_of(run_at(recording.path), recording):
+        sentences.append(damage)
+    elif status != "finished":
         recorded = "its loop is recorded up to its last step"
         if (planned := recording.config.get("episodes")) is not None:
             of = f" of {planned:,}" if is_whole(planned, 0, 2**63) else ""
@@ -85,7 +88,9 @@ def ending_of(recording: Recording, phase: str, number: int) -> str:
     """Return how an episode ended, a key of `ENDINGS`."""
     records = recording.phase(phase).episodes.array(number, number + 1)
     if not len(records):
-        return "cut off"
+        steps = recording.phase(phase).episode(number)
+        last = [row for rows in steps.rows(len(steps) - 1) for row in rows]
+        return next((end for end in ("terminated", "truncated") if any(row[end] for row in last)), "cut off")
     return next((end for end in ("success", "terminated", "truncated") if records[0][end]), "reset")
 
 

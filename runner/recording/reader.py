@@ -259,8 +259,16 @@ class Phase:
         end = None if stop is None else self.steps.first_from("episode", stop)
         return self.steps.blocks(self.steps.first_from("episode", start), end)
 
+    def known_episodes(self) -> int:
+        """Return how many episodes `episode` finds: of one environment also those that only steps are of."""
+        ended = self.episodes.count()
+        if environment_count(self._recording) > 1 or not (total := self.steps.total()):
+            return ended
+        last = self.steps.numbered(range(total - 1, total))
+        return max([ended, *(int(rows["episode"][-1]) + 1 for rows in last)])
+
     def episode(self, number: int) -> EpisodeSteps:
-        """Return the steps of an episode, which are read later; also of one that never ended.
+        """Return the steps of an episode, which are read later; also of one whose end is not recorded.
 
         Where several environments take turns, episodes are numbered as they ended, and only ended ones are
         found.
@@ -281,16 +289,16 @@ class Phase:
             length = last + 1 - first
             if self.steps.have_turns:
                 length, environment = int(records[0]["length"]), int(records[0]["environment"])
-        elif number == ended and environment_count(self._recording) == 1:
-            before = self.episodes.array(ended - 1, ended)
-            first, last = int(before[0]["last_step"]) + 1 if len(before) else 0, total - 1
+        elif number >= 0 and environment_count(self._recording) == 1:
+            starts = (self.steps.rows_between("episode", begin) for begin in (number, number + 1))
+            first, stop = (next((int(rows["step"][0]) for rows in start), total) for start in starts)
             for rows in self.steps.numbered(range(first, first + 1)):
                 first += len(rows) - len(taken(rows))  # a vector of one may have only reset it at first
-            length = last + 1 - first
+            last, length = stop - 1, stop - first
         if not (0 <= first <= last < total and 0 < length <= last + 1 - first):
             raise NotInRecording(
                 f"{self._recording.path}: has no {self.title} episode {number:,}; "
-                f"there are {ended:,}, from 0."
+                f"there are {self.known_episodes():,}, from 0."
             )
         return EpisodeSteps(self.steps, first, last, length, environment)
 

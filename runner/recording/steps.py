@@ -84,6 +84,12 @@ class Steps(TopicChunks):
         blocks = self._unpacked(chunks=self.actions.chunks_from("step", numbers.start))
         return within(blocks, "step", numbers.start, numbers.stop)
 
+    def rows_between(self, field: str, start: int, stop: int = FOREVER) -> Iterator[Records]:
+        """Yield the steps with such values of a field that never decreases, in blocks as `rows` does."""
+        if not self.are_actions:
+            return super().rows_between(field, start, stop)
+        return within(self._unpacked(), field, start, stop)
+
     def _unpacked(self, times: range | None = None, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the steps of each message with actions, as `TopicChunks.messages` selects them."""
         where = f"{self.file.path}: {self.actions.topic.name}"

@@ -227,8 +227,11 @@ def repair_command(named: tuple[Path, Run | None] = recording_and_run) -> Reply:
         with lock, bytes_line("repairing") as report:
             repaired = repair(part, report, own.summary if own is not None else None)
             if own is not None and repaired.lost and own.status == "finished":
-                # Resuming the run must arrive at the digest that it had.
-                own.update(status="interrupted", proof=own.summary.content_digest)
+                # Resuming the run must arrive at the digest that it had. What a process of it states it holds
+                # is compared when its recording is added to the run; of the run, the recording says it now.
+                left = ("seconds", "error", "unfolded") if own is run else tuple(own.summary)
+                summary = {key: own.summary[key] for key in left if key in own.summary}
+                own.update(status="interrupted", proof=own.summary.content_digest, summary=summary)
         done.append((repaired, own))
     first, *others = [_repair_as_json(repaired) for repaired, _ in done]
     value = first | ({"shards": others} if others else {})

@@ -267,7 +267,7 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
 
 def _values(run: Run, at: EpisodeRef, branches: list[Link], stage: ReplayStage | None) -> dict[str, object]:
     with open_recording(run.recording) as recording:
-        episodes = recording.train.episodes.count()
+        episodes = recording.train.known_episodes()
         environments, is_job = recording.environments, recording.can_train_again
         evaluations = [EvaluationChoice(one.after, one.stop - one.start) for one in evaluations_of(recording)]
     if at.after is None:

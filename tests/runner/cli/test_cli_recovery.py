@@ -253,6 +253,20 @@ def test_repair_lists_losses_and_resume_restores_them(command, copied, recorded_
     assert command("verify", copied.run_id).exit_code == 0
 
 
+def test_after_a_repair_show_and_ls_say_what_is_left(command, copied):
+    before = command.json("show", copied.run_id)
+    os.truncate(copied.recording, int(0.6 * copied.recording.stat().st_size))
+    command("repair", copied.run_id)
+    with open_recording(copied.recording) as recording:
+        left = recording.done()
+    assert left["eval_steps"] < before["eval_steps"]
+    shown, (row,) = command.json("show", copied.run_id), command.json("ls")["runs"]
+    assert {key: shown[key] for key in left} == left
+    assert {key: row[key] for key in left} == left
+    assert shown["content_digest"] is row["content_digest"] is None
+    assert shown["seconds"] == before["seconds"]
+
+
 def test_repair_by_path_when_nothing_opens(command, copied, tmp_path):
     path = tmp_path / "alone.mcap"
     data = bytearray(copied.recording.read_bytes())

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import shutil
 
@@ -144,6 +145,15 @@ def test_a_finished_run_says_that_its_recording_is_cut_off(recorded_run, command
         shown = command("show", "@latest").stdout
         assert "cut off" in re.search("^damage .*$", shown, re.MULTILINE)[0]
         assert "cut off" in command.json("show", "@latest")["damage"]
+
+
+def test_a_plot_and_a_report_give_the_reason_that_show_gives(recorded_run, command, tmp_path):
+    folder = command.recordings / recorded_run.run_id
+    shutil.copytree(recorded_run.folder, folder)
+    os.truncate(folder / "recording.mcap", recorded_run.recording.stat().st_size * 9 // 10)
+    damage = command.json("show", "@latest")["damage"]
+    assert damage in command("plot", "@latest", "-o", tmp_path / "plot.svg").stderr
+    assert damage in command("report", "@latest", "-o", tmp_path / "report.html").stderr
 
 
 def test_markdown_has_the_same_sections(recorded):

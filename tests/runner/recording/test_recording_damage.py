@@ -117,19 +117,23 @@ def test_a_cut_file_has_the_status_interrupted(lake, tmp_path):
         assert recording.mdp.states == 16
 
 
-def test_the_steps_of_an_episode_that_never_ended_are_returned(tmp_path):
-    """Its last chunk of episodes is lost, but none of its steps."""
-    data = make_run(tmp_path, LAKE, evaluation=None, log=None).recording.read_bytes()
+def test_episodes_are_found_by_their_steps_where_their_ends_are_lost(tmp_path):
+    """The last chunk of episodes is lost, but none of the steps."""
+    run = make_run(tmp_path, LAKE, evaluation=None, log=None)
+    with open_recording(run.recording) as recording:
+        lengths = recording.train.episodes.array()["length"].tolist()
+    data = run.recording.read_bytes()
     channels = {start: _channel(data, start) for opcode, start, _ in records_of(data) if opcode == CHUNK}
     cut = next(start for start, channel in channels.items() if channel == schema.TRAIN_EPISODE.channel)
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[:cut])
     with open_recording(path) as recording:
         assert recording.train.episodes.count() == 0
-        steps = recording.train.episode_steps(0)
-        assert len(steps) == recording.train.steps.count() > 100
-        with pytest.raises(RecordingError, match="no training episode 1"):
-            recording.train.episode_steps(1)
+        steps = [recording.train.episode_steps(number) for number in range(len(lengths))]
+        assert list(map(len, steps)) == lengths
+        assert sum(lengths) == recording.train.steps.count() > 100
+        with pytest.raises(RecordingError, match=f"no training episode {len(lengths)}; there are"):
+            recording.train.episode_steps(len(lengths))
         with pytest.raises(RecordingError, match="no evaluation steps"):
             recording.eval.episode_steps(0)
 

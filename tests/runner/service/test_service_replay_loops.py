@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
+import os
 import re
+import shutil
 import sys
 
 import gymnasium
@@ -16,6 +18,7 @@ from runner.recording import schema
 from runner.recording.observation_names import NAMES
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
+from runner.runs.run import Run
 
 
 @pytest.mark.parametrize(
@@ -37,6 +40,24 @@ def test_a_part_has_the_recorded_values_from_the_reset_on(loops_client, loops, a
     assert later["first"] == 4
     assert later["before"] == [4]
     assert later["series"][0]["values"] == whole["series"][0]["values"][4:9]
+
+
+@pytest.mark.parametrize("name", ["pole", "rooms"])
+def test_the_episodes_of_a_recording_that_was_cut_off_are_those_of_its_steps(loops, tmp_path, name):
+    whole = find_run(name, loops)
+    run = Run(tmp_path / "runs" / "cut", whole.facts)
+    shutil.copytree(whole.folder, run.folder)
+    with open_recording(run.recording) as recording:
+        end = recording.train.episodes.entry(0).offset
+    os.truncate(run.recording, end)
+    with open_recording(run.recording) as recording:
+        assert not recording.train.episodes.count()
+    with serving(tmp_path / "runs") as client:
+        for episode in range(4):
+            steps = steps_of(loops, name, "train", episode)
+            shown = part(client, f"{run.run_id}/replay/train/{episode}")
+            assert shown["length"] == len(steps)
+        assert 'placeholder="0 to 3"' in page(client, f"/runs/{run.run_id}/replay/train/0")
 
 
 def test_what_was_logged_near_a_step_is_there_with_its_place(loops_client, loops):
