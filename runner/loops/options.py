@@ -17,6 +17,7 @@ from runner.loops.description import Described
 from runner.loops.makers import why_not_certain
 from runner.loops.values import warn_user
 from runner.recording.maker import EnvironmentMaker
+from runner.runs.redaction import redacted_settings
 from runner.runs.run import Run
 from runner.runs.shards import find_joined
 from runner.util.extras import require
@@ -192,7 +193,7 @@ def options_of(
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
     try:
-        settings = as_json(settings_in(config))
+        settings = redacted_settings(as_json(settings_in(config)))
         json.dumps(settings, ensure_ascii=False).encode()
     except (RecursionError, ValueError) as error:
         raise ConfigError(

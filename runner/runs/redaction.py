@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final
 
 REDACTED: Final = "[redacted]"
 SECRET_NAMES: Final = (
@@ -47,6 +47,8 @@ _IN_SOURCES: Final = (
     r"(?:api|access|private|auth|account|signing|encryption)[_-]?key)"
 )
 """In sources a mere `key` is seldom a secret: `sort(key="length")`."""
+_SECRET_SETTING: Final = re.compile(_IN_SOURCES, re.IGNORECASE)
+_PLACEHOLDERS: Final = "{$<%["
 _AFTER_NAME: Final = (
     r"[\w-]{0,40}[\"']?\]?(?:(?:\s{0,3}:\s{0,3}[\w.\[\]| ]{1,30})?\s{0,3}[:=]\s{0,3}|"
     r"(?<=[\"'])\s{0,3},\s{0,3}|"
@@ -187,6 +189,21 @@ def redacted_line(text: str) -> str:
     return text
 
 
+def redacted_settings(value: Any, name: str = "") -> Any:
+    """Return settings, as JSON has them, with secrets among their texts replaced by `[redacted]`.
+
+    As in sources, a mere `key` in a name does not count. Placeholders such as `${TOKEN}` and `<pad>` stay.
+    """
+    if isinstance(value, dict):
+        return {key: redacted_settings(part, key) for key, part in value.items()}
+    if isinstance(value, list):
+        return list(map(redacted_settings, value))
+    if not isinstance(value, str):
+        return value
+    stays = value[:1] in _PLACEHOLDERS or _stays(name, value) or not _SECRET_SETTING.search(name)
+    return redacted_line(value) if stays else REDACTED
+
+
 class LineRedactor:
     """Redacts the lines of an output one after the other, and every line of a private key."""
 
@@ -219,6 +236,6 @@ def _secrets_among(variables: frozenset[tuple[str, str]]) -> tuple[str, ...]:
 def _without_value(match: re.Match[str]) -> str:
     """Return an assignment without its value; a placeholder such as `"${TOKEN}"` stays."""
     name, quoted = match[1], match[2]
-    if quoted[1] in "{$<%[" or _stays(name, quoted[1:-1]):
+    if quoted[1] in _PLACEHOLDERS or _stays(name, quoted[1:-1]):
         return match[0]
     return f"{name}{quoted[0]}{REDACTED}{quoted[0]}"

@@ -40,6 +40,7 @@ from runner.loops.media import Histogram as Histogram
 from runner.loops.media import Image, Media, array_of
 from runner.loops.options import settings_in
 from runner.runs.listing import list_runs
+from runner.runs.redaction import redacted_settings
 from runner.util.jsonable import as_json
 from runner.util.values import flatten
 
@@ -178,7 +179,7 @@ class Tracked(Tracker):
                 "config: found settings after the recording began, which are logged as a text, `config`: set "
                 "them before the environment is reset."
             )
-            self.script.log("config", json.dumps(as_json(settings)))
+            self.script.log("config", json.dumps(redacted_settings(as_json(settings))))
 
     def finish(self, exit_code: int | None = None, quiet: bool | None = None) -> None:  # noqa: ARG002
         """End the run: as failed if the exit code is not 0."""

@@ -450,3 +450,28 @@ def test_arrays_pictures_and_histograms_are_logged_as_such(tmp_path):
     assert sum(arrays["weights/counts"][1]) == 128
     assert pictures == ["nested/figure", "view"]
     assert rec.run.summary["logged"] == {"one": 0.5}
+
+
+def test_secrets_among_the_settings_are_not_recorded(tmp_path):
+    settings = {
+        "api_key": "sk-not-long",
+        "db": {"password": "hunter2", "url": "postgres://user:hunter2@host/db", "PASSWD": "hunter2"},
+        "callbacks": [{"auth_token": "hunter2"}],
+    }
+    harmless = {
+        "key_dim": 64,
+        "max_tokens": 100_000,
+        "tokenizer": "gpt2",
+        "pad_token": "<pad>",
+        "monkey": "see",
+    }
+    given = json.loads(json.dumps(settings | harmless))
+    path, _ = recorded(tmp_path, "CartPole-v1", 3, config=given)
+    assert given == settings | harmless
+    assert b"hunter2" not in path.read_bytes()
+    assert "hunter2" not in path.with_name("run.json").read_text()
+    with open_recording(path) as recording:
+        kept = recording.config["config"]
+    assert kept["api_key"] == kept["db"]["password"] == kept["callbacks"][0]["auth_token"] == "[redacted]"
+    assert kept["db"]["url"] == "postgres://[redacted]@host/db"
+    assert {name: kept[name] for name in harmless} == harmless
