@@ -290,7 +290,7 @@ def ranked_episodes(recording: Recording) -> tuple[str, Ints]:
     records = records[records["last_step"] < recording.phase(phase).steps.total()]
     if not len(records):
         raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
-    return phase, _by_rank(records)
+    return phase, records["episode"][_by_rank(records)]
 
 
 def ranked_trials(recording: Recording, evaluation: Evaluation) -> list[EpisodeRef]:
@@ -300,17 +300,27 @@ def ranked_trials(recording: Recording, evaluation: Evaluation) -> list[EpisodeR
 
 def ranked(recording: Recording, phase: str, start: int, stop: int) -> list[EpisodeRef]:
     """Return the worst, the median and the best of some episodes: by success, return and length."""
-    numbers = _by_rank(recording.phase(phase).episodes.array(start, stop))
+    records = recording.phase(phase).episodes.array(start, stop)
+    numbers = records["episode"][_by_rank(records)]
     return references(recording, phase, numbers[[0, len(numbers) // 2, -1]])
 
 
+def in_order(records: Records, order: str) -> Ints:
+    """Return the places of episodes in an order, such as `longest` first."""
+    places = np.arange(len(records))
+    if order in ("longest", "shortest"):
+        places = np.argsort(records["length"], kind="stable")
+    elif order in ("worst", "best"):
+        places = _by_rank(records)
+    return places[::-1] if order in ("newest", "longest", "best") else places
+
+
 def _by_rank(records: Records) -> Ints:
-    """Return the numbers of episodes from worst to best; a return that is no number is the worst."""
+    """Return the places of episodes from worst to best; a return that is no number is the worst."""
     with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
         returns = records["returns"].sum(axis=1)
     returns[np.isnan(returns)] = -np.inf
-    order = np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
-    return records["episode"][order].astype(np.int64)
+    return np.lexsort((-records["length"].astype(np.int64), returns, records["success"]))
 
 
 def last_whole_evaluation(recording: Recording) -> Evaluation | None:

@@ -167,18 +167,25 @@ class RunDetails:
 
     def sections(self) -> list[Section]:
         """Return what people see of the run: what it is, its results, its configuration and provenance."""
-        run = self.run
         first, *made = self.origin_sections()
-        results = [
-            Section("Last results", facts={} if self.loop is None else results_in_words(self.loop)),
-            Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
-            Section("Branches", facts={name: str(origin) for name, origin in self.branches.items()}),
-            Section("Greedy policy, exactly", facts=self._optimality()),
-            Section("Tables", facts={table.agent: str(table) for table in self.tables}),
-        ]
+        results = self.result_sections()
         if self.evaluations:
             grid = evaluations_grid(self.evaluations, self.success_events)
             results.insert(0, Section("Evaluations", grids=[grid]))
+        return [first, *results, *made]
+
+    def result_sections(self) -> list[Section]:
+        """Return the results but the evaluations."""
+        run, results = (
+            self.run,
+            [
+                Section("Last results", facts={} if self.loop is None else results_in_words(self.loop)),
+                Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
+                Section("Branches", facts={name: str(origin) for name, origin in self.branches.items()}),
+                Section("Greedy policy, exactly", facts=self._optimality()),
+                Section("Tables", facts={table.agent: str(table) for table in self.tables}),
+            ],
+        )
         if self.checkpoints:
             last = self.checkpoints[-1].reference
             listing = f"`{command_for(run, 'checkpoints')}` lists them."
@@ -186,7 +193,7 @@ class RunDetails:
         if run.marks:
             rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
             results.append(Section("Marks", grids=[Grid(("step", "text", "tags"), rows)]))
-        return [first, *(each for each in results if each.facts or each.grids or each.sentences), *made]
+        return [each for each in results if each.facts or each.grids or each.sentences]
 
     def _repr_html_(self) -> str:
         return html(self.sections())
@@ -212,7 +219,9 @@ class RunDetails:
         folder = f"{run.folder}{os.sep}"
         steps = ""
         if environment and None not in (self.train_steps, self.episodes, self.eval_steps):
-            steps = f"{self.train_steps:,} of training in {counted(self.episodes or 0, 'episode')}, "
+            ended = counted(self.episodes or 0, "episode")
+            ended = f"in {ended}" if self.episodes or not self.train_steps else "(no episode ended)"
+            steps = f"{self.train_steps:,} of training {ended}, "
             steps += f"{self.eval_steps:,} of evaluation"
         if self.environments > 1:
             environment += f", {self.environments:,} in parallel"

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from runner.runs.run import Run
     from runner.util.values import Json
 
-_HEADINGS: Final = ("checkpoint", "phase", "episode", "format", "size", "digest", "content")
+_HEADINGS: Final = ("checkpoint", "phase", "last episode", "format", "size", "digest", "content")
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,9 @@ class CheckpointRows:
         ]
         command = f"dualtaxi checkpoint get {self.run_id} {rows[-1][0]}"
         sentence = f"{counted(len(rows), 'checkpoint')}. `{command}` writes the last."
-        return [Section("Checkpoints", [sentence], [Grid(_HEADINGS, rows)])]
+        address = f"/api/v1/runs/{self.run_id}/checkpoints/"
+        links = [f"{address}{one.digest}" if one.is_here else "" for one in self.checkpoints]
+        return [Section("Checkpoints", [sentence], [Grid(_HEADINGS, rows, links=links)])]
 
 
 def checkpoints(run: Run) -> CheckpointRows:

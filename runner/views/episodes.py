@@ -30,12 +30,23 @@ _PHASE: Final = view_input(
 )
 
 
+_ORDERS: Final = ("number", "newest", "best", "worst", "longest", "shortest")
+_ORDER: Final = view_input(
+    "order",
+    "The episodes that come first; best and worst by success, return and length.  [default: number]",
+    default="number",
+    label="Order",
+    values=_ORDERS,
+)
+
+
 @dataclass(frozen=True)
 class EpisodeRows:
     """Some episodes of a phase."""
 
     run_id: str
     phase: str
+    order: str
     start: int
     total: int
     """Number of all episodes of the phase."""
@@ -77,11 +88,13 @@ class EpisodeRows:
         links = [
             "" if at.after == UNKNOWN_EVALUATION else f"replay/{at.episode_path}" for at in self.references
         ]
-        paging = Paging(self.start // _ROWS + 1, self.total, _ROWS, f"{VIEW.name}?phase={self.phase}")
+        query = f"phase={self.phase}" + (f"&order={self.order}" if self.order != _ORDERS[0] else "")
+        paging = Paging(self.start // _ROWS + 1, self.total, _ROWS, f"{VIEW.name}?{query}")
         headings = ("episode" if is_training else "trial", "end", *self.headings.values())
         sentence = counted(self.total, "episode" if is_training else "trial")
         if len(rows) < self.total:
-            sentence = f"Numbers {self.start:,} to {self.start + len(rows) - 1:,} of {sentence}"
+            rows_shown = "Numbers" if self.order == _ORDERS[0] else f"The {self.order} first: rows"
+            sentence = f"{rows_shown} {self.start:,} to {self.start + len(rows) - 1:,} of {sentence}"
         return [Section(title, [f"{sentence}."], [Grid(headings, rows, links=links, paging=paging)])]
 
     def _end(self, i: int) -> str:
@@ -95,6 +108,7 @@ class EpisodeRows:
 def episodes(
     recording: Recording,
     phase: Phase = _PHASE,
+    order: str = _ORDER,
     start: Any = START,
     stop: Any = STOP,
 ) -> EpisodeRows:
@@ -105,13 +119,18 @@ def episodes(
     Examples:
       dualtaxi episodes @latest
       dualtaxi episodes k3v9m2xq --phase eval --start 100 --stop 200
+      dualtaxi episodes k3v9m2xq --order longest --stop 10
     """
-    from runner.analysis.episodes import references
+    from runner.analysis.episodes import in_order, references
     from runner.analysis.frames import episode_columns
     from runner.environments.naming import event_in_words
 
     total, rows = recording.phase(phase).episodes.count(), rows_in(start, stop)
-    columns = episode_columns(recording, phase, min(rows.start, total), min(rows.stop, total))
+    if order == _ORDERS[0]:
+        columns = episode_columns(recording, phase, min(rows.start, total), min(rows.stop, total))
+    else:
+        places = in_order(recording.phase(phase).episodes.array(), order)[rows.start : rows.stop]
+        columns = {name: column[places] for name, column in episode_columns(recording, phase).items()}
     shown = [name for name in columns if name not in _HIDDEN]
     if recording.environment["penalty_below"] is None:
         shown.remove("penalties")
@@ -121,7 +140,7 @@ def episodes(
         headings[name] = "return" if len(recording.agents) == 1 else event_in_words(name)
     values = {name: column.tolist() for name, column in columns.items()}
     numbers = references(recording, phase, values["episode"])
-    return EpisodeRows(recording.run_id, phase, rows.start, total, values, numbers, headings)
+    return EpisodeRows(recording.run_id, phase, order, rows.start, total, values, numbers, headings)
 
 
 VIEW: Final = View(

@@ -39,7 +39,9 @@ class EvaluationRows:
         return [self.table]
 
 
-def evaluations(recording: Recording, start: Any = START, stop: Any = STOP) -> EvaluationRows:
+def evaluations(
+    recording: Recording, start: Any = START, stop: Any = STOP, *, newest_first: bool = False
+) -> EvaluationRows:
     """Show the evaluations of RUN: returns, lengths, successes, and every event counted.
 
     The evaluations of a loop are its evaluation episodes between two training episodes.
@@ -51,11 +53,14 @@ def evaluations(recording: Recording, start: Any = START, stop: Any = STOP) -> E
     from runner.analysis.evaluations import evaluation_records, evaluations_section
 
     every, rows = evaluation_records(recording), rows_in(start, stop)
+    if newest_first:
+        every.reverse()
     records = every[rows.start : rows.stop]
     table = Section("Evaluations", ["No evaluation was recorded."])
     if records:
         paging = Paging(rows.start // _ROWS + 1, len(every), _ROWS, VIEW.name)
         table = evaluations_section(recording, records, paging)
+        table.sentences.extend(["The newest come first."] * newest_first)
     elif every:
         table = Section("Evaluations", [f"There are {len(every):,} evaluations, from 0."])
     return EvaluationRows(recording.run_id, rows.start, len(every), records, table)
@@ -65,6 +70,7 @@ VIEW: Final = View(
     "evaluations",
     "Evaluations",
     evaluations,
+    page_values=(("newest_first", True),),
     counts_steps=False,
     has_default=True,
     is_live=True,

@@ -17,7 +17,6 @@ from runner.analysis.contents import shortcomings, why_no_steps
 from runner.analysis.episodes import EpisodeRef, last_whole_evaluation, ranked, ranked_trials
 from runner.analysis.evaluations import (
     EvaluationRecord,
-    evaluation_records,
     evaluations_section,
     metric_columns,
 )
@@ -106,7 +105,8 @@ def render_report(
 
 
 def _run(recording: Recording, chosen: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
-    records = evaluation_records(recording)
+    details = describe_recording(run_at(recording.path), recording)
+    records = details.evaluations
     episodes = _episodes(recording, chosen)
     player = _player(recording, episodes, progress)
     notes = shortcomings(recording)
@@ -132,8 +132,9 @@ def _run(recording: Recording, chosen: Sequence[EpisodeRef], progress: Tell) -> 
         sections.append(evaluations_section(recording, records))
     elif recording.has_tables:
         sections.append(Section("Evaluations", ["No evaluation was recorded."]))
-    parts = describe_recording(run_at(recording.path), recording, with_results=False).origin_sections()
-    sections.append(Section("Configuration and provenance", parts=parts, layout="tables"))
+    sections += details.result_sections()
+    origin = details.origin_sections()
+    sections.append(Section("Configuration and provenance", parts=origin, layout="tables"))
     last = records[-1] if records else None
     row = {
         "run": recording.run_id,

@@ -6,8 +6,10 @@ import os
 import re
 import shutil
 
+import gymnasium
 import pytest
 
+import runner
 from runner.integrations.tensorboard import SummaryWriter
 from runner.runs.run import RUN_FILE, create_run
 
@@ -154,6 +156,20 @@ def test_a_plot_and_a_report_give_the_reason_that_show_gives(recorded_run, comma
     damage = command.json("show", "@latest")["damage"]
     assert damage in command("plot", "@latest", "-o", tmp_path / "plot.svg").stderr
     assert damage in command("report", "@latest", "-o", tmp_path / "report.html").stderr
+
+
+def test_a_report_has_the_results_that_show_has(command, tmp_path):
+    with runner.record(gymnasium.make("CartPole-v1"), command.recordings, name="loop") as rec:
+        rec.reset(seed=0)
+        rec.step(0, extras={"value": 0.5})
+        rec.log("loss", 0.25)
+        rec.checkpoint("policy", b"weights")
+    shown = command("show", "loop").stdout
+    command("report", "loop", "-o", tmp_path / "report.html")
+    report = (tmp_path / "report.html").read_text()
+    for text in ("Checkpoints", "Last results", "Values recorded with steps", "(no episode ended)"):
+        assert text in shown
+        assert text in report
 
 
 def test_markdown_has_the_same_sections(recorded):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import gymnasium
 import httpx2
 import pytest
@@ -52,6 +54,10 @@ def test_a_pushed_run_has_its_checkpoints_and_so_has_a_pulled_one(server, tmp_pa
     address = f"{server.url}/runs/{run.run_id}/checkpoints"
     page = httpx2.get(address).text
     assert (page.count("policy@"), page.count(">here<")) == (6, 5)
+    downloads = re.findall(r'href="(/api/v1/[^"]*)">policy@', page)
+    assert [httpx2.get(f"{server.url}{one}").content for one in downloads] == [
+        bytes([k // 2]) * 1000 for k in range(5)
+    ]
     assert str(server.recordings) not in page
     for each in runner.find_run(run.run_id, server.recordings).checkpoints():
         each.path.unlink(missing_ok=True)

@@ -178,8 +178,12 @@ def test_jobs_wait_for_workers_and_can_be_cancelled_meanwhile(connect, settings,
     assert (page["queue"]["workers"], page["queue"]["running"], page["queue"]["queued"]) == (2, 2, 2)
     only = client.get("/api/v1/jobs", params={"state": "queued", "limit": 1}).json()
     assert (only["total"], [job["number"] for job in only["jobs"]]) == (2, [numbers[3]])
-    assert client.post(f"/api/v1/jobs/{numbers[2]}/cancel").json()["state"] == "cancelled"
-    client.post(f"/api/v1/jobs/{numbers[0]}/cancel")
+    for number in (numbers[2], numbers[0]):
+        button = f'action="/queue/{number}/cancel"'
+        assert button in client.get("/queue").text
+        assert client.post(f"/queue/{number}/cancel").status_code == 200
+        assert job(client, number)["state"] == "cancelled"
+        assert button not in client.get("/queue").text
     job_until(client, numbers[3], lambda job: job["state"] == "running")
 
 

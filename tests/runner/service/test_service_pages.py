@@ -71,7 +71,7 @@ def test_the_caret_of_a_wrong_filter_stands_under_its_place_in_a_fixed_width(cli
 
 def test_each_evaluation_leads_to_its_replay(client):
     page = page_of(client, "/runs/first/evaluations")
-    assert re.findall(r'replay/eval/(\d+)/0"', page) == ["0", "10", "20", "30", "40", "50", "60"]
+    assert re.findall(r'replay/eval/(\d+)/0"', page) == ["60", "50", "40", "30", "20", "10", "0"]
     assert "There are 7 evaluations, from 0." in page_of(client, "/runs/first/evaluations?page=2")
 
 
@@ -81,6 +81,37 @@ def test_a_page_of_episodes_leads_to_the_others(client):
     pages = re.findall(r'rel="(prev|next)" href="([^"]*)"', page)
     assert pages[-1] == ("prev", f"/runs/{first}/episodes?phase=eval")
     assert page_of(client, f"/runs/first/episodes?phase=eval&page={10**8}").count("<tr") == 0
+
+
+def test_episodes_come_in_the_order_that_is_chosen(client):
+    def read(order, start, stop):
+        address = f"/api/v1/runs/first/episodes?phase=eval&order={order}&start={start}&stop={stop}"
+        return client.get(address).json()["columns"]
+
+    whole = read("number", 0, 140)
+    rank = list(zip(whole["success"], sums(whole), [-n for n in whole["length"]], strict=True))
+    expected = {
+        "newest": sorted(whole["episode"], reverse=True),
+        "longest": sorted(whole["length"], reverse=True),
+        "shortest": sorted(whole["length"]),
+        "best": sorted(rank, reverse=True),
+        "worst": sorted(rank),
+    }
+    for order, values in expected.items():
+        found = read(order, 20, 50)
+        if order in ("best", "worst"):
+            found["rank"] = list(
+                zip(found["success"], sums(found), [-n for n in found["length"]], strict=True)
+            )
+        key = {"newest": "episode", "best": "rank", "worst": "rank"}.get(order, "length")
+        assert found[key] == values[20:50]
+    page = page_of(client, "/runs/first/episodes?phase=eval&order=longest&page=2")
+    assert 'episodes?phase=eval&amp;order=longest"' in page.replace("&#38;", "&amp;")
+
+
+def sums(columns):
+    returns = [column for name, column in columns.items() if name.startswith("return.")]
+    return list(map(sum, zip(*returns, strict=True)))
 
 
 def test_a_search_keeps_the_columns_and_their_order(client):
