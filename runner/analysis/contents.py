@@ -26,6 +26,15 @@ ENDINGS: Final = {
     "stopped": "stopped before its end",
 }
 """How an episode may end, and its description."""
+END_WORDS: Final = {
+    "success": "success",
+    "terminated": "terminated",
+    "truncated": "step limit",
+    "reset": "reset",
+    "cut off": "cut off",
+    "stopped": "not over",
+}
+"""How an episode ends, in the words of a table."""
 
 Step = np.void | Message
 """A step: a record, or the fields of a message where values vary in size."""

@@ -359,5 +359,6 @@ def evaluations_section(
         )
     headings, cells = zip(*columns, strict=True)
     links = [f"replay/eval/{record.episode}/0" for record in records]
-    grid = Grid(headings, list(zip(*cells, strict=True)), links=links, paging=paging)
+    rows = list(zip(*cells, strict=True))
+    grid = Grid(headings, rows, links=links, paging=paging, cut=(), spare=headings[:2:-1])
     return Section("Evaluations", [explanation], [grid])

@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from runner.analysis.contents import END_WORDS
 from runner.analysis.sections import Grid, Section, html
 from runner.drawing import svg, svg_maps
 from runner.drawing.palette import ink_on, ramp_colour
@@ -17,15 +18,6 @@ from runner.environments.naming import numbered_actions, spoken
 from runner.util.humanize import number, sentence
 from runner.util.values import Json, finite
 
-ENDS: Final = {
-    "success": "success",
-    "terminated": "terminated",
-    "truncated": "step limit",
-    "reset": "reset",
-    "cut off": "cut off",
-    "stopped": "not over",
-}
-"""How an episode ends, by the keys of `ENDINGS`, in the words of a table."""
 _CELL: Final = (116, 44)
 """Width and height of a cell of the matrix."""
 _HEAD: Final = (96, 60)
@@ -40,7 +32,7 @@ class Outcome:
     """The sum of each learner's rewards."""
     length: int
     end: str
-    """A key of `ENDS`."""
+    """A key of `END_WORDS`."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +98,7 @@ class WhatIf:
             "step": f"{self.at}, {self.title}",
             "state": f"{self.state}: {self.state_in_words}",
             "policy": f"{self.policy}, after {self.tables_step:,} training steps",
-            "recorded": f"return {returns}, {recorded.length:,} steps, {ENDS[recorded.end]}",
+            "recorded": f"return {returns}, {recorded.length:,} steps, {END_WORDS[recorded.end]}",
             "discount": f"{self.discount:g}, of the exact values",
         }
 
@@ -131,7 +123,7 @@ class WhatIf:
                 f"{row.name}{' (recorded)' if row.is_recorded else ''}",
                 *map(_short, row.returns),
                 f"{row.length:,}",
-                ENDS[row.end],
+                END_WORDS[row.end],
                 f"{100 * row.probability:.3g} %",
                 *(number(value, 3) for value in (*row.learned, *row.values, row.optimal_value, row.regret)),
             )
@@ -187,7 +179,9 @@ class WhatIf:
                 f'<rect x="{x + 2}" y="{y + 2}" width="{_CELL[0] - 4}" height="{_CELL[1] - 4}" '
                 f'fill="{colour}"{edge}/>' + _text(x + _CELL[0] / 2, y + 27, values, ink_on(colour))
             )
-            title = f"<title>{escape(row.name)}: {escape(ENDS[row.end])} after {row.length:,} steps</title>"
+            title = (
+                f"<title>{escape(row.name)}: {escape(END_WORDS[row.end])} after {row.length:,} steps</title>"
+            )
             link = "" if address is None else f' href="{escape(address(row.action))}"'
             parts.append(f"<a{link}>{title}{cell}</a>" if link else f"<g>{title}{cell}</g>")
         width, height = _HEAD[0] + _CELL[0] * len(columns), _HEAD[1] + _CELL[1] * len(rows)

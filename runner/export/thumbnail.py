@@ -20,16 +20,21 @@ _POINTS: Final = 200
 def thumbnail(recording: Recording, phase: str, episode: int, title: str) -> str:
     """Return an episode as SVG: its last state with the ways of the movers, or its return over its steps.
 
-    No environment is made: without recorded steps the picture is empty.
+    No environment is made: without recorded steps the picture says so.
 
     Raises:
         RecordingError: there is no such episode, or the recording is damaged.
     """
     tables = recording.phase(phase)
     is_empty = recording.leaves_out_steps or tables.steps.are_actions
+    if is_empty:
+        where = f'x="{WIDTH / 2}" y="{HEIGHT / 2}" text-anchor="middle"'
+        return svg.picture(
+            WIDTH, HEIGHT, title, f'<text {where} font-size="13" fill="#808080">no steps</text>'
+        )
     drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
     states, rewards, count = [], [np.zeros(1)], 0
-    for rows in () if is_empty else tables.episode(episode).rows(0):
+    for rows in tables.episode(episode).rows(0):
         rewards.append(rows["rewards"].sum(axis=1))
         if drawing is not None:
             recording.mdp.check_steps(rows, str(recording.path), schema.PHASE_NAMES[phase])

@@ -19,9 +19,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from runner.analysis.contents import END_WORDS
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.marking import mark_steps
 from runner.analysis.sections import Grid
+from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.query.conditions import ENDS, EpisodeParser, Facts, NotInRun
 from runner.query.episode_index import (
@@ -138,20 +140,22 @@ class Found:
     def grid(self) -> Grid:
         """The hits as a table."""
         cut = ("name", "events", "marks")
-        headings = ("run", "name", "episode", "return", "length", "ended", "events", "marks")
+        headings = ("run", "name", "episode", "return", "length", "end", "events", "marks")
         rows = []
         for hit in self.hits:
             most = sorted(hit.events, key=lambda name: -hit.events[name])[:_MOST_EVENTS]
-            events = ", ".join(f"{name} {hit.events[name]:,}" for name in most)
+            events = ", ".join(f"{event_in_words(name)} {hit.events[name]:,}" for name in most)
             numbers = UNKNOWN if hit.ret is None else f"{hit.ret:,.6g}", f"{hit.length:,}"
-            rows.append((hit.run_id, hit.name, hit.at, *numbers, hit.ended, events, ", ".join(hit.marks)))
+            rows.append(
+                (hit.run_id, hit.name, hit.at, *numbers, END_WORDS[hit.ended], events, ", ".join(hit.marks))
+            )
         shown = [
             (heading, *cells)
             for heading, *cells in zip(headings, *rows, strict=True)
             if any(cells) or heading not in cut
         ]
         headings, *rows = zip(*shown, strict=True)
-        return Grid(headings, rows, left=("run", "ended", *cut), cut=cut)
+        return Grid(headings, rows, left=("run", "end", *cut), cut=cut)
 
     def as_json(self) -> Json:
         """Return the result as JSON can hold it."""

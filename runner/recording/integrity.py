@@ -146,7 +146,10 @@ def _check_beginning(raw: RawRecord, contents: Index, layout: Layout) -> None:
     expected = beginning_of(layout)[2:]
     is_whole = (contents.schema_records, contents.channel_records) == expected
     if not is_whole or raw.offset != contents.header_end + sum(map(len, expected)):
-        raise RecordingError("found other schemas or channels than a recording of its kind begins with")
+        raise RecordingError(
+            "found other schemas or channels than this version writes before its first message: "
+            "the recording is of another version or program, or damaged there"
+        )
 
 
 def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: Report, path: str) -> None:

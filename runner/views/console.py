@@ -49,7 +49,7 @@ class Output:
             (duration(line.seconds), f"{line.position:,}", stream, line.text)
             for line, stream in zip(self.lines, streams, strict=True)
         ]
-        grid = Grid(("time", "step", "stream", "output"), rows, streams=streams)
+        grid = Grid(("time", "about step", "stream", "output"), rows, streams=streams)
         return [Section("Output", [f"{sentence}."], [grid])]
 
 
@@ -76,8 +76,8 @@ def console(
 ) -> Output:
     """Show what the process that recorded RUN printed: the last lines of its output, or of those with a text.
 
-    Each line has the time at which it began and the number of steps taken until then. A progress bar has its
-    last state; 10 MB are recorded.
+    Each line has the time at which it began and about the number of steps taken until then, interpolated
+    between samples of the clock. A progress bar has its last state; 10 MB are recorded.
 
     Examples:
       dualtaxi console @latest

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from runner.util.values import Json
 
 _ROWS: Final = 100
-_HIDDEN: Final = ("episode", "success", "terminated", "truncated", "last_step")
+_HIDDEN: Final = ("success", "terminated", "truncated", "episode", "last_step")
 """Columns that the table does not show as they are."""
 
 
@@ -30,13 +30,14 @@ _PHASE: Final = view_input(
 )
 
 
-_ORDERS: Final = ("number", "newest", "best", "worst", "longest", "shortest")
 _ORDER: Final = view_input(
     "order",
-    "The episodes that come first; best and worst by success, return and length.  [default: number]",
+    "What comes first: newest, best, worst (by success, return and length), longest or shortest.  "
+    "[default: number]",
     default="number",
+    metavar="ORDER",
     label="Order",
-    values=_ORDERS,
+    values=("number", "newest", "best", "worst", "longest", "shortest"),
 )
 
 
@@ -52,7 +53,7 @@ class EpisodeRows:
     """Number of all episodes of the phase."""
     columns: Mapping[str, list[Any]]
     references: Sequence[EpisodeRef]
-    headings: Mapping[str, str]
+    headings: dict[str, str]
     """Heading of each column of the table."""
     step_to_look_at = None
 
@@ -67,6 +68,7 @@ class EpisodeRows:
 
     def sections(self) -> list[Section]:
         """Return a table with a row for each episode."""
+        from runner.analysis.contents import END_WORDS
         from runner.analysis.episodes import UNKNOWN_EVALUATION
 
         is_training = self.phase == "train"
@@ -80,7 +82,7 @@ class EpisodeRows:
                 str(at.episode)
                 if at.after in (None, UNKNOWN_EVALUATION)
                 else f"{at.after}, trial {at.episode}",
-                self._end(i),
+                next((END_WORDS[end] for end in _HIDDEN[:3] if self.columns[end][i] > 0), END_WORDS["reset"]),
                 *(column[i] for column in cells),
             )
             for i, at in enumerate(self.references)
@@ -88,21 +90,16 @@ class EpisodeRows:
         links = [
             "" if at.after == UNKNOWN_EVALUATION else f"replay/{at.episode_path}" for at in self.references
         ]
-        query = f"phase={self.phase}" + (f"&order={self.order}" if self.order != _ORDERS[0] else "")
-        paging = Paging(self.start // _ROWS + 1, self.total, _ROWS, f"{VIEW.name}?{query}")
+        paging = Paging(
+            self.start // _ROWS + 1, self.total, _ROWS, f"{VIEW.name}?phase={self.phase}&order={self.order}"
+        )
         headings = ("episode" if is_training else "trial", "end", *self.headings.values())
+        spare = [text for name, text in reversed(self.headings.items()) if "return" not in name]
+        grid = Grid(headings, rows, links=links, paging=paging, cut=(), spare=tuple(spare))
         sentence = counted(self.total, "episode" if is_training else "trial")
         if len(rows) < self.total:
-            rows_shown = "Numbers" if self.order == _ORDERS[0] else f"The {self.order} first: rows"
-            sentence = f"{rows_shown} {self.start:,} to {self.start + len(rows) - 1:,} of {sentence}"
-        return [Section(title, [f"{sentence}."], [Grid(headings, rows, links=links, paging=paging)])]
-
-    def _end(self, i: int) -> str:
-        if self.columns["success"][i] > 0:
-            return "success"
-        if self.columns["terminated"][i]:
-            return "ended"
-        return "step limit" if self.columns["truncated"][i] else "cut off"
+            sentence = f"Rows {self.start:,} to {self.start + len(rows) - 1:,} of {sentence}"
+        return [Section(title, [f"{sentence}."], [grid])]
 
 
 def episodes(
@@ -126,7 +123,7 @@ def episodes(
     from runner.environments.naming import event_in_words
 
     total, rows = recording.phase(phase).episodes.count(), rows_in(start, stop)
-    if order == _ORDERS[0]:
+    if order == "number":
         columns = episode_columns(recording, phase, min(rows.start, total), min(rows.stop, total))
     else:
         places = in_order(recording.phase(phase).episodes.array(), order)[rows.start : rows.stop]

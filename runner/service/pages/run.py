@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.axes import EPISODES
 from runner.analysis.contents import damage_of
 from runner.analysis.episodes import TYPICAL
+from runner.analysis.evaluations import loop_summary
 from runner.analysis.summary import results_in_words
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
@@ -27,7 +27,7 @@ from runner.recording.composition import composition_of
 from runner.recording.labels import MAX_NOTE
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics, has_environment
+from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
 from runner.runs.catalogue.removal import clean, plan, remove
 from runner.runs.run import Run, label
 from runner.runs.shards import shards_in_words
@@ -45,11 +45,11 @@ from runner.service.dependencies import (
     WrittenRun,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunPage, StatusName, last_results, result_of
+from runner.service.pages.frame import RunPage, StatusName, result_of
 from runner.service.pages.rendering import Form, Page, form_of, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
-from runner.util.values import Json
+from runner.util.values import Json, JsonView
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
@@ -206,16 +206,18 @@ def _overview(
 
 def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
     number, live = _job_of(run, jobs)
-    summary = live or (_done_by(run) if not run.can_train_again and run.status == "running" else run.summary)
+    done, results, environment, damage = _recorded(run)
+    summary = live or done
+    if run.can_train_again:
+        results = Summary(last_evaluation=EvaluationMetrics.of(summary.get("last_evaluation") or {}))
     episodes = summary.get("episode", summary.get("episodes"))
     trial_steps = summary.get("eval_steps")
     taken = {
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
     }
-    environment, damage = _environment(run)
     facts = {"Environment": environment} if environment else {}
-    facts |= _results(run, EvaluationMetrics.of(summary.get("last_evaluation") or {})) | {
+    facts |= _results(run, results) | {
         **(taken if has_environment(run.file.config) else {}),
         **({"Evaluation steps": humanize.number(trial_steps, 0)} if trial_steps or live else {}),
         "Time": _duration(run),
@@ -241,28 +243,27 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
     )
 
 
-def _environment(run: Run) -> tuple[str, str]:
-    """Return what a run's environment consists of, and what is wrong with the recording of a finished run."""
+def _recorded(run: Run) -> tuple[JsonView, Summary, str, str]:
+    """Return how far a run is, a loop's last results, what its environment consists of, and its damage."""
+    done: JsonView = run.summary
+    results, environment = Summary(), ""
     try:
         with open_recording(run.recording) as recording:
-            return str(composition_of(recording) or ""), damage_of(run, recording)
+            environment = str(composition_of(recording) or "")
+            if not run.can_train_again:
+                results = loop_summary(recording)
+                if run.status == "running":
+                    done = {**recording.done(), "bytes": recording.file.size}
+            return done, results, environment, damage_of(run, recording)
     except RecordingError as error:
-        return "", str(error) if run.status == "finished" else ""
+        return done, results, environment, str(error) if run.status == "finished" else ""
 
 
-def _done_by(run: Run) -> Json:
-    """Return what a loop that is being recorded has done so far."""
-    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return {**recording.done(), "bytes": recording.file.size}
-    return {}
-
-
-def _results(run: Run, last: EvaluationMetrics) -> dict[str, str]:
+def _results(run: Run, results: Summary) -> dict[str, str]:
     """Return the last results of a run by name; of a loop, the known ones."""
-    if run.can_train_again:
-        return dict(result_of(metric, last) for metric in METRICS if not metric.per_agent)
-    results = last_results(run)
     evaluation = results.last_evaluation or EvaluationMetrics()
+    if run.can_train_again:
+        return dict(result_of(metric, evaluation) for metric in METRICS if not metric.per_agent)
     measures = dict(result_of(metric, evaluation) for metric in METRICS)
     known = {name: text for name, text in measures.items() if humanize.UNKNOWN not in text}
     return known | dict(islice(results_in_words(results).items(), MAX_RESULTS))

@@ -253,6 +253,14 @@ def test_repair_lists_losses_and_resume_restores_them(command, copied, recorded_
     assert command("verify", copied.run_id).exit_code == 0
 
 
+def test_verify_says_that_schemas_may_be_of_another_version(command, copied):
+    data = copied.recording.read_bytes()
+    copied.recording.write_bytes(data.replace(b"penalties", b"penaltieS"))
+    result = command("verify", copied.run_id)
+    assert result.exit_code == 1
+    assert "the recording is of another version or program, or damaged there" in result.stdout
+
+
 def test_after_a_repair_show_and_ls_say_what_is_left(command, copied):
     before = command.json("show", copied.run_id)
     os.truncate(copied.recording, int(0.6 * copied.recording.stat().st_size))

@@ -79,7 +79,7 @@ def test_a_page_of_episodes_leads_to_the_others(client):
     first = client.get("/api/v1/runs/first").json()["run_id"]
     page = page_of(client, "/runs/first/episodes?phase=eval&page=2")
     pages = re.findall(r'rel="(prev|next)" href="([^"]*)"', page)
-    assert pages[-1] == ("prev", f"/runs/{first}/episodes?phase=eval")
+    assert pages[-1] == ("prev", f"/runs/{first}/episodes?phase=eval&amp;order=number")
     assert page_of(client, f"/runs/first/episodes?phase=eval&page={10**8}").count("<tr") == 0
 
 
@@ -106,7 +106,7 @@ def test_episodes_come_in_the_order_that_is_chosen(client):
         key = {"newest": "episode", "best": "rank", "worst": "rank"}.get(order, "length")
         assert found[key] == values[20:50]
     page = page_of(client, "/runs/first/episodes?phase=eval&order=longest&page=2")
-    assert 'episodes?phase=eval&amp;order=longest"' in page.replace("&#38;", "&amp;")
+    assert 'episodes?phase=eval&amp;order=longest"' in page
 
 
 def sums(columns):
