@@ -9,6 +9,7 @@ All other parts of the project read recordings through this module.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from bisect import bisect_right
@@ -260,12 +261,13 @@ class Phase:
         return self.steps.blocks(self.steps.first_from("episode", start), end)
 
     def known_episodes(self) -> int:
-        """Return how many episodes `episode` finds: of one environment also those that only steps are of."""
-        ended = self.episodes.count()
-        if environment_count(self._recording) > 1 or not (total := self.steps.total()):
-            return ended
-        last = self.steps.numbered(range(total - 1, total))
-        return max([ended, *(int(rows["episode"][-1]) + 1 for rows in last)])
+        """Return how many episodes are known by their ends, or, of one environment, by their steps alone."""
+        count, total = self.episodes.count(), self.steps.total()
+        if environment_count(self._recording) == 1:
+            with contextlib.suppress(RecordingError):  # the last steps are damaged
+                for rows in self.steps.numbered(range(max(0, total - 1), total)):
+                    count = max(count, int(rows["episode"][-1]) + 1)
+        return count
 
     def episode(self, number: int) -> EpisodeSteps:
         """Return the steps of an episode, which are read later; also of one whose end is not recorded.
