@@ -1,5 +1,7 @@
 """Sweeps: many runs of one experiment with different values, from a grid, at random or by a search.
 
+parameters  the values to try
+strategies  how values are tried: a row each
 model       the contents of a sweep file
 loading     reading a sweep file, with located errors
 search      the values to try next, by Optuna

@@ -26,7 +26,7 @@ from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, ser
 from runner.export.plots.curves import HEIGHT, WIDTH, curves_section, panel_chart
 from runner.export.reports.rendering import render
 from runner.runs.resolve import find_run
-from runner.sweep.model import Range
+from runner.sweep.parameters import Parameter, Range
 from runner.sweep.results import Ranked, Results, sections, value_text, values_text
 from runner.util.arrays import Floats
 
@@ -142,7 +142,7 @@ def _nothing_to_draw(results: Results) -> str:
     return f"the sweep {results.sweep.name!r}: nothing to draw, as {reason}."
 
 
-def _axis(path: str, parameter: Range | list[object], trials: Sequence[Ranked]) -> ParameterAxis:
+def _axis(path: str, parameter: Parameter, trials: Sequence[Ranked]) -> ParameterAxis:
     if isinstance(parameter, Range):
         return ParameterAxis(
             path, (), parameter.log, np.array([trial.values.get(path, np.nan) for trial in trials])

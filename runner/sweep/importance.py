@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
-from runner.sweep.model import Parameter, Range
+from runner.sweep.parameters import Parameter, Range, count_of
 from runner.sweep.search import require_optuna
 from runner.util.arrays import Floats
 from runner.util.extras import require
@@ -83,14 +83,14 @@ def effects_of(
 
 
 def effects_of_grid(
-    parameters: Mapping[str, Range | list[object]], seed_values: Sequence[Sequence[float]]
+    parameters: Mapping[str, Parameter], seed_values: Sequence[Sequence[float]]
 ) -> list[Effect]:
     """Return main effects and interactions of a grid whose points were all completed, without a forest.
 
     `seed_values` is the objective at each seed, finite, of each point; the last parameter changes fastest.
     The interval is over resampled seeds.
     """
-    shape = tuple(each.steps + 1 if isinstance(each, Range) else len(each) for each in parameters.values())
+    shape = tuple(map(count_of, parameters.values()))
     names, rng = list(parameters), np.random.default_rng(0)
 
     def shares_of(points: Iterable[Floats]) -> dict[tuple[str, ...], float]:

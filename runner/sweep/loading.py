@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -19,7 +19,8 @@ from runner.config.problems import found, problems_at, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
 from runner.errors import CannotRedo, EnvironmentNotUsable
-from runner.sweep.model import Range, Sweep, SweepFile
+from runner.sweep.model import Sweep, SweepFile
+from runner.sweep.parameters import samples_of
 from runner.util.yaml_text import write_yaml
 
 MAX_NAME: Final = 50
@@ -172,7 +173,7 @@ def _with_checked_parameters(sweep: Sweep, document: Document, require: Require 
 
     errors = []
     for path, parameter in sweep.file.parameters.items():
-        for number, sample in enumerate(_samples(parameter)):
+        for number, sample in enumerate(samples_of(parameter)):
             try:
                 experiment = _valid_experiment(sweep, path, sample, document)
                 if number == 0 or path.split(".")[0] in ("env", "initial_q"):
@@ -191,7 +192,7 @@ def _with_checked_parameters(sweep: Sweep, document: Document, require: Require 
 def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
     """Return an experiment with a value of a parameter, and the first values of the others valid with it."""
     samples = {
-        key: [sample] if key == path else list(_samples(each)) for key, each in sweep.file.parameters.items()
+        key: [sample] if key == path else samples_of(each) for key, each in sweep.file.parameters.items()
     }
     problem = None
     for values in itertools.islice(itertools.product(*samples.values()), _MAX_COMBINATIONS):
@@ -201,13 +202,6 @@ def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Documen
             problem = problem or error
     assert problem is not None
     raise problem
-
-
-def _samples(parameter: Range | list[object]) -> Iterator[object]:
-    if isinstance(parameter, Range):
-        yield from (parameter.at(0), parameter.last)
-    else:
-        yield from parameter
 
 
 def _experiment(sweep: Sweep, values: Mapping[str, object], document: Document) -> ExperimentConfig:

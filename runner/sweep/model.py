@@ -3,95 +3,21 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from decimal import Decimal
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import SECTION_OF, Name, Seed, SeveralSeeds
 from runner.config.values import ConfigSection, Count, refusal
+from runner.sweep.parameters import MAX_TRIALS, Parameter
+from runner.sweep.strategies import STRATEGIES, Strategy, StrategyName
 from runner.util.values import Json, JsonView
 
-Strategy = Literal["grid", "random", "tpe", "genetic"]
 At = Literal["last", "best", "area", "first_over"]
 Direction = Literal["maximize", "minimize"]
-
-MAX_TRIALS: Final = 100_000
-
-
-def _number_kind(value: object) -> str | None:
-    if isinstance(value, float):
-        return "number"
-    return "integer" if isinstance(value, int) and not isinstance(value, bool) else None
-
-
-Number = Annotated[
-    Annotated[int, Field(ge=-(10**15), le=10**15), Tag("integer")] | Annotated[float, Tag("number")],
-    Discriminator(_number_kind),
-]
-
-
-class Range(ConfigSection):
-    """Numbers from `low` to `high`, both included; whole ones if both are whole."""
-
-    low: Number = Field(description="The lowest value.")
-    high: Number = Field(description="The highest value.")
-    log: bool = Field(default=False, description="Draw evenly in the logarithm, for values over magnitudes.")
-    step: Number | None = Field(default=None, description="Only low, low + step, ...; required by a grid.")
-
-    @model_validator(mode="after")
-    def _is_a_range(self) -> Self:
-        if not self.low < self.high:
-            raise refusal(("high",), f"found {self.high:g}, expected a number above low, {self.low:g}")
-        if self.log and self.low <= 0:
-            raise refusal(("low",), f"found {self.low:g}, expected a number above 0: log is true")
-        if self.step is not None and self.step <= 0:
-            raise refusal(("step",), f"found {self.step:g}, expected a number above 0")
-        if self.log and self.step is not None:
-            raise refusal(("step",), f"found {self.step:g}, but log is true: leave out one of them")
-        return self
-
-    @property
-    def is_integer(self) -> bool:
-        """Whether its values are whole numbers."""
-        return all(isinstance(bound, int) for bound in (self.low, self.high, self.step or 1))
-
-    @property
-    def steps(self) -> int:
-        """The number of whole steps from `low` up to `high`."""
-        low, high, step = (Decimal(str(number)) for number in (self.low, self.high, self.step or 1))
-        return int((high - low) / step)
-
-    def at(self, number: int) -> int | float:
-        """Return the value after this number of steps, in decimal arithmetic: 0.3, not 0.1 + 0.2."""
-        value = Decimal(str(self.low)) + number * Decimal(str(self.step or 1))
-        return int(value) if self.is_integer else float(value)
-
-    def nearest(self, value: float) -> int | float:
-        """Return the value of whole steps next to one that was added up in floating point."""
-        return value if self.step is None else self.at(round((value - self.low) / self.step))
-
-    @property
-    def last(self) -> int | float:
-        """The highest value that whole steps reach."""
-        return self.high if self.step is None else self.at(self.steps)
-
-
-def _parameter_kind(value: object) -> str | None:
-    if isinstance(value, Mapping | Range):
-        return "Range"
-    return "array" if isinstance(value, list | tuple) else None
-
-
-_Choices = Annotated[list[object], Field(min_length=1)]
-Parameter = Annotated[
-    Annotated[_Choices, Tag("array")] | Annotated[Range, Tag("Range")], Discriminator(_parameter_kind)
-]
-"""The values to try: each of a list, or numbers of a range."""
 
 
 class Objective(ConfigSection):
@@ -170,7 +96,9 @@ class SweepFile(ConfigSection):
     base: _Base = Field(
         description="The experiment: a configuration, or the path of one, relative to this file."
     )
-    strategy: Strategy = Field(description="Which values are tried: all of a grid, or `trials` of a search.")
+    strategy: StrategyName = Field(
+        description=" ".join(f"{name}: {strategy.text}." for name, strategy in STRATEGIES.items())
+    )
     parameters: Annotated[dict[str, Parameter], Field(min_length=1)] = Field(
         description="By path of the configuration, such as evaluation.trials: a list, or low and high."
     )
@@ -203,33 +131,15 @@ class SweepFile(ConfigSection):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        if self.strategy == "grid":
-            if self.trials is not None:
-                raise refusal(("trials",), f"found {self.trials}, but a grid tries all of its points")
-            for name, parameter in self.parameters.items():
-                if isinstance(parameter, Range) and parameter.step is None and not parameter.is_integer:
-                    raise refusal(("parameters", name), "found a range without step: a grid needs one")
-                if isinstance(parameter, Range) and parameter.log:
-                    raise refusal(("parameters", name, "log"), "found true, but a grid has steps")
-            if self.grid_points > MAX_TRIALS:
-                message = (
-                    f"found a grid of more points than {MAX_TRIALS:,}: take larger steps, or a strategy that "
-                    "tries some of them"
-                )
-                raise refusal(("parameters",), message)
-        elif self.trials is None:
-            raise refusal(("trials",), f"missing, expected a whole number: {self.strategy} has no end")
+        self.searched.check(self)
         if self.pruning is not None and self.objective.at == "first_over":
             raise refusal(("pruning",), "found one, but objective.at is first_over, which can come late")
         return self
 
     @property
-    def grid_points(self) -> int:
-        """The number of points of the grid of all parameters."""
-        return math.prod(
-            parameter.steps + 1 if isinstance(parameter, Range) else len(parameter)
-            for parameter in self.parameters.values()
-        )
+    def searched(self) -> Strategy:
+        """How its values are tried."""
+        return STRATEGIES[self.strategy]
 
 
 @dataclass(frozen=True)

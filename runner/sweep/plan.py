@@ -49,7 +49,7 @@ class Plan:
 def plan_of(sweep: Sweep) -> Plan:
     """Return what a sweep will take, measured by its first trial with one episode."""
     search = Search(sweep)
-    is_grid = sweep.file.strategy == "grid"
+    is_grid = sweep.file.searched.is_grid
     configs: list[ExperimentConfig] = []
     errors: list[ConfigError] = []
     for values in search.ask(search.trials if is_grid else sweep.file.batch):

@@ -18,7 +18,8 @@ from runner.analysis.compare import statistics
 from runner.analysis.compare.statistics import Estimate, bounded
 from runner.analysis.sections import Grid, Section
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
-from runner.sweep.model import Range, Sweep
+from runner.sweep.model import Sweep
+from runner.sweep.parameters import points_of, samples_of
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded_trials
 from runner.util.humanize import UNKNOWN, counted
 from runner.util.values import Json
@@ -68,8 +69,8 @@ class Results:
     def is_whole_grid(self) -> bool:
         """Whether every point of a grid was completed, each seed with a finite value."""
         return (
-            self.sweep.file.strategy == "grid"
-            and len(self.suggested) == self.sweep.file.grid_points
+            self.sweep.file.searched.is_grid
+            and len(self.suggested) == points_of(self.sweep.file.parameters.values())
             and all(trial.state == "finished" for trial in self.suggested)
             and all(_is_reached(value) for trial in self.suggested for value in trial.seed_values.values())
         )
@@ -83,10 +84,7 @@ class Results:
         parameters = self.sweep.file.parameters
         if self.is_whole_grid:
             return effects_of_grid(parameters, [list(trial.seed_values.values()) for trial in self.suggested])
-        unused = {
-            path: parameter.low if isinstance(parameter, Range) else parameter[0]
-            for path, parameter in parameters.items()
-        }
+        unused = {path: samples_of(parameter)[0] for path, parameter in parameters.items()}
         completed = [
             (unused | trial.values, trial.value)
             for trial in self.suggested

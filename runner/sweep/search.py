@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.sweep.model import Parameter, Range, Sweep
+import numpy as np
+
+from runner.sweep.model import Sweep
+from runner.sweep.parameters import Parameter, Range, count_of, points_of
 from runner.util.extras import require
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
-    from optuna.samplers import BaseSampler
     from optuna.trial import Trial
 
 _MAX_DRAWS: Final = 20
@@ -31,16 +33,17 @@ def require_optuna() -> ModuleType:
 
 
 class Search:
-    """Suggests values for trials; a grid or `tpe` suggests the values of a configuration once."""
+    """Suggests values for trials; a grid suggests the values of a configuration once."""
 
     def __init__(self, sweep: Sweep) -> None:
         self._optuna = require_optuna()
         self._sweep, self._file = sweep, (file := sweep.file)
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
-        self._study = self._optuna.create_study(sampler=self._sampler(), direction=file.objective.direction)
+        sampler = file.searched.sampler(self._optuna.samplers, file, file.search_seed % 2**32)
+        self._study = self._optuna.create_study(sampler=sampler, direction=file.objective.direction)
         self._asked_trials: list[Trial] = []
         self._suggested: set[str] = set()
-        self._points = self._distinct_points() if file.strategy == "grid" else []
+        self._points = self._distinct_points() if file.searched.is_grid else []
         self.trials = file.trials or len(self._points)
         """The number of trials of the whole search."""
 
@@ -48,10 +51,10 @@ class Search:
         """Return the values of the next trials, by path; fewer at the end of the search."""
         suggested = []
         for number in range(len(self._asked_trials), min(len(self._asked_trials) + count, self.trials)):
-            if self._file.strategy == "grid":
+            if self._points:
                 self._study.enqueue_trial(self._grid_point(self._points[number]))
             trial, values = self._draw()
-            if self._file.strategy == "tpe" and not self._file.repeats:
+            if self._file.searched.skips_repeats and not self._file.repeats:
                 # The same values would give the same runs, from which the search learns nothing.
                 for _ in range(_MAX_DRAWS):
                     if self._identity(values) not in self._suggested:
@@ -96,7 +99,7 @@ class Search:
 
     def _distinct_points(self) -> Sequence[int]:
         """Return the points of the grid, the first of those that differ in unused parameters alone."""
-        points = range(self._file.grid_points)
+        points = range(points_of(self._file.parameters.values()))
         if "algorithm" not in self._file.parameters:
             return points  # all parameters are used
         firsts: dict[str, int] = {}
@@ -106,15 +109,12 @@ class Search:
 
     def _grid_point(self, number: int) -> dict[str, object]:
         """Return a point of the grid, the last parameter changing fastest, as values for Optuna."""
-        point: dict[str, object] = {}
-        for path, parameter in reversed(self._file.parameters.items()):
-            if isinstance(parameter, Range):
-                number, at = divmod(number, parameter.steps + 1)
-                point[path] = parameter.at(at)
-            else:
-                number, at = divmod(number, len(parameter))
-                point[path] = json.dumps(parameter[at])
-        return point
+        parameters = self._file.parameters
+        at = np.unravel_index(number, [count_of(parameter) for parameter in parameters.values()])
+        return {
+            path: parameter.at(int(place)) if isinstance(parameter, Range) else json.dumps(parameter[place])
+            for place, (path, parameter) in zip(at, parameters.items(), strict=True)
+        }
 
     def _distribution(self, parameter: Parameter) -> BaseDistribution:
         kinds = self._optuna.distributions
@@ -128,13 +128,3 @@ class Search:
         return kinds.FloatDistribution(
             float(parameter.low), float(parameter.last), log=parameter.log, step=parameter.step
         )
-
-    def _sampler(self) -> BaseSampler:
-        samplers, batch, seed = self._optuna.samplers, self._file.batch, self._file.search_seed % 2**32
-        match self._file.strategy:
-            case "tpe":
-                return samplers.TPESampler(seed=seed, n_startup_trials=2 * batch)
-            case "genetic":
-                return samplers.NSGAIISampler(population_size=max(2, batch), seed=seed)
-            case _:
-                return samplers.RandomSampler(seed=seed)

@@ -84,7 +84,7 @@ class Trials:
         self.search = Search(sweep)
         self.done: list[Trial] = []
         """The trials of the batches that are over."""
-        adaptive = sweep.file.strategy not in ("grid", "random") or sweep.file.pruning is not None
+        adaptive = sweep.file.searched.is_adaptive or sweep.file.pruning is not None
         self._batch_size = sweep.file.batch if adaptive else self.search.trials
 
     def ask(self) -> list[Trial]:

@@ -34,7 +34,8 @@ from runner.util.values import checked_name
 
 if TYPE_CHECKING:
     from runner.cli.output import Part
-    from runner.sweep.model import Range, Sweep
+    from runner.sweep.model import Sweep
+    from runner.sweep.parameters import Parameter
     from runner.sweep.plan import Plan
     from runner.sweep.running import SweepStatus
     from runner.sweep.trials import Trials
@@ -238,7 +239,7 @@ def _plan(sweep: Sweep, plan: Plan) -> Reply:
     return Reply(dataclasses.asdict(plan) | more, [rows])
 
 
-def _range_text(parameter: list[object] | Range) -> str:
+def _range_text(parameter: Parameter) -> str:
     """Return the values of a parameter as text."""
     if isinstance(parameter, list):
         return ", ".join(map(str, parameter))

@@ -10,6 +10,7 @@ from sweeping import BASE, described
 from runner.config import ConfigError
 from runner.sweep.loading import from_values, load_sweep
 from runner.sweep.plan import plan_of
+from runner.sweep.strategies import STRATEGIES
 
 SHIPPED = sorted((Path(__file__).parents[3] / "configs" / "sweeps").glob("*.yaml"))
 
@@ -94,6 +95,11 @@ def test_an_unknown_reward_of_the_environment_is_reported_with_its_place(file):
     reply = refused(file, base=base, parameters={"env.kwargs.rewards.pick_up": [1, 2]})
     assert "small.yaml:" in reply
     assert "did you mean 'pickup'" in reply
+
+
+def test_the_documentation_has_the_strategies():
+    lines = (Path(__file__).parents[3] / "docs" / "sweeps.md").read_text().splitlines()
+    assert {f"| `{name}` | {strategy.text} |" for name, strategy in STRATEGIES.items()} <= set(lines)
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -21,7 +21,8 @@ from runner.runs.run import create_run
 from runner.sweep import local, state
 from runner.sweep.loading import from_values
 from runner.sweep.local import LocalWorkers
-from runner.sweep.model import Objective, Range
+from runner.sweep.model import Objective
+from runner.sweep.parameters import Range
 from runner.sweep.plan import plan_of
 from runner.sweep.results import ranking, results_of, sections
 from runner.sweep.running import run_sweep
