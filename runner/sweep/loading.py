@@ -18,7 +18,7 @@ from runner.config.model import SECTION_OF
 from runner.config.problems import found, problems_at, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
-from runner.errors import CannotRedo, EnvironmentNotUsable
+from runner.errors import RunnerError
 from runner.sweep.model import Sweep, SweepFile
 from runner.sweep.parameters import samples_of
 from runner.util.yaml_text import write_yaml
@@ -28,31 +28,30 @@ MAX_NAME: Final = 50
 _LEARNERS: Final = {"mode", "tables", "rewards"}
 _MAX_COMBINATIONS: Final = 64
 """Maximum number of combinations tried to find values that are valid together."""
-Require = Callable[[ExperimentConfig], None]
+Checks = Mapping[str, Callable[[ExperimentConfig], object]]
+"""By key of a configuration, such as `env`, a function that may refuse its value by a `RunnerError`."""
+NO_CHECKS: Final[Checks] = {}
 
 
-def load_sweep(path: str | os.PathLike[str], name: str | None = None) -> Sweep:
+def load_sweep(path: str | os.PathLike[str], name: str | None = None, checks: Checks = NO_CHECKS) -> Sweep:
     """Return the sweep that a YAML file describes, or a shipped one such as `modes`.
 
     The name replaces the one in the file, or the file's own without its ending. The `ConfigError` of a bad
-    file has a line for each problem, with file, line, column and key.
+    file has a line for each problem, with file, line, column and key; `checks` as for `from_text`.
     """
     file = config_path(path)
     document = read_yaml(read_text(file), str(file))
-    return _with_checked_parameters(_sweep(document, name, file.stem, file.parent), document)
+    return _checked(_sweep(document, name, file.stem, file.parent), document, checks)
 
 
-def from_text(text: str, source: str, require: Require = lambda *_: None) -> Sweep:
+def from_text(text: str, source: str, checks: Checks = NO_CHECKS) -> Sweep:
     """Return the sweep that the text of a file describes, which cannot name another file as its base.
 
     `source` is the file's name, for messages and as the default name of the sweep; errors as of `load_sweep`.
-    `require` is called with the base, and with experiments before their environments are made; it may refuse.
+    The checks are called with the base, and with experiments before their environments are made.
     """
     document = read_yaml(text, source)
-    sweep = _sweep(document, None, Path(source).stem, None)
-    with problems_at(("base",), document, CannotRedo, ConfigError):
-        require(sweep.base)
-    return _with_checked_parameters(sweep, document, require)
+    return _checked(_sweep(document, None, Path(source).stem, None), document, checks)
 
 
 def from_values(values: Mapping[str, object]) -> Sweep:
@@ -167,20 +166,22 @@ def _places(places: Mapping[tuple[str, ...], Place], key: str) -> dict[tuple[str
     return {where[1:]: place for where, place in places.items() if where[:1] == (key,)}
 
 
-def _with_checked_parameters(sweep: Sweep, document: Document, require: Require = lambda *_: None) -> Sweep:
+def _checked(sweep: Sweep, document: Document, checks: Checks) -> Sweep:
     """Return the sweep; try every bound and choice of each parameter, with values of the others that fit."""
     from runner.environments.loading import load_mdp
 
+    for key, check in checks.items():
+        with problems_at(("base", key), document, RunnerError):
+            check(sweep.base)
     errors = []
     for path, parameter in sweep.file.parameters.items():
         for number, sample in enumerate(samples_of(parameter)):
             try:
                 experiment = _valid_experiment(sweep, path, sample, document)
                 if number == 0 or path.split(".")[0] in ("env", "initial_q"):
-                    with problems_at(
-                        ("parameters", path), document, CannotRedo, ConfigError, EnvironmentNotUsable
-                    ):
-                        require(experiment)
+                    with problems_at(("parameters", path, number), document, RunnerError):
+                        for check in checks.values():
+                            check(experiment)
                         load_mdp(experiment.env.id, experiment.env.kwargs, experiment.rewards)
             except ConfigError as error:
                 errors.append(error)

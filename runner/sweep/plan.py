@@ -69,7 +69,7 @@ def plan_of(sweep: Sweep) -> Plan:
 
 def _measured_bytes(config: ExperimentConfig, mdp: Mdp, metric: str) -> int:
     """Return the bytes of a run of one episode, which must have readings of the metric."""
-    values = config.to_mapping()
+    values = config.to_mapping() | {"initial_q": 0.0}  # there are no other runs in a temporary folder
     if config.evaluation is not None:
         values["evaluation"] |= {"every": 1, "trials": 1}
     short = from_mapping(values, ["episodes=1"])

@@ -12,10 +12,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
+from runner.config import from_mapping
 from runner.config.document import read_yaml
 from runner.config.job import identity_of
 from runner.config.loading import read_text
 from runner.errors import ConfigError, RunnerError, nearest
+from runner.execution.initial_tables import resolve_initial_q
 from runner.execution.resume import require_same_makers
 from runner.runs.listing import list_runs
 from runner.runs.locking import acquired
@@ -56,6 +58,26 @@ def read_sweep(name: str, recordings: Path) -> Sweep:
         return from_values({"repeats": True} | read_yaml(read_text(path), str(path)).value)
     except (ConfigError, TypeError, ValueError) as error:
         raise RunnerError(f"{path}: no longer describes a sweep: {error}") from error
+
+
+def with_resolved_tables(sweep: Sweep, recordings: Path) -> Sweep:
+    """Return a sweep with the ids and steps of the runs whose Q-tables its trials start from.
+
+    The runs of a sweep are found by their configurations, which have ids and steps.
+    """
+    values = sweep.to_mapping()
+
+    def resolved(table: object) -> object:
+        if not isinstance(table, Mapping) or "run" not in table:
+            return table
+        config = from_mapping(values["base"] | {"initial_q": table})
+        return resolve_initial_q(config, recordings).to_mapping()["initial_q"]
+
+    base, parameters = values["base"], values["parameters"]
+    base["initial_q"] = resolved(base["initial_q"])
+    if isinstance(choices := parameters.get("initial_q"), list):
+        parameters["initial_q"] = [resolved(choice) for choice in choices]
+    return from_values(values)
 
 
 def begin(sweep: Sweep, recordings: Path, resume: bool, accept_changes: bool) -> None:

@@ -86,13 +86,17 @@ def run(
       dualtaxi sweep run hyperparameters --resume
     """
     from runner.api import interruptible
+    from runner.execution.initial_tables import resolve_initial_q
     from runner.sweep.loading import load_sweep
     from runner.sweep.plan import plan_of
     from runner.sweep.search import require_optuna
+    from runner.sweep.state import with_resolved_tables
     from runner.sweep.whole import run_whole_sweep
 
     require_optuna()
-    sweep = load_sweep(file, checked_name(name))
+    folder = recordings_folder(recordings)
+    checks = {"initial_q": lambda config: resolve_initial_q(config, folder)}
+    sweep = with_resolved_tables(load_sweep(file, checked_name(name), checks), folder)
     if dry_run:
         return _plan(sweep, plan_of(sweep))
 
@@ -107,7 +111,7 @@ def run(
     ):
         trials, status = run_whole_sweep(
             sweep,
-            recordings_folder(recordings),
+            folder,
             workers,
             ray,
             resume=is_resumed,

@@ -93,11 +93,15 @@ def _check_config(text: str, source: str, document: Document, recordings: Path) 
 def _check_sweep(text: str, source: str, document: Document, recordings: Path) -> CheckedJob:
     require_optuna()
 
-    def require(experiment: ExperimentConfig) -> None:
-        require_listed(experiment.env.id, experiment.env.kwargs)
-        refuse_path(experiment)
+    def require_run(config: ExperimentConfig) -> None:
+        refuse_path(config)
+        resolve_initial_q(config, recordings)
 
-    sweep = sweep_from_text(text, source, require)
+    checks = {
+        "env": lambda config: require_listed(config.env.id, config.env.kwargs),
+        "initial_q": require_run,
+    }
+    sweep = state.with_resolved_tables(sweep_from_text(text, source, checks), recordings)
     values, runs = sweep.to_mapping(), Search(sweep).trials * len(sweep.seeds)
     if sweep.name in sweeps_in(recordings):
         before = state.read_sweep(sweep.name, recordings).to_mapping()

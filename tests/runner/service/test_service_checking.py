@@ -71,6 +71,7 @@ def test_mistakes_have_the_lines_of_the_file(tmp_path):
         ("episodes: 3\ninitial_q: {run: /etc/passwd}\n", 2, "found the path '/etc/passwd'"),
         ("episodes: 3\ninitial_q: {run: ../x.mcap}\n", 2, "found the path"),
         (SWEEP.replace("{env", "{initial_q: {run: a/b}, env"), 2, "found the path 'a/b'"),
+        (SWEEP.replace("10, e", "10,\n  initial_q: {run: a/b}, e"), 3, "found the path 'a/b'"),
         (SWEEP.replace("{step_size: [0.1,", "{initial_q: [{run: x.mcap},"), 4, "found the path 'x.mcap'"),
         (SWEEP.replace("{step_size: [0.1, 0.5, 1.0]", "{initial_q.run: [/x]"), 4, "found the path '/x'"),
         ("base: cooperative.yaml\nstrategy: grid\nparameters: {discount: [0.1]}\n", 1, "found the path"),

@@ -6,10 +6,11 @@ import json
 
 import pytest
 from click.testing import CliRunner
-from sweeping import Here
+from sweeping import BASE, Here
 
+import runner
 from runner.cli import cli
-from runner.config import load
+from runner.config import from_mapping, load
 from runner.runs.listing import list_runs
 from runner.sweep import cluster, plan
 
@@ -65,6 +66,16 @@ def test_existing_runs_are_finished_despite_a_limit(type_in, file, tmp_path):
     again = type_in("run", str(file(limits={"runs": 4})), "--workers", "1", "--resume", "--json", code=1)
     assert json.loads(again.stdout)["done"] == 4
     assert {run.status for run in list_runs(tmp_path / "runs")} == {"finished"}
+
+
+def test_trials_start_from_the_table_of_a_run(type_in, file, tmp_path):
+    parameters = {"initial_q": [0, {"run": "start"}]}
+    path = str(file(strategy="grid", trials=None, parameters=parameters, seeds=[0]))
+    assert "small.yaml:20:5: parameters.initial_q[1]: no run 'start'" in type_in("run", path, code=2).output
+    runner.run(from_mapping(BASE, name="start"), recordings=tmp_path / "runs")
+    type_in("run", path, "--workers", "1")
+    type_in("run", path, "--workers", "1", "--resume")
+    assert len(list_runs(tmp_path / "runs")) == 3
 
 
 def test_a_full_disk_is_reported_before_anything_runs(type_in, file, monkeypatch, tmp_path):
