@@ -22,7 +22,7 @@ from runner.export.rerun.layout import OVERVIEW
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.selection import MAX_MEMBERS, time_of
 from runner.export.rerun.steps import Batch
-from runner.export.rerun.tracks import Times, Track, TrackRow, TrackView, Writer, in_tracks, scalars, times_of
+from runner.export.rerun.tracks import Times, Track, TrackView, Writer, scalars, times_of
 from runner.export.values import FEW, acted, number_names, observed
 from runner.recording import schema
 from runner.recording.messages import decode_array, frame_place, media_type
@@ -36,8 +36,6 @@ MAX_BARS: Final = 16
 """Extras of more numbers are drawn as bars."""
 MAX_LINES: Final = 24
 """Observations or actions of more numbers are not drawn as lines."""
-FRAMES_SENT: Final = 64
-"""Pictures of an environment that are sent at once."""
 LOG: Final = TrackView("log", "Log", rrb.TextLogView)
 OBSERVED: Final = {"observation": observed, "action": acted}
 
@@ -80,7 +78,7 @@ class LoopTracks:
 
     @property
     def still(self) -> Iterator[Track]:
-        """Everything but the steps: episodes and recorded frames."""
+        """Everything but the steps: episodes, and recorded frames at the steps of their environments."""
         for block in self._of_phase.episodes.blocks():
             for member in self._members:
                 own = block[member.is_own(block)]
@@ -90,10 +88,6 @@ class LoopTracks:
                     if member.column == 0:  # agents have one length
                         named = member._replace(name="") if member.agent else member
                         yield self._line(named, "length", times, own["length"][:, np.newaxis])
-        yield from in_tracks(self._frames(), FRAMES_SENT)
-
-    def _frames(self) -> Iterator[TrackRow]:
-        """Yield recorded frames, at the steps of their environments."""
         recording, is_each_step = self._recording, frames_every(self._recording) == 1
         for frame in self._of_phase.frames.decoded():
             environment, _ = frame_place(frame)
@@ -137,14 +131,13 @@ class LoopTracks:
         entity, title = _entity(self._phase, member.name, quantity), f"{member.name} {name}".strip()
         texts = TrackView("texts", title, rrb.TextDocumentView)
         bars = TrackView("bars", title, rrb.BarChartView)
-        rows = []
         for step, value in zip(times["step"][is_given].tolist(), values.data[is_given], strict=True):
             if isinstance(value, str):
                 text = rr.TextDocument(value.encode(errors="replace").decode())
-                rows.append(TrackRow(entity, step, text, texts))
+                yield Track(entity, view=texts, row=(step, text))
             elif value.size:
-                rows.append(TrackRow(entity, step, rr.BarChart(value.ravel().astype(np.float64)), bars))
-        yield from in_tracks(rows)
+                chart = rr.BarChart(value.ravel().astype(np.float64))
+                yield Track(entity, view=bars, row=(step, chart))
 
     def _line(
         self, member: Member, quantity: str, times: Times, values: Array, names: Sequence[str] = ("",)
@@ -176,7 +169,7 @@ class LoopTracks:
         view = TrackView(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
         return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
-    def drawn(self) -> Iterator[TrackRow]:
+    def drawn(self) -> Iterator[Track]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
         recording, phase, selection = self._recording, self._phase, self._writer.selection
         trust, episodes = selection.trust, selection.drawn.get(phase, ())
@@ -202,7 +195,7 @@ class LoopTracks:
             notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
         for note in notes:
             selection.warnings.append(note)
-            yield TrackRow("log", self._writer.last, rr.TextLog(note, level="WARN"), LOG)
+            yield Track("log", view=LOG, row=(self._writer.last, rr.TextLog(note, level="WARN")))
 
     def _is_later(self, environment: int, step: int) -> bool:
         """Return whether a picture is later than the one before.
@@ -213,10 +206,10 @@ class LoopTracks:
         self._pictured[environment] = step
         return before < step
 
-    def _frame(self, environment: int, step: int, shown: rr.AsComponents) -> TrackRow:
+    def _frame(self, environment: int, step: int, shown: rr.AsComponents) -> Track:
         entity = _entity(self._phase, self._environment(environment), "frame")
         view = TrackView(self._phase, entity.replace("/", " "), rrb.Spatial2DView)
-        return TrackRow(entity, step, shown, view)
+        return Track(entity, view=view, row=(step, shown))
 
     def _environment(self, number: int) -> str:
         return f"env_{number}" if self._recording.environments > 1 else ""
@@ -224,17 +217,18 @@ class LoopTracks:
 
 def logged_tracks(recording: Recording) -> Iterator[Track]:
     """Yield what a loop logged: pictures, arrays, texts and numbers."""
-    yield from in_tracks(_named(recording), 1)  # they may be large
-    texts = (
-        TrackRow(
-            "log",
-            time_of(text),
-            rr.TextLog(f"{text['name']}: {text['message']}", level="INFO"),
-            LOG,
-        )
-        for text in recording.table(schema.LOG_TOPIC).decoded()
-    )
-    yield from in_tracks(texts)
+    for image in recording.table(schema.IMAGE_TOPIC).decoded():
+        if data := _still(image["data"]):
+            name = entity_name(image["frame_id"])
+            view = TrackView("picture", name, rrb.Spatial2DView)
+            yield Track(f"picture/{name}", view=view, row=(time_of(image), _picture(data)))
+    for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
+        name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
+        view = TrackView("array", name, rrb.TensorView)
+        yield Track(f"array/{name}", view=view, row=(time // schema.STEP_NANOSECONDS, tensor))
+    for text in recording.table(schema.LOG_TOPIC).decoded():
+        line = rr.TextLog(f"{text['name']}: {text['message']}", level="INFO")
+        yield Track("log", view=LOG, row=(time_of(text), line))
     for series, rows in recording.scalars():
         names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
         for name in dict.fromkeys(names.tolist()):
@@ -242,19 +236,6 @@ def logged_tracks(recording: Recording) -> Iterator[Track]:
             times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
             values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
             yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
-
-
-def _named(recording: Recording) -> Iterator[TrackRow]:
-    """Yield logged pictures and arrays."""
-    for image in recording.table(schema.IMAGE_TOPIC).decoded():
-        if data := _still(image["data"]):
-            name = entity_name(image["frame_id"])
-            view = TrackView("picture", name, rrb.Spatial2DView)
-            yield TrackRow(f"picture/{name}", time_of(image), _picture(data), view)
-    for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
-        name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
-        view, step = TrackView("array", name, rrb.TensorView), time // schema.STEP_NANOSECONDS
-        yield TrackRow(f"array/{name}", step, tensor, view)
 
 
 def _entity(*parts: str) -> str:

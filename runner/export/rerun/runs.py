@@ -12,7 +12,7 @@ import rerun as rr
 
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import GridLabels
-from runner.export.rerun.loops import FRAMES_SENT, LoopTracks, logged_tracks
+from runner.export.rerun.loops import LoopTracks, logged_tracks
 from runner.export.rerun.metrics import EVENTS, mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
@@ -24,7 +24,6 @@ from runner.export.rerun.tracks import (
     Track,
     Writer,
     cleared,
-    in_tracks,
     scalars,
     text_track,
     times_of,
@@ -110,7 +109,7 @@ class RunReader:
                 yield from cleared(f"{phase}/{part}", stops)
         if not is_job:
             for maker, *_ in self._makers.values():
-                yield from in_tracks(maker.drawn(), FRAMES_SENT)
+                yield from maker.drawn()
         elif scene and self._labels:
             yield from self._notice(scene.columns / 2, scene.rows / 2)
 

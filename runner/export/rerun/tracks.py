@@ -57,15 +57,8 @@ class Track:
     """Components of as many rows as there are times."""
     static: Sequence[Any] = ()
     view: TrackView | None = None
-
-
-class TrackRow(NamedTuple):
-    """What an entity shows from a step on."""
-
-    entity: str
-    step: int
-    shown: rr.AsComponents
-    view: TrackView | None = None
+    row: tuple[int, rr.AsComponents] | None = None
+    """A step, and what is shown from it on: a single row, which Rerun sends together with others."""
 
 
 @dataclass(eq=False)
@@ -101,6 +94,10 @@ class Writer:
                     self.stream.log(entity, archetype, static=True)
             if view := track.view:
                 self.views.setdefault((view.group, view.name), (view, {}))[1][entity] = None
+            if track.row:
+                step, shown = track.row
+                self.stream.set_time("step", sequence=step)
+                self.stream.log(entity, shown)
             if track.times:
                 steps = track.times["step"]
                 if "episode" in track.times:
@@ -144,27 +141,6 @@ def columns(archetype: object, **parts: Array) -> list[rr.ComponentColumn]:
 def scalars(values: Array) -> list[rr.ComponentColumn]:
     """Return the column of series, [n, series]."""
     return columns(rr.Scalars, scalars=values.astype(np.float64, copy=False))
-
-
-def in_tracks(rows: Iterable[TrackRow], size: int = MAX_ROWS) -> Iterator[Track]:
-    """Yield rows as tracks, at most `size` rows of an entity at once; they have the same components."""
-    waiting: dict[tuple[str, type], list[TrackRow]] = {}
-    for row in rows:
-        key = row.entity, type(row.shown)
-        group = waiting.setdefault(key, [])
-        group.append(row)
-        if len(group) == size:
-            yield _track_of(waiting.pop(key))
-    yield from map(_track_of, waiting.values())
-
-
-def _track_of(rows: Sequence[TrackRow]) -> Track:
-    shown = []
-    for batches in zip(*(row.shown.as_component_batches() for row in rows), strict=True):
-        items = pa.concat_arrays([batch.as_arrow_array() for batch in batches])
-        descriptor = batches[0].component_descriptor()
-        shown.append(rr.ComponentColumn(descriptor, rr.AnyBatchValue(descriptor, items)))
-    return Track(rows[0].entity, {"step": np.array([row.step for row in rows])}, shown, view=rows[0].view)
 
 
 def cleared(entity: str, steps: Array | Sequence[int]) -> Iterator[Track]:

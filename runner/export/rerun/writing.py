@@ -32,6 +32,7 @@ def export(
         temporary = stack.enter_context(new_file(path, force=True))
         temporary.touch()  # where no file can be created, Rerun would not raise an OSError
         stream.save(temporary)
+        stream.set_log_time_enabled(False)
         writers = [
             Writer(stream, recording, selection, f"{run.title} ({run.run_id})", run.marks, stage=stage)
             for run, recording, selection in zip(runs, recordings, selections, strict=True)
