@@ -16,10 +16,14 @@ from runner.recording.metrics import METRICS
 
 FRAMES_PER_SECOND: Final = 10.0
 OVERVIEW: Final = "Overview"
-"""The tab of a loop for lines of all its environments; other tabs are groups of their own."""
+"""The tab for metrics of a job, or lines of all environments of a loop; other groups have their own."""
 PICTURES: Final = ("train", "eval", "picture")
-SHARES: Final = {"grid": 4, "train": 3, "eval": 3, "picture": 3, "array": 2, "log": 1}
-"""The groups at the left of a loop, with their shares of the height; pictures share one."""
+SHARES: Final = {"grid": 4.0, **dict.fromkeys(PICTURES, 3.0), "array": 2.0, "events": 4 / 3, "log": 1.0}
+"""The groups at the left, with their shares of the height; pictures share one."""
+VALUES: Final = "values"
+"""The group in the middle: the table of values above, their maps below."""
+FURTHER: Final = ("bars", "logged")
+"""Groups in the overview, too."""
 MAX_SHOWN: Final = {**dict.fromkeys(PICTURES, MAX_MEMBERS), "array": 2, "bars": 2, "logged": 6}
 """Views of a group in the blueprint; all are sent."""
 PLOTS: Final = {
@@ -36,8 +40,8 @@ Shown = rrb.View | rrb.Container
 def blueprint(runs: Sequence[Writer]) -> rrb.Blueprint:
     """Return the arrangement of runs, jobs above loops, with the panels around it."""
     jobs = [run for run in runs if run.recording.has_tables]
-    parts = [_jobs(jobs)] if jobs else []
-    parts += [_loop(run) for run in runs if run not in jobs]
+    loops = [run for run in runs if run not in jobs]
+    parts = [_compared(jobs), *map(_alone, loops)] if len(jobs) > 1 else [*map(_alone, jobs + loops)]
     return rrb.Blueprint(
         parts[0] if len(parts) == 1 else rrb.Vertical(*parts),
         rrb.TimePanel(state="collapsed", timeline="step", fps=FRAMES_PER_SECOND, play_state="paused"),
@@ -47,24 +51,43 @@ def blueprint(runs: Sequence[Writer]) -> rrb.Blueprint:
     )
 
 
-def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
-    """Return the arrangement of one job, or of several side by side."""
+def _alone(run: Writer) -> rrb.Container:
+    """Return the arrangement of a run: its pictures at the left, values in the middle, lines at the right."""
+    left: list[tuple[Shown, float]] = []
+    for group, share in SHARES.items():
+        views: list[Shown] = [*_group(run, group)]
+        if group in PICTURES and views:
+            views = [rrb.Grid(*views, grid_columns=math.ceil(math.sqrt(len(views))))]
+        left += [(view, share) for view in views]
+    tabs = [
+        rrb.Grid(*_group(run, tab, *(FURTHER if tab == OVERVIEW else ())), grid_columns=2, name=tab)
+        for tab in dict.fromkeys([OVERVIEW, *(group for group, _ in run.views)])
+        if tab not in (*SHARES, VALUES, *FURTHER)
+    ]
+    right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
+    columns: list[tuple[Shown, float]] = []
+    if left:
+        shown, heights = zip(*left, strict=True)
+        recording = run.recording
+        is_wide = recording.has_tables or max(recording.environments, len(recording.agents)) > 1
+        columns.append((rrb.Vertical(*shown, row_shares=heights), 3.0 if is_wide else 2.0))
+    if values := _group(run, VALUES):
+        table, *maps = values
+        below: list[Shown] = [rrb.Horizontal(*maps)] if len(maps) > 1 else [*maps]
+        columns.append((rrb.Vertical(table, *below), 2.25))
+    parts, widths = zip(*columns, (right, 3.0), strict=True)
+    return rrb.Horizontal(*parts, column_shares=widths, name=run.title)
+
+
+def _compared(jobs: Sequence[Writer]) -> rrb.Container:
+    """Return the arrangement of several jobs: side by side, above the lines of all."""
     last, plots = max(job.last for job in jobs), []
     for title in dict.fromkeys(PLOTS.values()):
-        if shown := [job.views["plots", title] for job in jobs if ("plots", title) in job.views]:
+        if shown := [job.views[OVERVIEW, title] for job in jobs if (OVERVIEW, title) in job.views]:
             entities = [entity for _, of_job in shown for entity in of_job]
             plots.append(_drawn(shown[0][0], "/", entities, last))
-    if len(jobs) == 1:
-        columns: list[Shown] = [rrb.Grid(*plots, grid_columns=2)]
-        if values := _group(jobs[0], "values"):
-            table, *maps = values
-            grid = _group(jobs[0], "grid", "events")
-            below: list[Shown] = [rrb.Horizontal(*maps)] if len(maps) > 1 else [*maps]
-            middle = rrb.Vertical(table, *below, row_shares=[1, 1]) if below else table
-            columns = [rrb.Vertical(*grid, row_shares=[3, 1]), middle, *columns]
-        return rrb.Horizontal(*columns, column_shares=[4, 3, 4] if values else [1])
     halves = [
-        rrb.Horizontal(*grid, rrb.Tabs(*_group(job, "values", "events")), name=job.title)
+        rrb.Horizontal(*grid, rrb.Tabs(*_group(job, VALUES, "events")), name=job.title)
         for job in jobs
         if (grid := _group(job, "grid"))
     ]
@@ -73,35 +96,12 @@ def _jobs(jobs: Sequence[Writer]) -> rrb.Container:
     return rrb.Vertical(rrb.Horizontal(*halves), tabs, row_shares=[7, 3]) if halves else tabs
 
 
-def _loop(loop: Writer) -> rrb.Container:
-    """Return the arrangement of a loop: its pictures at the left, its lines at the right."""
-    left: list[tuple[Shown, int]] = []
-    for group, share in SHARES.items():
-        views: list[Shown] = [*_group(loop, group)]
-        if group in PICTURES and views:
-            views = [rrb.Grid(*views, grid_columns=math.ceil(math.sqrt(len(views))))]
-        left += [(view, share) for view in views]
-    further = ("bars", "logged")
-    tabs = [
-        rrb.Grid(*_group(loop, tab, *(further if tab == OVERVIEW else ())), grid_columns=2, name=tab)
-        for tab in dict.fromkeys([OVERVIEW, *(group for group, _ in loop.views)])
-        if tab not in (*SHARES, *further)
-    ]
-    right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
-    if not left:
-        return rrb.Vertical(right, name=loop.title)
-    shown, shares = zip(*left, strict=True)
-    column = rrb.Vertical(*shown, row_shares=shares)
-    recording = loop.recording
-    share = 3 if max(recording.environments, len(recording.agents)) > 1 else 2
-    return rrb.Horizontal(column, right, column_shares=[share, 3], name=loop.title)
-
-
 def _group(run: Writer, *groups: str) -> list[rrb.View]:
     """Return the views of groups, as many as are shown."""
-    views = []
+    views, titles = [], [*PLOTS.values()]
     for group in groups:
         of_group = [(view, entities) for view, entities in run.views.values() if view.group == group]
+        of_group.sort(key=lambda shown: titles.index(shown[0].name) if shown[0].name in titles else 0)
         if group in schema.PHASES:  # frames: environments by number
             of_group.sort(key=lambda shown: (len(shown[0].name), shown[0].name))
         for view, entities in of_group[: MAX_SHOWN.get(group)]:

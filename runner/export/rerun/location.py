@@ -12,7 +12,6 @@ from runner.analysis.diff import can_compare_steps, divergences
 from runner.analysis.diff.sections import where_in_words
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluation_after
-from runner.errors import NotInRecording
 from runner.export.rerun.selection import Request, evaluations_with_steps, select, time_of
 from runner.recording.reader import Recording, open_recording
 from runner.replay.recorded import ended_episode
@@ -47,9 +46,7 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
             added = {"evaluations": (*request.evaluations, step.after), "trials": (number,)}
         steps = recording.phase(step.phase).episode(number)
         if step.t >= len(steps):
-            raise NotInRecording(
-                f"{recording.path}: found no t = {step.t} there; the episode has {len(steps)} steps, from 0."
-            )
+            raise step.no_step(recording, len(steps), step.t)
         time = time_of(steps.one(step.t))
     if not request.everything:
         request = dataclasses.replace(request, with_default=request.is_default, **added)

@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
-from runner.export.rerun.layout import PLOTS
+from runner.export.rerun.layout import OVERVIEW, PLOTS
 from runner.export.rerun.tracks import (
     Colour,
     Floats,
@@ -42,6 +42,16 @@ EVENTS: Final = TrackView(
 _ONE_PHASE: Final = ("filled_percent", "reward_percent", "events", "episodes")
 """Metrics of several lines whose view shows one phase alone."""
 
+_FIELDS: Final = {
+    "train": {
+        "mean_length": "mean_length",
+        "filled_percent": "percent_filled",
+        **{name: name for name in SCHEDULES},
+    },
+    "eval": {metric.name: metric.field for metric in METRICS},
+}
+"""The metrics of each phase, and the fields of a message with their values."""
+
 Lines = tuple[str, Times, Array, Sequence[str]]
 """The path of an entity, its times, the values of its lines, [rows, lines], and their names.
 
@@ -53,12 +63,9 @@ def metric_tracks(run: Writer) -> Iterator[Track]:
     """Yield the tracks of all metrics of a job."""
     recording, evaluations = run.recording, run.recording.eval.all_metrics()
     reports = sorted([*recording.train.all_metrics(), *evaluations], key=lambda row: int(row["log_time"]))
-    learners, events = [spoken(name) for name in recording.agents], list(recording.mdp.event_names)
-    for path, times, values, given in itertools.chain(
-        _training_lines(reports, learners),
-        _evaluation_lines(evaluations, events),
-        _episode_lines(recording, reports, learners, events),
-    ):
+    learners = [spoken(name) for name in recording.agents]
+    lines = _reported_lines(reports, evaluations, list(recording.mdp.event_names))
+    for path, times, values, given in itertools.chain(lines, _episode_lines(recording, reports, learners)):
         phase, *_, name = path.split("/")
         owners = [f" {learner}" for learner in learners] if values.shape[1] > 1 else [""]
         names = given or [schema.PHASE_NAMES[phase] + owner for owner in owners]
@@ -66,23 +73,25 @@ def metric_tracks(run: Writer) -> Iterator[Track]:
         colours = phase_colours(phase, len(names), run.tint)
         if name in SCHEDULES:
             number = SCHEDULES.index(name)
-            colours = [line_colours(1 + len(SCHEDULES), run.tint)[1 + number]]
+            names, colours = [spoken(name)], [line_colours(1 + len(SCHEDULES), run.tint)[1 + number]]
             width = 3.0 - number  # visible on top of each other where their values are equal
-        elif name in _ONE_PHASE and len(names) > 1:
+        elif name == "filled_percent":
+            names = learners if len(learners) > 1 else ["filled"]
+        if name in _ONE_PHASE and len(names) > 1:
             colours = line_colours(len(names), run.tint)
         label = f"{recording.run_id} " if run.tint else ""
         static = [series_lines([label + name for name in names], colours, width)]
         legend = {"plot_legend": rrb.PlotLegend(visible=True)}
-        view = TrackView("plots", PLOTS[name], options=legend) if name in PLOTS else None
+        view = TrackView(OVERVIEW, PLOTS[name], options=legend) if name in PLOTS else None
         yield Track(path, times, scalars(values), static, view)
-    lines = [
-        f"evaluation after {row['episode']:,} episodes: "
-        + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
-        + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
-        for row in evaluations
-    ]
-    if lines:
-        yield log_track("eval/events", _times(evaluations), lines)
+    if evaluations:
+        texts = [
+            f"evaluation after {row['episode']:,} episodes: "
+            + (f"{row['success_percent']:.1f} % success, " if row["successes"] >= 0 else "")
+            + f"{row['eval_mean_length']:.1f} steps and {row['mean_penalties']:.1f} penalties per trial"
+            for row in evaluations
+        ]
+        yield log_track("eval/events", _times(evaluations), texts)
 
 
 def mark_tracks(run: Writer) -> Iterator[Track]:
@@ -97,70 +106,53 @@ def mark_tracks(run: Writer) -> Iterator[Track]:
         yield log_track("marks", times_of(times), lines)
 
 
-def log_track(
-    entity: str,
-    times: Times,
-    lines: Sequence[str],
-    levels: Sequence[str] = (),
-    view: TrackView | None = EVENTS,
-) -> Track:
+def log_track(entity: str, times: Times, lines: Sequence[str], levels: Sequence[str] = ()) -> Track:
     """Return a track of lines of the log, by default of the level INFO."""
     columns = rr.TextLog.columns(text=lines, level=levels or ["INFO"] * len(lines))
-    return Track(entity, times, columns, view=view)
+    return Track(entity, times, columns, view=EVENTS)
 
 
-def _training_lines(reports: Sequence[Message], learners: Sequence[str]) -> Iterator[Lines]:
-    """Yield what reports state of training."""
-    if not reports:
-        return
-    times = _times(reports)
-    yield "train/metrics/mean_length", times, _numbers(reports, "mean_length"), ()
-    filled = learners if len(learners) > 1 else ["filled"]
-    yield "train/metrics/filled_percent", times, _numbers(reports, "percent_filled"), filled
-    for name in SCHEDULES:
-        yield f"train/metrics/{name}", times, _numbers(reports, name), [spoken(name)]
+def _reported_lines(
+    reports: Sequence[Message], evaluations: Sequence[Message], events: Sequence[str]
+) -> Iterator[Lines]:
+    """Yield what reports state of training, and the results of evaluations."""
+    for phase, rows in zip(_FIELDS, (reports, evaluations), strict=True):
+        for name, field in _FIELDS[phase].items() if rows else ():
+            values = _numbers(rows, field)
+            if not np.isnan(values).all():
+                yield f"{phase}/metrics/{name}", _times(rows), values, ()
     counts = [dict(zip(row["rewards"], row["reward_counts"], strict=True)) for row in reports]
     if rewards := sorted({reward for row in counts for reward in row}):
         shares = [[100.0 * row.get(r, 0) / max(sum(row.values()), 1) for r in rewards] for row in counts]
-        yield "train/metrics/reward_percent", times, np.array(shares), [f"{reward:g}" for reward in rewards]
-
-
-def _evaluation_lines(evaluations: Sequence[Message], events: Sequence[str]) -> Iterator[Lines]:
-    """Yield the results of evaluations."""
-    if not evaluations:
-        return
-    times = _times(evaluations)
-    for metric in METRICS:
-        values = _numbers(evaluations, metric.field)
-        if not np.isnan(values).all():
-            yield f"eval/metrics/{metric.name}", times, values, ()
-    counts = _numbers(evaluations, "events") / _numbers(evaluations, "trials")
-    if events:
-        yield "eval/metrics/events", times, counts, [spoken(event) for event in events]
-    yield from _shared_events("eval", times, events, counts)
+        names = [f"{reward:g}" for reward in rewards]
+        yield "train/metrics/reward_percent", _times(reports), np.array(shares), names
+    if events and evaluations:
+        happened = _numbers(evaluations, "events") / _numbers(evaluations, "trials")
+        yield "eval/metrics/events", _times(evaluations), happened, [spoken(event) for event in events]
+        yield from _shared_events("eval", _times(evaluations), events, happened)
 
 
 def _episode_lines(
-    recording: Recording, reports: Sequence[Message], learners: Sequence[str], events: Sequence[str]
+    recording: Recording, reports: Sequence[Message], learners: Sequence[str]
 ) -> Iterator[Lines]:
     """Yield every episode, and the means over the training episodes that ended between two reports."""
+    events = list(recording.mdp.event_names)
     names = ["length", "penalties", *(f"return {name}" for name in learners), *events]
     ends = np.array([row["step"] for row in reports], np.int64)
-    # The last row is for episodes that ended after the last report.
-    sums, counts = np.zeros((len(reports) + 1, len(names))), np.zeros(len(reports) + 1)
-    for phase, (_, topic) in schema.PHASES.items():
-        for block in recording.table(topic).blocks():
+    # The last row is for episodes that ended after the last report, the last column counts them.
+    sums = np.zeros((len(reports) + 1, len(names) + 1))
+    for phase in recording.phases:
+        for block in phase.episodes.blocks():
             parts = [block[name] for name in ("length", "penalties", "returns", "events")]
-            values = np.column_stack(parts).astype(np.float64)
-            number = {"episode" if phase == "train" else "trial": block["episode"]}
-            yield f"{phase}/episodes", times_of(block["log_time"], **number), values, names
-            if phase == "train":
-                report = np.searchsorted(ends, block["last_step"].astype(np.int64) + 1)
-                np.add.at(sums, report, values)
-                counts += np.bincount(report, minlength=len(counts))
-    some = np.flatnonzero(counts[:-1])
+            values = np.column_stack([*parts, np.ones(len(block))])
+            is_training = phase.name == "train"
+            number = {"episode" if is_training else "trial": block["episode"]}
+            yield f"{phase.name}/episodes", times_of(block["log_time"], **number), values[:, :-1], names
+            if is_training:
+                np.add.at(sums, np.searchsorted(ends, block["last_step"].astype(np.int64) + 1), values)
+    some = np.flatnonzero(sums[:-1, -1])
     if len(some):
-        means, times = sums[some] / counts[some, None], _times([reports[k] for k in some.tolist()])
+        means, times = sums[some] / sums[some, -1:], _times([reports[k] for k in some.tolist()])
         _, penalties, returns, happened = np.split(means, (1, 2, 2 + len(learners)), axis=1)
         yield "train/metrics/mean_penalties", times, penalties, ()
         yield "train/metrics/mean_return", times, returns, ()

@@ -239,7 +239,8 @@ class MapTracks:
         """Yield where each step of a batch is in the map, and the maps that there are."""
         state, path, placements = batch.records["state"], self._path, self._placements
         here = self._here.take(state, axis=0)[:, None]
-        yield Track(f"{path}/here", batch.times, columns(rr.Boxes2D, centers=here))
+        boxes = columns(rr.Boxes2D, centers=here, half_sizes=np.full_like(here, 0.5))
+        yield Track(f"{path}/here", batch.times, boxes)
         if not (n := len(batch.map_rows)):
             return
         times, maps = batch.at(batch.map_rows), (batch.value_maps, batch.greedy_maps)
@@ -261,8 +262,7 @@ class MapTracks:
             f"as of step {time:,}\n{context}"
             for time, context in zip(times["step"].tolist(), contexts, strict=True)
         ]
-        sizes = columns(rr.Boxes2D, half_sizes=repeated(pairs([(0.5, 0.5)]), n))
         moves = columns(rr.Arrows2D, vectors=vectors)
-        for part, shown in (("", image), ("/here", sizes), ("/moves", moves), ("/stops", stops)):
+        for part, shown in (("", image), ("/moves", moves), ("/stops", stops)):
             yield Track(path + part, times, shown)
         yield text_track(f"{path}/label", times, (placements.width / 2, MAP_LABEL_Y), labels)

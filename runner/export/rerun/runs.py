@@ -13,7 +13,7 @@ import rerun as rr
 from runner.environments.naming import spoken
 from runner.export.rerun.labels import GridLabels
 from runner.export.rerun.loops import LoopTracks, logged_tracks
-from runner.export.rerun.metrics import EVENTS, mark_tracks, metric_tracks, phase_colours, series_lines
+from runner.export.rerun.metrics import mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.q_values import MapTracks, ValueReader, ValueTracks
 from runner.export.rerun.scene import background, scene_of
 from runner.export.rerun.selection import episodes_of
@@ -78,11 +78,8 @@ class RunReader:
                 if self._is_job:
                     text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
                     yield Track("notice/text", static=[text], view=view)
-        for phase, makers in self._makers.items():
-            if self._is_job and makers:
-                yield Track(f"{phase}/events", view=EVENTS)
-            for maker in makers:
-                yield from maker.still
+        for maker in chain.from_iterable(self._makers.values()):
+            yield from maker.still
 
     def steps(self) -> Iterator[Track]:
         """Yield the selected steps, then pictures that are drawn of them."""
@@ -96,8 +93,7 @@ class RunReader:
             for batch in _prefetched(batches) if is_job else batches:
                 if is_job:
                     yield Track(f"{phase}/reward", batch.times, scalars(batch.records["rewards"]), style)
-                are_unknown = is_job and not len(batch.values)
-                for maker in makers[:1] if are_unknown else makers:
+                for maker in makers:
                     yield from maker.of(batch)
                 if self._labels:
                     edges ^= batch.edges()  # no edge where a stretch continues the one before

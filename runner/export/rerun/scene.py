@@ -15,7 +15,7 @@ import rerun as rr
 from runner.drawing import palette
 from runner.drawing.svg import VEHICLES, wall_ends
 from runner.environments.mdp import Mdp
-from runner.environments.naming import action_names
+from runner.environments.naming import action_names, states_in_words
 from runner.environments.scene import SceneDescription
 from runner.export.rerun.tracks import GREY, Track, TrackView, centred, labels_alone, pairs
 from runner.util.arrays import Ints
@@ -125,20 +125,14 @@ class Placements:
         things = scene.passengers + scene.goals
         carriers = scene.carriers[:, things]
         where = np.where(carriers >= 0, -1 - carriers, scene.cells[:, things])
-        keys, context = np.unique(where, axis=0, return_inverse=True)
+        _, first, context = np.unique(where, axis=0, return_index=True, return_inverse=True)
         self.context = context.reshape(-1)
         """[S]: the number of each state's context."""
-        places = [str(divmod(cell, scene.columns)) for cell in range(scene.rows * scene.columns)]
-        for mark in scene.description["landmarks"]:
-            places[mark["cell"][0] * scene.columns + mark["cell"][1]] = mark["name"]
-        places += [f"in {label}" for label in reversed(scene.labels)]  # -1 is in the first thing
-        names = [
-            ", ".join(f"{scene.labels[i]} {places[k]}" for i, k in zip(things, key, strict=True))
-            for key in keys.tolist()
-        ]
+        words = [text.split(", ") for text in states_in_words(scene.mdp)[first]]
+        names = [", ".join(word for i, word in enumerate(parts) if i not in scene.movers) for parts in words]
         self.names = np.array(names, object)
-        """A description of each context: `passenger R, destination B`."""
-        self.states = np.full((len(keys), self.height * self.width), -1, np.int32)
+        """A description of each context: `passenger at R, destination B`."""
+        self.states = np.full((len(first), self.height * self.width), -1, np.int32)
         """[contexts, pixels]: the state at each pixel, row by row; -1 for none."""
         self.states[self.context, self.pixel] = np.arange(scene.mdp.states)
 

@@ -227,8 +227,8 @@ def _asked_episodes(request: Request, count: int, where: str) -> Ints:
 
 def _default_episodes(lengths: Ints, limit: int = DEFAULT_STEPS) -> Ints:
     """Return episodes evenly spread from the first to the last, as many as the limits allow."""
-    numbers = np.arange(min(len(lengths), 1))
-    for count in range(min(DEFAULT_EPISODES, len(lengths)), 1, -1):
+    numbers = np.arange(0)
+    for count in range(min(DEFAULT_EPISODES, len(lengths)), 0, -1):
         numbers = np.linspace(0, len(lengths) - 1, count).round().astype(np.int64)
         if lengths[numbers].sum() <= limit:
             break

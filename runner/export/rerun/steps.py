@@ -19,7 +19,7 @@ from runner.drawing import palette
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import events_in_words, states_in_words
 from runner.export.rerun.labels import GridLabels
-from runner.export.rerun.metrics import log_track, phase_colours, series_lines
+from runner.export.rerun.metrics import EVENTS, log_track, phase_colours, series_lines
 from runner.export.rerun.scene import Scene
 from runner.export.rerun.tracks import (
     GREY,
@@ -109,6 +109,7 @@ class StepTracks:
             for name, colour in zip(("state", "action"), phase_colours(phase, 2), strict=True):
                 parts[name] = [series_lines([f"{name} ({phase})"], [colour])]
         self.still = [Track(f"{phase}/{part}", static=static, view=view) for part, static in parts.items()]
+        self.still.append(Track(f"{phase}/events", view=EVENTS))
         """What never changes."""
 
     def of(self, batch: Batch) -> Iterator[Track]:
@@ -185,7 +186,7 @@ class StepTracks:
             kind = "episode" if self._phase == "train" else "trial"
             states = zip(batch.number[begins], self._states[records["state"][begins]], strict=True)
             lines = [f"{kind} {number:,} begins: {state}" for number, state in states]
-            yield log_track(entity, batch.at(begins), lines, view=None)
+            yield log_track(entity, batch.at(begins), lines)
         names = enumerate(mdp.event_names)
         masks = events & np.uint32(sum(1 << bit for bit, name in names if ".illegal" not in name))
         endings = np.where(records["terminated"], 1, 2 * records["truncated"])
@@ -196,7 +197,7 @@ class StepTracks:
                 text, level = self._entry(mask, ending)
                 lines.append(f"{text} after {t + 1} steps" if ending else text)
                 levels.append(level)
-            yield log_track(entity, batch.at(rows), lines, levels, view=None)
+            yield log_track(entity, batch.at(rows), lines, levels)
 
 
 def _entry(mdp: Mdp, mask: int, ending: int) -> tuple[str, str]:

@@ -84,7 +84,7 @@ class TestSelection:
             spans = select(recording, location.request).by_phase["train"]
         assert location.time == step["log_time"] // schema.STEP_NANOSECONDS
         assert any(span.start <= step["step"] < span.stop for span in spans)
-        with pytest.raises(RecordingError, match="no t = 999"):
+        with pytest.raises(RecordingError, match="found no step 999"):
             locate(run, Request(), EpisodeRef(7, 999))
         with pytest.raises(RecordingError, match="no trial 6 "):
             locate(run, Request(), EpisodeRef(6, after=20))

@@ -154,7 +154,7 @@ def test_episodes_of_a_vector_are_selected_and_located(tmp_path):
         assert chosen.stop - chosen.start < len(span) * N + N
         time = steps_of(recording)["log_time"][steps_of(recording)["step"] == span[2]]
     assert locate(run, Request(), EpisodeRef(4, 2, None)).time * schema.STEP_NANOSECONDS == time
-    with pytest.raises(RecordingError, match="found no t = 9999"):
+    with pytest.raises(RecordingError, match="has 29 steps, from 0; found no step 9,999"):
         locate(run, Request(), EpisodeRef(4, 9999, None))
     with pytest.raises(RecordingError, match="no training episode 999"):
         locate(run, Request(), EpisodeRef(999, 0, None))
