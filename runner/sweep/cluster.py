@@ -9,10 +9,9 @@ from __future__ import annotations
 import os
 import socket
 import threading
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable
 from types import ModuleType
-from typing import Any, Concatenate, Final, Generic, ParamSpec, Self, TypeVar
+from typing import Any, Concatenate, Final, ParamSpec, TypeVar
 
 from runner.errors import RunnerError
 from runner.sweep.local import CLOSE_SECONDS, LocalWorkers, R, Work, Workers
@@ -74,8 +73,8 @@ def _run(actor: RayActor, task: Work) -> object:
     return task.run(actor.stop)
 
 
-class RayWorkers(Generic[TaskT, R]):
-    """Actors of Ray, started when they are needed; each keeps what it has loaded.
+class RayWorkers(Workers[TaskT, R]):
+    """Actors of Ray; each keeps what it has loaded.
 
     There are at most `count`, None for one per processor of the cluster, and never more than `limit`; the
     address is as for `connect`.
@@ -84,18 +83,11 @@ class RayWorkers(Generic[TaskT, R]):
     def __init__(self, count: int | None, address: str | None, limit: int) -> None:
         self._ray = connect(address, count)
         processors = int(self._ray.cluster_resources().get("CPU", 1))
-        self._count = max(1, min(count or processors, limit))
+        super().__init__(max(1, min(count or processors, limit)))
         self._on_own_disk = address is not None
-        self._idle: list[Any] = []
-        self._busy: dict[Any, tuple[Any, TaskT]] = {}
-
-    @property
-    def idle(self) -> int:
-        """The number of tasks that can be started now."""
-        return self._count - len(self._busy)
 
     def submit(self, task: TaskT) -> None:
-        """Start a task on an idle worker."""
+        """Start a task on an idle actor, or a new one."""
         if not self._idle:  # a task and two other calls run at the same time
             options = {"num_cpus": 1, "max_concurrency": 3, "max_restarts": 0}
             self._idle.append(self._ray.remote(RayActor).options(**options).remote())
@@ -103,27 +95,21 @@ class RayWorkers(Generic[TaskT, R]):
         remote = task.placed(threads=False, on_own_disk=self._on_own_disk)
         self._busy[actor.run.remote(_run, remote)] = actor, task
 
-    def collect(self, seconds: float) -> list[tuple[TaskT, R | None]]:
-        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
-        done: list[tuple[TaskT, R | None]] = []
-        ready = self._ray.wait(list(self._busy), timeout=seconds)[0] if self._busy else []
-        for reference in ready:
-            actor, task = self._busy.pop(reference)
-            try:
-                done.append((task, self._ray.get(reference)))
-            except self._ray.exceptions.RayError:
-                done.append((task, None))
-            else:
-                self._idle.append(actor)
+    def _ready(self, seconds: float) -> Iterable[Any]:
+        done: list[Any] = self._ray.wait(list(self._busy), timeout=seconds)[0]
         return done
 
+    def _result(self, worker: Any, key: Any) -> R | None:  # noqa: ARG002 - the reference knows its actor
+        try:
+            result: R = self._ray.get(key)
+        except self._ray.exceptions.RayError:
+            return None
+        return result
+
     def stop(self) -> None:
-        """Make every worker close its recording and return its task as interrupted."""
+        """Ask the actor of every task to stop."""
         for actor, _ in self._busy.values():
             actor.request_stop.remote()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
@@ -132,9 +118,7 @@ class RayWorkers(Generic[TaskT, R]):
         self._ray.shutdown()
 
 
-def worker_pool(
-    count: int | None, ray: str | None, tasks: int
-) -> AbstractContextManager[Workers[TaskT, R], None]:
+def worker_pool(count: int | None, ray: str | None, tasks: int) -> Workers[TaskT, R]:
     """Return workers, at most one per task; Ray prints messages about workers that died on stdout.
 
     There are at most `count`, None for one per processor. `ray` is the address of a cluster, empty for Ray on

@@ -6,7 +6,8 @@ import contextlib
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
@@ -36,41 +37,65 @@ T = TypeVar("T", bound=Work)
 R = TypeVar("R")
 
 
-class Workers(Protocol[T, R]):
-    """Workers that run tasks T with results R, on this machine or on others."""
-
-    @property
-    def idle(self) -> int:
-        """The number of tasks that can be started now."""
-
-    def submit(self, task: T) -> None:
-        """Start a task on an idle worker."""
-
-    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
-        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
-
-    def stop(self) -> None:
-        """Make every worker close its recording and return its task as interrupted."""
-
-
-class LocalWorkers(Generic[T, R]):
-    """Processes, started when they are needed."""
+class Workers(ABC, Generic[T, R]):
+    """Workers that run tasks T with results R, on this machine or on others; started when needed."""
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._context = process_context(PRELOADED)
-        with starting_processes():  # an event starts one that tracks it
-            self._stopping = self._context.Event()
-        self._idle: list[_SweepWorker[R]] = []
-        self._busy: dict[object, tuple[_SweepWorker[R], T]] = {}
+        self._idle: list[Any] = []
+        self._busy: dict[Any, tuple[Any, T]] = {}
+        """By what becomes ready when a task ends, its worker and the task."""
 
     @property
     def idle(self) -> int:
         """The number of tasks that can be started now."""
         return self._count - len(self._busy)
 
+    @abstractmethod
     def submit(self, task: T) -> None:
         """Start a task on an idle worker."""
+
+    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
+        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
+        done: list[tuple[T, R | None]] = []
+        for key in self._ready(seconds) if self._busy else ():
+            worker, task = self._busy.pop(key)
+            result = self._result(worker, key)
+            done.append((task, result))
+            if result is not None:
+                self._idle.append(worker)
+        return done
+
+    @abstractmethod
+    def _ready(self, seconds: float) -> Iterable[Any]:
+        """Wait up to this time for tasks to end; return their keys in `_busy`."""
+
+    @abstractmethod
+    def _result(self, worker: Any, key: Any) -> R | None:
+        """Return the result of a task that ended; None if its worker died."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Make every worker close its recording and return its task as interrupted."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    @abstractmethod
+    def __exit__(self, *_: object) -> None: ...
+
+
+class LocalWorkers(Workers[T, R]):
+    """Processes of this machine."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__(count)
+        self._context = process_context(PRELOADED)
+        with starting_processes():  # an event starts one that tracks it
+            self._stopping = self._context.Event()
+
+    def submit(self, task: T) -> None:
+        """Start a task on an idle process, or a new one."""
         local = task.placed(threads=self._count < (os.cpu_count() or 1))
         while self._idle:
             worker = self._idle.pop()
@@ -82,25 +107,15 @@ class LocalWorkers(Generic[T, R]):
             worker.send(local)  # `collect` notices if it is dead already
         self._busy[worker.pipe] = worker, task
 
-    def collect(self, seconds: float) -> list[tuple[T, R | None]]:
-        """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
-        done: list[tuple[T, R | None]] = []
-        for pipe in (
-            connection.wait([worker.pipe for worker, _ in self._busy.values()], seconds) if self._busy else ()
-        ):
-            worker, task = self._busy.pop(pipe)
-            result = worker.receive()
-            done.append((task, result))
-            if result is not None:
-                self._idle.append(worker)
-        return done
+    def _ready(self, seconds: float) -> Iterable[Any]:
+        return connection.wait(list(self._busy), seconds)
+
+    def _result(self, worker: _SweepWorker[R], key: Any) -> R | None:  # noqa: ARG002 - its pipe
+        return worker.receive()
 
     def stop(self) -> None:
-        """Make every worker close its recording and return its task as interrupted."""
+        """Set the event that every process watches."""
         self._stopping.set()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
