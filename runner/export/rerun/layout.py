@@ -66,12 +66,12 @@ def _alone(run: Writer) -> rrb.Container:
     ]
     right = tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0)
     columns: list[tuple[Shown, float]] = []
+    values = _group(run, VALUES)
     if left:
         shown, heights = zip(*left, strict=True)
-        recording = run.recording
-        is_wide = recording.has_tables or max(recording.environments, len(recording.agents)) > 1
+        is_wide = values or max(run.recording.environments, len(run.recording.agents)) > 1
         columns.append((rrb.Vertical(*shown, row_shares=heights), 3.0 if is_wide else 2.0))
-    if values := _group(run, VALUES):
+    if values:
         table, *maps = values
         below: list[Shown] = [rrb.Horizontal(*maps)] if len(maps) > 1 else [*maps]
         columns.append((rrb.Vertical(table, *below), 2.25))

@@ -23,7 +23,7 @@ from runner.export.rerun.metrics import line_colours, phase_colours, series_line
 from runner.export.rerun.selection import MAX_MEMBERS, time_of
 from runner.export.rerun.steps import Batch
 from runner.export.rerun.tracks import Times, Track, TrackView, Writer, scalars, times_of
-from runner.export.values import FEW, acted, number_names, observed
+from runner.export.values import FEW, acted, names_in, number_names, observed
 from runner.recording import schema
 from runner.recording.messages import decode_array, frame_place, media_type
 from runner.recording.observation_names import observation_names
@@ -125,8 +125,7 @@ class LoopTracks:
             # A gap in the line where the value was not recorded
             numbers = values.data.reshape(len(values), -1).astype(np.float64)
             numbers[~is_given] = np.nan
-            names = [f"{name}[{i}]" for i in range(numbers.shape[1])]
-            yield self._line(member, quantity, times, numbers, names)
+            yield self._line(member, quantity, times, numbers, [*names_in(name, values.shape[1:])])
             return
         entity, title = _entity(self._phase, member.name, quantity), f"{member.name} {name}".strip()
         texts = TrackView("texts", title, rrb.TextDocumentView)
@@ -156,7 +155,9 @@ class LoopTracks:
                 shades = line_colours(min(len(self._members), MAX_MEMBERS))
                 colours = [shades[member.number % len(shades)]]
         style: Any = series_lines(lines, colours)
-        if names == ["action"]:  # of a Discrete space: lines between such numbers mean nothing
+        if quantity == "action" and names == [
+            "action"
+        ]:  # of a Discrete space: lines between such numbers mean nothing
             style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
         tab, title = OVERVIEW, quantity.removeprefix("extra/")
         actions = self._of_phase.action_names(member.agent) if quantity == "action" else ()
