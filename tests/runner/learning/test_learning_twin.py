@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import get_args
 
@@ -86,10 +87,10 @@ def test_trajectories_and_tables_are_the_twins_for_every_seed(seed):
 
 
 @st.composite
-def random_mdps(draw):
-    """Any small game of three agents: several outcomes, rewards of one or of each, some that never end."""
-    actions = tuple(draw(st.lists(st.integers(1, 3), min_size=3, max_size=3)))
-    shape = draw(st.integers(1, 5)), actions[0] * actions[1] * actions[2], draw(st.integers(1, 3))
+def random_mdps(draw, agents):
+    """Any small game: several outcomes, rewards of one or of each agent, some that never end."""
+    actions = tuple(draw(st.lists(st.integers(1, 3), min_size=agents, max_size=agents)))
+    shape = draw(st.integers(1, 5)), math.prod(actions), draw(st.integers(1, 3))
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     weights = rng.integers(0, 3, shape) + np.eye(shape[2], dtype=int)[rng.integers(0, shape[2], shape[:2])]
     starts = rng.integers(0, 2, shape[0]) + np.eye(shape[0], dtype=int)[0]
@@ -100,12 +101,12 @@ def random_mdps(draw):
         kwargs={},
         next_state=rng.integers(0, shape[0], shape).astype(np.int32),
         probability=weights / weights.sum(axis=2, keepdims=True),
-        rewards=rng.integers(-3, 4, (*shape, draw(st.sampled_from([1, 3])))) * scale,
+        rewards=rng.integers(-3, 4, (*shape, draw(st.sampled_from([1, agents])))) * scale,
         terminated=rng.random(shape) < draw(st.sampled_from([0.0, 0.2, 1.0])),
         events=rng.integers(0, 4, shape).astype(np.uint32),
         start=starts / starts.sum(),
         step_limit=draw(st.integers(1, 9)),
-        agents=("a", "b", "c"),
+        agents=("a", "b", "c")[:agents],
         action_counts=actions,
         event_names=names,
         success_events=draw(st.sampled_from([(), ("goal",), names])),
@@ -147,8 +148,19 @@ settings_of_learners = st.fixed_dictionaries(
 
 @pytest.mark.long
 @settings(deadline=None, max_examples=30)
-@given(random_mdps(), settings_of_learners, st.integers(0, 2**64 - 1), st.integers(1, 40))
+@given(random_mdps(agents=2), settings_of_learners, st.integers(0, 2**64 - 1), st.integers(1, 40))
 def test_any_game_by_any_rule_is_learned_as_the_twin_does(mdp, values, seed, block):
+    assert_any_game_is_learned(mdp, values, seed, block)
+
+
+@settings(deadline=None, max_examples=10)
+@given(random_mdps(agents=3), settings_of_learners, st.integers(0, 2**64 - 1), st.integers(1, 40))
+def test_any_game_of_three_is_learned_as_the_twin_does(mdp, values, seed, block):
+    values |= {"algorithm": "q_learning"}  # the others would be compiled for three learners for this alone
+    assert_any_game_is_learned(mdp, values, seed, block)
+
+
+def assert_any_game_is_learned(mdp, values, seed, block):
     if values["algorithm"] not in ("q_learning", "random"):
         values["quirks"]["second_table_uses_first_action"] = False
     config = from_mapping({"episodes": 100, "mode": "competitive"} | values)
