@@ -115,7 +115,9 @@ def refuse_path(config: ExperimentConfig) -> None:
     """Refuse an initial Q-table that is named by the path of its recording."""
     start = config.initial_q
     if isinstance(start, RunTable) and is_path(start.run):
-        raise ConfigError(f"initial_q: found the path {start.run!r}, expected the id or name of a run here.")
+        raise ConfigError(
+            f"found the path {start.run!r} of a Q-table, expected the id or name of a run here."
+        )
 
 
 def is_path(name: str) -> bool:
