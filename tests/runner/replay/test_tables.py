@@ -140,21 +140,25 @@ def history_by_hand(recording, visits, state):
     return counts, steps, episodes
 
 
-@pytest.mark.parametrize("algorithm", ["sarsa_lambda", "n_step_q_learning"])
-def test_the_history_of_values_that_later_steps_change(tmp_path, algorithm):
-    values = {"mode": "cooperative", "algorithm": algorithm, "episodes": 9}
+@pytest.mark.parametrize(
+    ("algorithm", "mode"), [("sarsa_lambda", "competitive"), ("n_step_q_learning", "cooperative")]
+)
+def test_the_history_of_values_that_later_steps_change(tmp_path, algorithm, mode):
+    values = {"mode": mode, "algorithm": algorithm, "episodes": 9}
     run = make_run(tmp_path, TAXIS, values, recording={"chunk_steps": 256})
     with open_recording(run.recording) as recording:
         steps = recording.train.steps.array()
         state = int(steps["state"][len(steps) // 2])
-        replay, changed = TableReplay(recording), np.full(recording.mdp.joint_actions, -1)
+        replay = TableReplay(recording)
+        changed = np.full((len(replay.tables), replay.tables[0].shape[1]), -1)
         for step in range(len(steps)):
-            before = replay.tables[0][state].copy()
+            before = [table[state].copy() for table in replay.tables]
             replay.advance(step + 1)
-            changed[replay.tables[0][state] != before] = step
+            for i, table in enumerate(replay.tables):
+                changed[i, table[state] != before[i]] = step
         found = history_of(recording, state, len(steps))
-    assert found.changed_step.tolist() == [changed.tolist()]
-    assert found.visits.sum() == (steps["state"] == state).sum()
+    assert found.changed_step.tolist() == changed.tolist()
+    assert found.visits.sum(axis=1).tolist() == [(steps["state"] == state).sum()] * len(changed)
     assert (steps["state"][changed[changed >= 0]] != state).any()
 
 
