@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import shlex
+import time
 from typing import Any, Final
 
 from runner.client.jobs import JobEvent, LogEvent, StateEvent
@@ -17,6 +18,8 @@ from runner.util.processes import OWN_ONLY
 POLL_SECONDS: Final = 0.5
 CLOSE_SECONDS: Final = 10
 """How long the command may take to close its recording before Ray kills it."""
+START_SECONDS: Final = 60
+"""How long to wait for a cluster that has just started, or whose machines are all busy, to take a job."""
 LOG_SECONDS: Final = 5.0
 """How long to wait for the rest of the log of a command that has ended."""
 COMMAND: Final = "python -P -m runner run --job"
@@ -39,7 +42,9 @@ def do_on_cluster(spec: JobSpec, address: str, channel: JobChannel) -> StateEven
         for job in client.list_jobs():
             if (job.metadata or {}).get("folder") == folder and not job.status.is_terminal():
                 client.stop_job(job.submission_id)
-        submission = client.submit_job(
+        submission = _submitted(
+            client,
+            channel,
             entrypoint=f"{COMMAND} {shlex.quote(folder)}",
             entrypoint_num_cpus=1 if spec.job.run_ids else 0,
             runtime_env={"env_vars": {OWN_ONLY: "1", "RAY_JOB_STOP_WAIT_TIME_S": str(CLOSE_SECONDS)}},
@@ -48,6 +53,18 @@ def do_on_cluster(spec: JobSpec, address: str, channel: JobChannel) -> StateEven
         return asyncio.run(_follow(client, submission, channel))
     except (OSError, RuntimeError, RunnerError) as error:
         return StateEvent("failed", f"--ray: the cluster at {address} does not do this job: {error}")
+
+
+def _submitted(client: Any, channel: JobChannel, **job: object) -> str:
+    """Submit a job and return its number; where Ray asks for another try later, try for a minute."""
+    end = time.monotonic() + START_SECONDS
+    while True:
+        try:
+            return str(client.submit_job(**job))
+        except RuntimeError as error:
+            if "try again later" not in str(error) or channel.stop() or time.monotonic() > end:
+                raise
+        time.sleep(POLL_SECONDS)
 
 
 async def _follow(client: Any, submission: str, channel: JobChannel) -> StateEvent | None:

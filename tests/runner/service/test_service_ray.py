@@ -8,14 +8,18 @@ import multiprocessing
 import os
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import psutil
 import pytest
 from submitted import ENDLESS, ICY
 
 import runner
+from runner.client.jobs import LogEvent
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs, run_at
+from runner.service.jobs import cluster as cluster_jobs
+from runner.service.jobs.channel import JobChannel
 from runner.service.jobs.checking import check
 from runner.service.jobs.cluster import require_job_api
 from runner.service.jobs.queue import JobQueue
@@ -130,3 +134,36 @@ def test_a_cluster_that_cannot_be_reached_fails_the_job(tmp_path):
         over = job_until(jobs, submit(jobs, ICY), lambda job: job.is_over)
         assert over.state == "failed"
         assert over.error.startswith("--ray: the cluster at http://127.0.0.1:9 does not do this job: ")
+
+
+def test_a_cluster_that_has_no_agent_yet_is_asked_again(tmp_path, monkeypatch):
+    answers = [RuntimeError("500: No available agent to submit job, please try again later."), "first"]
+
+    class Client:
+        def list_jobs(self):
+            return []
+
+        def submit_job(self, **_):
+            answer = answers.pop(0)
+            if isinstance(answer, str):
+                return answer
+            raise answer
+
+        def get_job_status(self, _):
+            return SimpleNamespace(is_terminal=lambda: True)
+
+        def get_job_info(self, submission):
+            return SimpleNamespace(message=f"{submission} is over")
+
+        async def tail_job_logs(self, _):
+            yield ""
+
+    monkeypatch.setattr(cluster_jobs, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(
+        cluster_jobs, "require_job_api", lambda: SimpleNamespace(JobSubmissionClient=lambda _: Client())
+    )
+    events = []
+    spec = SimpleNamespace(folder=tmp_path, job=SimpleNamespace(run_ids=()))
+    cluster_jobs.do_on_cluster(spec, "http://127.0.0.1:1", JobChannel(events.append, lambda: False))
+    assert not answers
+    assert events == [LogEvent("Ray: first is over")]
