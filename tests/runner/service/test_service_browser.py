@@ -248,7 +248,7 @@ def test_a_narrow_screen_shows_the_open_tab_the_results_and_both_sides(page):
             ("/runs", "tbody .status"),
             ("/runs", "thead th:nth-of-type(8)"),
             ("/runs/first/config", ".tabs [aria-current]"),
-            ("/compare?run=first&run=second", "#results ~ .scroll td:last-child"),
+            ("/compare?run=first&run=second", "#results-title ~ .scroll td:last-child"),
         ):
             shown = page(address).find_element(By.CSS_SELECTOR, selector)
             box = browser.execute_script("return arguments[0].getBoundingClientRect().toJSON()", shown)
