@@ -117,8 +117,8 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     frames = frame_times(np.concatenate(log_times) // schema.STEP_NANOSECONDS)
     ended = ending_of(recording, at.phase, number)
     total = None
-    if ended != "cut off":
-        total = float(phase.episodes.array(number, number + 1)["returns"].sum())
+    if len(records := phase.episodes.array(number, number + 1)):  # none if the file was cut off
+        total = float(records["returns"].sum())
     elif first + limit >= length:
         total = float(before.sum() + reward.sum())
     begun = f" Reset with {reset.in_words}." if reset is not None and reset.in_words else ""

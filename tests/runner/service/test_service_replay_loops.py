@@ -43,7 +43,9 @@ def test_a_part_has_the_recorded_values_from_the_reset_on(loops_client, loops, a
 
 
 @pytest.mark.parametrize("name", ["pole", "rooms"])
-def test_the_episodes_of_a_recording_that_was_cut_off_are_those_of_its_steps(loops, tmp_path, name):
+def test_the_episodes_of_a_recording_that_was_cut_off_are_those_of_its_steps(
+    loops_client, loops, tmp_path, name
+):
     whole = find_run(name, loops)
     run = Run(tmp_path / "runs" / "cut", whole.facts)
     shutil.copytree(whole.folder, run.folder)
@@ -57,6 +59,7 @@ def test_the_episodes_of_a_recording_that_was_cut_off_are_those_of_its_steps(loo
             steps = steps_of(loops, name, "train", episode)
             shown = part(client, f"{run.run_id}/replay/train/{episode}")
             assert shown["length"] == len(steps)
+            assert shown["description"] == part(loops_client, f"{name}/replay/train/{episode}")["description"]
         assert 'placeholder="0 to 3"' in page(client, f"/runs/{run.run_id}/replay/train/0")
 
 
