@@ -49,6 +49,8 @@ _IN_SOURCES: Final = (
 """In sources a mere `key` is seldom a secret: `sort(key="length")`."""
 _SECRET_SETTING: Final = re.compile(_IN_SOURCES, re.IGNORECASE)
 _PLACEHOLDERS: Final = "{$<%["
+_PLACEHOLDER: Final = re.compile(r"(?:\$?\{.*\}|<.*>|\[.*\]|\$[A-Z_][A-Z0-9_]*|%\w+%)?")
+"""A whole setting that stands for a value: a password may begin as one does."""
 _AFTER_NAME: Final = (
     r"[\w-]{0,40}[\"']?\]?(?:(?:\s{0,3}:\s{0,3}[\w.\[\]| ]{1,30})?\s{0,3}[:=]\s{0,3}|"
     r"(?<=[\"'])\s{0,3},\s{0,3}|"
@@ -197,11 +199,11 @@ def redacted_settings(value: Any, name: str = "") -> Any:
     if isinstance(value, dict):
         return {key: redacted_settings(part, key) for key, part in value.items()}
     if isinstance(value, list):
-        return list(map(redacted_settings, value))
+        return [redacted_settings(part, name) for part in value]
     if not isinstance(value, str):
         return value
-    stays = value[:1] in _PLACEHOLDERS or _stays(name, value) or not _SECRET_SETTING.search(name)
-    return redacted_line(value) if stays else REDACTED
+    is_secret = _SECRET_SETTING.search(name) and not _stays(name, value)
+    return REDACTED if is_secret and not _PLACEHOLDER.fullmatch(value) else redacted_line(value)
 
 
 class LineRedactor:

@@ -457,12 +457,15 @@ def test_secrets_among_the_settings_are_not_recorded(tmp_path):
         "api_key": "sk-not-long",
         "db": {"password": "hunter2", "url": "postgres://user:hunter2@host/db", "PASSWD": "hunter2"},
         "callbacks": [{"auth_token": "hunter2"}],
+        "passwords": ["hunter2", "$hunter2", "%hunter2", "{hunter2"],
     }
     harmless = {
         "key_dim": 64,
         "max_tokens": 100_000,
         "tokenizer": "gpt2",
         "pad_token": "<pad>",
+        "special_tokens": ["[PAD]", "<s>"],
+        "hf_token": "${HF_TOKEN}",
         "monkey": "see",
     }
     given = json.loads(json.dumps(settings | harmless))
@@ -473,5 +476,6 @@ def test_secrets_among_the_settings_are_not_recorded(tmp_path):
     with open_recording(path) as recording:
         kept = recording.config["config"]
     assert kept["api_key"] == kept["db"]["password"] == kept["callbacks"][0]["auth_token"] == "[redacted]"
+    assert kept["passwords"] == ["[redacted]"] * 4
     assert kept["db"]["url"] == "postgres://[redacted]@host/db"
     assert {name: kept[name] for name in harmless} == harmless
