@@ -10,7 +10,7 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from runner.config import from_mapping
 from runner.config.document import read_yaml
@@ -64,16 +64,28 @@ def with_resolved_tables(sweep: Sweep, recordings: Path) -> Sweep:
     """Return a sweep with the ids and steps of the runs whose Q-tables its trials start from.
 
     The runs of a sweep are found by their configurations, which have ids and steps.
+
+    Raises:
+        ConfigError: runs are tried, and no step: the last step of one would be taken of all.
+        RunnerError: there is no such run.
     """
     values = sweep.to_mapping()
 
-    def resolved(table: object) -> object:
+    def resolved(table: Any) -> Any:
         if not isinstance(table, Mapping) or "run" not in table:
             return table
         config = from_mapping(values["base"] | {"initial_q": table})
         return resolve_initial_q(config, recordings).to_mapping()["initial_q"]
 
     base, parameters = values["base"], values["parameters"]
+    if isinstance(runs := parameters.get("initial_q.run"), list):
+        steps = base["initial_q"] if isinstance(base["initial_q"], Mapping) else {}
+        if steps.get("step") is None and "initial_q.step" not in parameters:
+            raise ConfigError(
+                "parameters.initial_q.run: found runs without a step, expected base.initial_q.step, or whole "
+                "tables, initial_q: [{run: ...}, ...], each of the last step of its run."
+            )
+        parameters["initial_q.run"] = [resolved({"run": run, "step": 0})["run"] for run in runs]
     base["initial_q"] = resolved(base["initial_q"])
     if isinstance(choices := parameters.get("initial_q"), list):
         parameters["initial_q"] = [resolved(choice) for choice in choices]

@@ -78,6 +78,19 @@ def test_trials_start_from_the_table_of_a_run(type_in, file, tmp_path):
     assert len(list_runs(tmp_path / "runs")) == 3
 
 
+def test_runs_that_are_tried_need_a_step(type_in, file, tmp_path):
+    for number, name in enumerate(("first", "second")):
+        runner.run(from_mapping(BASE | {"seeds": [number]}, name=name), recordings=tmp_path / "runs")
+    tried = {"initial_q.run": ["first", "second"]}
+    given = {"strategy": "grid", "trials": None, "seeds": [0]}
+    without = str(file(**given, base=BASE | {"initial_q": {"run": "first"}}, parameters=tried))
+    assert "found runs without a step" in type_in("run", without, code=2).output
+    path = str(file(**given, parameters=tried | {"initial_q.step": [100]}))
+    type_in("run", path, "--workers", "1")
+    type_in("run", path, "--workers", "1", "--resume")
+    assert len(list_runs(tmp_path / "runs")) == 4
+
+
 def test_a_full_disk_is_reported_before_anything_runs(type_in, file, monkeypatch, tmp_path):
     with monkeypatch.context() as small:
         small.setattr(plan, "free_bytes", lambda _: 1000)
