@@ -93,7 +93,8 @@ class RunReader:
             for batch in _prefetched(batches) if is_job else batches:
                 if is_job:
                     yield Track(f"{phase}/reward", batch.times, scalars(batch.records["rewards"]), style)
-                for maker in makers:
+                are_unknown = is_job and not len(batch.values)  # some steps before them were lost
+                for maker in makers[:1] if are_unknown else makers:
                     yield from maker.of(batch)
                 if self._labels:
                     edges ^= batch.edges()  # no edge where a stretch continues the one before

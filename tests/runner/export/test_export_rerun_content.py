@@ -23,7 +23,9 @@ from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at
 from runner.runs.listing import run_at
 from runner.runs.resolve import find_run
+from tests.runner.altering import without_chunk
 from tests.runner.export.rerun_views import views_of
+from tests.runner.recording.making import TAXIS, make_run
 
 TOPICS = {"train": schema.TRAIN_STEP, "eval": schema.EVAL_STEP}
 
@@ -314,6 +316,16 @@ def check_lines(path, views):
 
 def test_lines_show_recorded_values_each_in_its_own_colour(exported):
     check_lines(exported.path, plots_below(""))
+
+
+def test_values_are_left_out_after_steps_that_were_lost(tmp_path):
+    run = make_run(tmp_path, TAXIS, recording={"chunk_steps": 256}, snapshots={"every": None})
+    lost = without_chunk(run.recording, schema.TRAIN_STEP, 1)
+    with open_recording(run.recording) as recording:
+        exported = Exported(recording, tmp_path / "run.rrd")
+        times = exported.steps("train")["log_time"] // schema.STEP_NANOSECONDS
+        assert exported.table("/train/reward")["step"] == times.tolist()
+        assert exported.table("/train/q", "Scalars:scalars")["step"] == times[:lost].tolist()
 
 
 def test_lines_of_two_runs_differ_in_colour(pictured, tmp_path):
