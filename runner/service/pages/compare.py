@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
-from fastapi import APIRouter, Depends, Query, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
 from runner.analysis.axes import EPISODES
@@ -191,11 +191,12 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
     return Page("compare_replay.html", show)
 
 
-@router.get("/{tab}")
-async def difference(
-    tab: Literal["divergence", "tables", "code"], runs: TwoRuns, compute: ComputationOf
-) -> Response:
+@router.get("/divergence")
+@router.get("/tables")
+@router.get("/code")
+async def difference(request: Request, runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the first step at which two runs differ, and why; or how their Q-tables differ, or their code."""
+    tab = request.url.path.rpartition("/")[2]
     function = fragments.made_difference if tab == "code" else fragments.difference
     found = await compute.shown(ShownDifference, function, *runs)
     lead, notes, body = found.tabs[tab]

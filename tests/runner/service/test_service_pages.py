@@ -235,6 +235,7 @@ MISSING = [
     ("/runs/first/rerun?at=1:x", 400, "expected EPISODE:T"),
     ("/runs/first/rerun?at=eval:9999:1", 404, "the nearest after 60"),
     ("/compare?run=first", 400, "expected 2 to 60"),
+    ("/compare/nothing?run=first&run=second", 404, "nothing at /compare/nothing"),
     ("/compare/replay?run=first&run=second&at=eval", 400, "expected EPISODE:T"),
     ("/sweeps/nothing", 404, "No sweep"),
     ("/queue/9", 404, "No job 9"),
