@@ -176,22 +176,19 @@ class RunDetails:
 
     def result_sections(self) -> list[Section]:
         """Return the results but the evaluations."""
-        run, results = (
-            self.run,
-            [
-                Section("Last results", facts={} if self.loop is None else results_in_words(self.loop)),
-                Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
-                Section("Branches", facts={name: str(origin) for name, origin in self.branches.items()}),
-                Section("Greedy policy, exactly", facts=self._optimality()),
-                Section("Tables", facts={table.agent: str(table) for table in self.tables}),
-            ],
-        )
+        results = [
+            Section("Last results", facts={} if self.loop is None else results_in_words(self.loop)),
+            Section("Values recorded with steps", facts=_extras_in_words(self.extras)),
+            Section("Branches", facts={name: str(origin) for name, origin in self.branches.items()}),
+            Section("Greedy policy, exactly", facts=self._optimality()),
+            Section("Tables", facts={table.agent: str(table) for table in self.tables}),
+        ]
         if self.checkpoints:
             last = self.checkpoints[-1].reference
-            listing = f"`{command_for(run, 'checkpoints')}` lists them."
+            listing = f"`{command_for(self.run, 'checkpoints')}` lists them."
             results.append(Section("Checkpoints", [f"{len(self.checkpoints):,}, the last {last}; {listing}"]))
-        if run.marks:
-            rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in run.marks]
+        if self.run.marks:
+            rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in self.run.marks]
             results.append(Section("Marks", grids=[Grid(("step", "text", "tags"), rows)]))
         return [each for each in results if each.facts or each.grids or each.sentences]
 

@@ -155,9 +155,8 @@ class LoopTracks:
                 shades = line_colours(min(len(self._members), MAX_MEMBERS))
                 colours = [shades[member.number % len(shades)]]
         style: Any = series_lines(lines, colours)
-        if quantity == "action" and names == [
-            "action"
-        ]:  # of a Discrete space: lines between such numbers mean nothing
+        is_discrete = quantity == "action" and names == ["action"]
+        if is_discrete:  # lines between such numbers mean nothing
             style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
         tab, title = OVERVIEW, quantity.removeprefix("extra/")
         actions = self._of_phase.action_names(member.agent) if quantity == "action" else ()
