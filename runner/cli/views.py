@@ -53,13 +53,14 @@ def command_of(view: View) -> Command:
             if output not in (None, _STDOUT):
                 with new_file(output, force) as temporary, temporary.open("wb") as stream:
                     answer.write(stream)
+        exit_code = answer.exit_code if view.is_of_runs else 0
         if output == _STDOUT:
             file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
             answer.write(file)
             if sys.stdout.isatty():
-                return Reply((), [file.getvalue().decode(errors="replace")])
+                return Reply((), [file.getvalue().decode(errors="replace")], exit_code=exit_code)
             sys.stdout.buffer.write(file.getvalue())
-            return Reply(())
+            return Reply((), exit_code=exit_code)
         data, page = answer.as_json(), ""
         if output is not None:
             data |= {"files": files_written(output)}
@@ -68,7 +69,6 @@ def command_of(view: View) -> Command:
                 notes = [f"Note: {note}." for note in answer.notes]
             else:
                 notes.append(path_and_size(output))
-        exit_code = answer.exit_code if view.is_of_runs else 0
         return Reply(data, _text(subject, answer), page=page, notes=notes, exit_code=exit_code)
 
     declared = {

@@ -115,7 +115,9 @@ def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
     diverged = json.loads(dualtaxi(tmp_path, "diff", "one", "two", "--json").stdout)
     assert (diverged["divergence"], diverged["evaluation_divergence"]["step"]) == (None, 0)
     page = tmp_path / "diff.html"
-    dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page))
+    assert dualtaxi(tmp_path, "diff", "one", "two", "--html", str(page)).exit_code == 1
+    printed = dualtaxi(tmp_path, "diff", "one", "two", "--html", "-")
+    assert (printed.exit_code, printed.stdout) == (1, page.read_text())
     assert "in the reset before evaluation step 0 of A, in the evaluation after" in page.read_text()
 
 
