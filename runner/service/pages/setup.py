@@ -53,7 +53,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
         **{f"As {name}": f"exports/{name}" for name in plugin_names(EXPORTS)},
     }
     links = [Link(text, f"/api/v1/runs/{run.run_id}/{path}") for text, path in files.items()]
-    if viewer_of(request).can_write:
+    if viewer_of(request).can_write and "made_by" not in run.file.config:  # a loop cannot be submitted
         links.insert(0, Link("Submit a variation", f"/submit?from={run.run_id}"))
     lines = Grid(("step", "level", "message"), log, left=("level", "message"))
     sections = [

@@ -357,6 +357,13 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     assert (curves["axis"], curves["notes"]) == ("v/0", [])
 
 
+def test_variations_are_of_jobs(client, recordings):
+    with runner.record(make("CartPole-v1"), recordings, name="alone") as env:
+        list(play(env, 5))
+    assert "Submit a variation" in page_of(client, "/runs/first/config")
+    assert "Submit a variation" not in page_of(client, "/runs/alone/config")
+
+
 def test_the_time_and_the_machine_are_shown(client, recordings):
     with runner.record(make("CartPole-v1"), recordings, name="alone", system=False) as env:
         list(play(env, 50))
