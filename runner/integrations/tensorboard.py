@@ -25,7 +25,9 @@ from runner.integrations.hooks import open_runs
 from runner.integrations.script import ScriptRun
 from runner.integrations.shapes import Tracker, as_number, as_run_name, forgiving, logs
 from runner.loops.media import Media, array_of, film_of, histogram_of, picture_of
+from runner.runs.redaction import redacted_settings
 from runner.runs.run import Run
+from runner.util.jsonable import as_json
 
 _HYPERPARAMETERS: Final = re.compile(r"\|param\|value\|\n\|-\|-\|\n", re.ASCII)
 """How the tables begin in which CleanRL's scripts write their settings."""
@@ -182,7 +184,7 @@ class SummaryWriter(Tracker):
         if self.script.is_waiting:
             self.script.settings |= dict(hparam_dict)
         else:
-            self.script.log("hparams", str(dict(hparam_dict)), global_step)
+            self.script.log("hparams", str(redacted_settings(as_json(hparam_dict))), global_step)
         for name, value in metric_dict.items():
             self.add_scalar(name, value, global_step)
 

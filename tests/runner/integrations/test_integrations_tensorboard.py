@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
 from scripts import arrays, images, scalars, the_run
@@ -11,6 +12,7 @@ from runner.analysis.series import read_series, values_left_out
 from runner.integrations import shapes
 from runner.integrations.script import MAX_NAMES
 from runner.integrations.tensorboard import SummaryWriter
+from runner.recording import schema
 
 
 def test_numbers_of_every_kind_are_logged_and_others_left_out():
@@ -89,6 +91,16 @@ def test_hyperparameters_of_tensorboard_are_the_settings():
         writer.add_hparams({"lr": 0.1}, {"score": 2.0})
     assert the_run().facts["config"]["config"] == {"lr": 0.1}
     assert the_run().summary["logged"] == {"score": 2.0}
+
+
+def test_hyperparameters_after_the_beginning_are_a_text_without_secrets():
+    env = gymnasium.make("CartPole-v1")
+    with SummaryWriter() as writer:
+        env.reset(seed=0)
+        writer.add_hparams({"lr": 0.1, "api_key": "hunter2"}, {})
+    with runner.open_recording(the_run().recording) as recording:
+        texts = [row["message"] for row in recording.table(schema.LOG_TOPIC).decoded()]
+    assert texts == ["{'lr': 0.1, 'api_key': '[redacted]'}"]
 
 
 def test_the_folder_that_the_script_names_is_there_for_its_own_files(folder):
