@@ -226,10 +226,16 @@ def _logged(recording: Recording, axis: Axis) -> tuple[Floats, Floats]:
     return np.array(steps, np.float64), np.array(values, np.float64)
 
 
-def first_crossing(points: Mapping[Position, float], level: float) -> Position | None:
-    """Return the first position at which a curve is at a level, or on the other side than where it began."""
-    begins_below = points[min(points)] < level
-    reached = (at for at in sorted(points) if (points[at] >= level if begins_below else points[at] <= level))
+def first_crossing(
+    points: Mapping[Position, float], level: float, rising: bool | None = None
+) -> Position | None:
+    """Return the first position at which a curve has reached a level, from below if `rising`.
+
+    Without it the side where the curve begins decides.
+    """
+    if rising is None:
+        rising = points[min(points)] < level
+    reached = (at for at in sorted(points) if (points[at] >= level if rising else points[at] <= level))
     return next(reached, None)
 
 

@@ -233,7 +233,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         ]
     else:
         axis = moments.axis
-        readings = [_single_agent_unnamed(values) for values in readings]
+        readings = [single_agent_unnamed(values) for values in readings]
         names = dict.fromkeys(name.removeprefix(LOGGED) for name in metrics if name.startswith(LOGGED))
         max_further = 0 if metrics else _MAX_NAMES
         training, averaged = _loop_training(recording, moments, names, max_further, not_finite)
@@ -330,7 +330,7 @@ def training_readings(report: TrainingRecord) -> Readings:
     }
 
 
-def _single_agent_unnamed(readings: Readings) -> Readings:
+def single_agent_unnamed(readings: Readings) -> Readings:
     """Return readings in which the values of a single agent have no name."""
     per_agent = {metric.name for metric in METRICS if metric.per_agent}
     return {

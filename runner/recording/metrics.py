@@ -168,6 +168,17 @@ METRIC_OF: Final[dict[str, Metric]] = {
 """Name to metric, in the order they are shown; events come after the evaluation's, logged values last."""
 
 
+def is_higher_better(name: str, has_goal: bool) -> bool | None:
+    """Return whether higher values of a metric, or of a line such as `mean_return.taxi_1`, are better.
+
+    None where neither is, in general. `has_goal`: episodes have a goal, which is better reached sooner.
+    """
+    metric = METRIC_OF.get(name) or METRIC_OF.get(name.rpartition(".")[0])
+    if metric is None or metric.better is None or (metric.better == "lower_to_goal" and not has_goal):
+        return None
+    return metric.better == "higher"
+
+
 def defined_metrics(has_success: bool, has_penalties: bool) -> tuple[EvaluationMetric, ...]:
     """Return the measures of an evaluation that an environment defines."""
     defined = {"": True, "success_events": has_success, "penalty_below": has_penalties}

@@ -20,6 +20,7 @@ from runner.analysis.series import (
 from runner.errors import RunnerError, nearest
 from runner.recording import schema
 from runner.recording.messages import Message
+from runner.recording.metrics import is_higher_better
 from runner.recording.reader import Recording
 from runner.sweep.model import Objective
 
@@ -91,7 +92,8 @@ def value_of(objective: Objective, curve: Curve) -> float:
             return mean_height(episodes, values)
         case "first_over":
             assert objective.level is not None
-            at = first_crossing(curve, objective.level)
+            rising = is_higher_better(objective.metric, has_goal=True)
+            at = first_crossing(curve, objective.level, rising)
             return NEVER if at is None else float(at)
 
 

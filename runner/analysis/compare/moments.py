@@ -16,7 +16,7 @@ from runner.analysis.compare.statistics import FEW_SEEDS, NEVER
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, full_name, points_of
 from runner.errors import RunnerError
-from runner.recording.metrics import METRIC_OF
+from runner.recording.metrics import is_higher_better
 from runner.util.humanize import listed
 
 Kind = Literal["last", "best", "area", "position", "crossing"]
@@ -29,10 +29,7 @@ _OF_WHOLE_RUNS: Final[tuple[Kind, ...]] = ("last", "best", "area")
 
 def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
     """Return whether higher values of a metric are better; None where neither is, in general."""
-    better = METRIC_OF[metric].better if metric in METRIC_OF else None
-    if better == "lower_to_goal":
-        return False if all(run.has_goal for group in groups for run in group.runs) else None
-    return None if better is None else better == "higher"
+    return is_higher_better(metric, all(run.has_goal for group in groups for run in group.runs))
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,8 @@ class Moment:
     last: the last evaluation, or a loop's last training episodes. best: the best of all. area: the mean of
     the curve by the trapezoid rule, over the span that every run covers. position: after `number` training
     episodes, steps, ...; episodes must have an evaluation there, on other axes a run is interpolated between
-    its readings. crossing: the position at which the curve is first at `level`, coming from the other side.
+    its readings. crossing: the position at which the curve is first at `level`, or at a better value; without
+    a better side, at `level` or beyond, seen from where it begins.
     """
 
     kind: Kind
@@ -254,7 +252,7 @@ def value_of(
         span = sorted({first, *(at for at in positions if first <= at <= last), last})
         return mean_height(span, np.interp(span, positions, values).tolist()), ""
     if moment.level is not None:
-        crossing = first_crossing(points, moment.level)
+        crossing = first_crossing(points, moment.level, higher_is_better(metric, groups))
         value = NEVER if crossing is None else float(crossing)
     elif moment.kind == "best":
         value = min(values) if higher_is_better(metric, groups) is False else max(values)

@@ -8,9 +8,9 @@ from typing import Final
 
 from runner.analysis.axes import first_crossing, mean_height
 from runner.analysis.evaluations import evaluation_records
-from runner.analysis.series import evaluation_readings, full_name, training_readings
+from runner.analysis.series import evaluation_readings, full_name, single_agent_unnamed, training_readings
 from runner.errors import RunnerError, nearest
-from runner.recording.metrics import METRIC_OF, METRICS
+from runner.recording.metrics import METRIC_OF, METRICS, is_higher_better
 from runner.recording.reader import Recording
 
 _COMPARED: Final = (*METRICS, METRIC_OF["training.mean_length"], METRIC_OF["training.percent_filled"])
@@ -48,16 +48,20 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
     curves_a, curves_b = _curves(a), _curves(b)
     names = [name for name in curves_a if name in curves_b]
     for name in targets:
-        if names and name not in names:
-            listed = ", ".join(names)
-            raise RunnerError(f"target: found {name!r}, expected one of {listed}.{nearest(name, names)}")
+        if name not in names:
+            known = f"expected one of {', '.join(names)}" if names else "but no evaluations of both runs"
+            raise RunnerError(f"target: found {name!r}, {known}.{nearest(name, names)}")
     diffs = []
     for name in names:
         left, right = curves_a[name], curves_b[name]
         episodes = sorted(left.keys() & right.keys())
         crossings = {}
         if (level := targets.get(name)) is not None:
-            crossings[f"{level:g}"] = first_crossing(left, level), first_crossing(right, level)
+            rising = is_higher_better(name, has_goal="success_percent" in names)
+            crossings[f"{level:g}"] = (
+                first_crossing(left, level, rising),
+                first_crossing(right, level, rising),
+            )
         diffs.append(
             MetricDiff(
                 name=name,
@@ -78,6 +82,8 @@ def _curves(recording: Recording) -> dict[str, dict[int, float]]:
     curves: dict[str, dict[int, float]] = {}
     for record in evaluation_records(recording):
         readings = evaluation_readings(record)
+        if not recording.can_train_again:
+            readings = single_agent_unnamed(readings)
         if record.training is not None:
             readings |= training_readings(record.training)
         for metric in _COMPARED:

@@ -241,6 +241,12 @@ def test_the_best_of_an_exact_measure_is_on_its_better_side(metric, best):
     assert result(series, Moment("best"), [(metric, "")]).metrics[0].groups[0].median == best
 
 
+@pytest.mark.parametrize(("metric", "level"), [("success_percent", 30.0), ("mean_penalties", 50.0)])
+def test_a_run_that_begins_on_the_better_side_of_a_level_is_there_at_once(metric, level):
+    series = [run(0, [40, 20, 60], metric=metric, discount=d, name=n) for d, n in ((1, "a"), (0.5, "b"))]
+    assert result(series, Moment("crossing", level=level), [(metric, "")]).metrics[0].groups[0].median == 0
+
+
 def test_a_level_reached_by_some_is_ranked_after_all_numbers():
     series = [run(seed, [0, 10 * seed], discount=1) for seed in range(6)]
     series += [run(seed, [0, 100], name="b") for seed in range(6)]
