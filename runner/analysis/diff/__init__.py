@@ -160,7 +160,7 @@ def diff(
             and a.train.steps.dtype is not None
         ):
             return _diff_branch(difference, a, b, Cause("branch", f"{names}, {origin}"), origin)
-    return _diff_loops(difference, a, b)
+    return _diff_loops(difference, a, b, None if first else targets or {})
 
 
 def _diff_jobs(
@@ -208,8 +208,10 @@ def _diff_branch(
     return replace(difference, evaluation_divergence=divergence, evaluation_cause=cause)
 
 
-def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
-    """Add to the difference of two runs, of which one is a loop, where they diverge."""
+def _diff_loops(
+    difference: RunDiff, a: Recording, b: Recording, targets: Mapping[str, float] | None
+) -> RunDiff:
+    """Add to the difference of two runs, of which one is a loop, where they diverge; with targets metrics."""
     if not have_same_spaces(a, b):
         return replace(difference, notes=["the environments have other spaces: no steps are compared"])
     if difference.same_content:
@@ -227,7 +229,8 @@ def _diff_loops(difference: RunDiff, a: Recording, b: Recording) -> RunDiff:
         compared = "actions" if any(run.leaves_out_steps for run in runs.values()) else "steps"
         if topics and (compared == "steps" or (a.has_actions and b.has_actions)):
             notes.append(f"all {compared} are the same; what differs is in {', '.join(topics)}")
-    return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
+    difference = replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
+    return difference if targets is None else replace(difference, metrics=metric_diffs(a, b, targets))
 
 
 def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:

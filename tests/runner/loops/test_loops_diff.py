@@ -37,6 +37,27 @@ def test_diff_names_the_step_at_which_loops_diverge(folder):
     assert "other spaces" in foreign.stdout
 
 
+def test_the_evaluations_of_loops_are_compared(tmp_path):
+    for name, steps in (("a", 10), ("b", 20)):
+        env = gymnasium.make("CartPole-v1", max_episode_steps=steps)
+        with runner.record(env, tmp_path, name=name) as rec:
+            list(play(rec, 5))
+            with rec.phase("eval"):
+                rec.reset(seed=1)
+                truncated, step = False, 0
+                while not truncated:
+                    _, _, terminated, truncated, _ = rec.step(step % 2)
+                    assert not terminated
+                    step += 1
+    table = json.loads(dualtaxi(tmp_path, "diff", "a", "b", "--target", "mean_return=15", "--json").stdout)
+    returns = next(metric for metric in table["metrics"] if metric["name"] == "mean_return")
+    assert (returns["end_a"], returns["end_b"]) == (10, 20)
+    ((_, crossings),) = returns["crossings"].items()
+    assert crossings[0] is None
+    assert crossings[1] is not None
+    assert dualtaxi(tmp_path, "diff", "a", "b", "--target", "success=1").exit_code == 2
+
+
 @pytest.mark.parametrize("first", [True, False])
 def test_a_job_and_a_loop_over_the_same_states_are_compared_step_by_step(tmp_path, first):
     cliff = {"id": "CliffWalking-v1", "kwargs": {"max_episode_steps": 40}}
