@@ -81,7 +81,7 @@ class RunProgress:
 
     @property
     def text(self) -> str:
-        """The work that is done, as `job.js` writes it."""
+        """The work that is done, as pages write it."""
         run = f", run {self.run} of {self.runs}" if self.runs > 1 else ""
         if not self.train_steps + self.eval_steps:
             return f"preparing{run}"
@@ -120,7 +120,7 @@ class SweepProgress:
 
     @property
     def text(self) -> str:
-        """The runs that are done, as `job.js` writes it."""
+        """The runs that are done, as pages write it."""
         return f"{self.done:,} of {self.runs:,} runs"
 
 

@@ -320,6 +320,8 @@ PARTS: Final = (
     "/runs/{run}/evaluations/part",
     "/runs/{run}/what-if/{at}/{action}",
     "/queue/status",
+    "/queue/{number}/status",
+    "/queue/{number}/log",
     "/sweeps/{name}/{part}",
     "/static/{digest}/{name:path}",
     "/static/rerun/{number}/{name}",

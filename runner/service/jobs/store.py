@@ -262,12 +262,12 @@ class JobStore:
                     events.append(JobEvent.from_line(line, str(after)))
         return events, after
 
-    def last_events(self, number: int, limit: int) -> tuple[list[JobEvent], int]:
-        """Return the last events of a job, and the id of the last one."""
+    def last_events(self, number: int, limit: int) -> list[JobEvent]:
+        """Return the last events of a job."""
         self.job(number)
         with self.path(number, LOG_FILE).open("rb") as log:
             lines = deque(log, limit)
-            return self.events(number, log.tell() - sum(map(len, lines)))
+            return self.events(number, log.tell() - sum(map(len, lines)))[0]
 
     def submitted(self, number: int) -> str:
         """Return the text of a job as it was submitted."""

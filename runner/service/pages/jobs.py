@@ -9,12 +9,13 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Query, Response
 
 from runner.analysis.sections import Paging
+from runner.client.jobs import JobStatus
 from runner.debugging.explanation_files import explanations_in
 from runner.service.api.jobs import Number
 from runner.service.api.uploads import list_uploads
 from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
-from runner.service.jobs.store import QueuedJob
+from runner.service.pages.frame import StatusName
 from runner.service.pages.rendering import Page, to_job
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
@@ -22,6 +23,7 @@ router = APIRouter(prefix="/queue", include_in_schema=False)
 ROWS: Final = 50
 MAX_LINES: Final = 1000
 """Lines of a job's log that its page shows."""
+After = Annotated[int, Query(ge=0, lt=2**53)]
 PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**6)]
 
 
@@ -43,20 +45,33 @@ def queue_status(jobs: JobsOf, number: PageNumber = 1) -> Response:
 @router.get("/{number}")
 def job(jobs: JobsOf, number: Number) -> Response:
     """Show a job: its progress, its log, its runs."""
-    events, place = jobs.store.last_events(number, MAX_LINES)
-    own_job = jobs.store.job(number)  # read after its log: the script of the page receives later events
+    events = jobs.store.last_events(number, MAX_LINES)
+    own_job = jobs.store.job(number).status()  # read after its log: the page receives later events
     is_answered = own_job.kind == "explain" and own_job.is_over
     answers = explanations_in(jobs.recordings) if is_answered else []
     values = {
-        "job": own_job.status(),
+        "job": own_job,
         "log": events,
-        "place": place,  # the id of the last event in the log
         "submitted": jobs.store.submitted(number),
-        "is_over": own_job.is_over,
         "seconds": _seconds(own_job),
         "explanations": [name for name in answers if name.startswith(f"{own_job.name}/")],
     }
     return Page("job.html", values)
+
+
+@router.get("/{number}/status")
+def job_status(jobs: JobsOf, number: Number, state: StatusName) -> Response:
+    """Return the progress and the runs of a job as a part of its page; 204 once it has another state."""
+    own_job = jobs.store.job(number).status()
+    if own_job.state != state:
+        return Response(status_code=HTTPStatus.NO_CONTENT)
+    return Page("job_status.html", {"job": own_job})
+
+
+@router.get("/{number}/log")
+def job_log(jobs: JobsOf, number: Number, after: After) -> Response:
+    """Return the lines of a job's log after an event as a part of its page."""
+    return Page("job_log.html", {"log": jobs.store.events(number, after)[0]})
 
 
 @router.post("/{number}/cancel")
@@ -84,8 +99,8 @@ def _rows(jobs: JobQueue, number: int) -> dict[str, object]:
     }
 
 
-def _seconds(job: QueuedJob) -> float | None:
+def _seconds(job: JobStatus) -> float | None:
     """Return the duration of a job from its first start; None if it is not over, or never started."""
-    if not job.is_over or not job.started or not job.ended:
+    if not (job.is_over and job.started and job.ended):
         return None
     return (datetime.fromisoformat(job.ended) - datetime.fromisoformat(job.started)).total_seconds()

@@ -83,8 +83,8 @@ def test_a_mistake_is_shown_at_its_line_then_a_job_is_submitted_and_watched(page
     wait(browser, lambda: "1 run" in text_of(browser, "#valid"))
     browser.find_element(By.CSS_SELECTOR, "button[value=submit]").click()
     wait(browser, lambda: "/queue/" in browser.current_url)
-    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "[data-state] .finished"))
-    browser.find_element(By.CSS_SELECTOR, "[data-runs] a").click()
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".titled .finished"))
+    browser.find_element(By.CSS_SELECTOR, ".runs a").click()
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, "#status"))
     assert find_run("asked", folder).run_id in browser.current_url
     assert "180" in text_of(browser, "#status")

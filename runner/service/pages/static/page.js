@@ -38,12 +38,15 @@ document.querySelectorAll("[data-later]:not([data-over-axis])").forEach(load);
 document.addEventListener("axischange", overAxis);
 overAxis();
 
-// A part that changes is fetched repeatedly, until the whole page must be loaded again.
+// A part that changes is fetched repeatedly, until the whole page must be loaded again; of a list with ids only what
+// follows its last entry.
 async function reload(place) {
   try {
-    const response = await request(place.dataset.live);
+    const last = place.lastElementChild?.dataset.id;
+    const response = await request(place.dataset.live + (last ?? ""));
     if (response.status === 204) return location.reload();
-    place.innerHTML = await response.text();
+    if (!last) place.textContent = "";
+    place.insertAdjacentHTML("beforeend", await response.text());
   } catch {
     /* the service is not available: try again */
   }
