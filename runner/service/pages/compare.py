@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, Query, Request, Response
@@ -13,6 +12,7 @@ from fastapi.responses import HTMLResponse
 from runner.analysis.axes import EPISODES
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.groups import flat_config
+from runner.analysis.sections import Grid
 from runner.errors import RunnerError
 from runner.export.plots.comparisons import letter
 from runner.recording.metrics import METRICS
@@ -34,12 +34,12 @@ from runner.views.compare import MAX_SCORES
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
 
-TABS: Final = (
+TABS: Final[tuple[tuple[str, str], ...]] = (
     ("", "Overview"),
-    ("/divergence", "Where they diverge"),
-    ("/replay", "Replays in step"),
-    ("/tables", "Q-tables"),
-    ("/code", "Code"),
+    ("divergence", "Where they diverge"),
+    ("replay", "Replays in step"),
+    ("tables", "Q-tables"),
+    ("code", "Code"),
 )
 MAX_LATEST: Final = 4
 """Runs whose latest episodes a page replays."""
@@ -47,8 +47,6 @@ MAX_RUNS: Final = 60
 """Runs that a page compares."""
 Scores = Annotated[str, Query(max_length=MAX_SCORES)]
 Names = Annotated[list[str] | None, Query(max_length=100)]
-Rows = list[tuple[str, list[str]]]
-"""Rows of a table: a name, and the value of each run."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,6 @@ class ComparedRun:
     """A run in a comparison."""
 
     head: RunHead
-    recording: Path
     letter: str
     label: str
     number: int
@@ -68,8 +65,8 @@ class Compared:
     """The head of every page of a comparison."""
 
     runs: list[ComparedRun]
-    tabs: list[tuple[str, str, str]]
-    """Path, title and address."""
+    tabs: list[tuple[str, str]]
+    """Path and title."""
     here: str
     can_explain: bool
     """Whether mixtures of both can be trained: jobs that differ in more than their seed."""
@@ -127,17 +124,18 @@ def overview(runs: ChosenRuns, scores: Scores = "") -> Response:
     """Show the differences of runs, and their curves in common plots."""
     settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in runs]
     rows = [
-        (key, [each.get(key, humanize.UNKNOWN) for each in settings])
+        (key, *(each.get(key, humanize.UNKNOWN) for each in settings))
         for key in dict.fromkeys(key for each in settings for key in each)
     ]
     digests = {each.summary.content_digest for each in runs}
     environments = {json.dumps(each.file.config.get("env"), sort_keys=True) for each in runs}
     tasks_address = link("/compare/tasks", {"run": [each.run_id for each in runs], "scores": scores})
     compared = _compared(runs, "")
+    headings = ("", *(run.label for run in compared.runs))
     values = {
         "compared": compared,
-        "differing": [(key, values) for key, values in rows if len(set(values)) > 1],
-        "results": _results(runs),
+        "differing": Grid(headings, [row for row in rows if len(set(row[1:])) > 1], left=headings),
+        "results": Grid(headings, _results(runs), left=headings),
         "same": len(digests) == 1 and None not in digests,
         # The latest episodes of these replay by themselves.
         "running": [each for each in compared.runs if each.head.status == "running"][:MAX_LATEST],
@@ -172,10 +170,10 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
         return link("/compare/replay", {"run": names, "at": str(other)}) if has_one else ""
 
     def show() -> dict[str, object]:
-        head, shown = _compared(runs, "/replay"), []
-        for one, place in zip(head.runs, places, strict=True):
+        head, shown = _compared(runs, "replay"), []
+        for run, one, place in zip(runs, head.runs, places, strict=True):
             source = f"/api/v1/runs/{one.head.id}/replay/{place.episode_path}"
-            with open_recording(one.recording) as recording:
+            with open_recording(run.recording) as recording:
                 shown.append(panel_of(recording, place.phase, source, one.label, one.number))
         return {
             "compared": head,
@@ -200,42 +198,45 @@ async def difference(request: Request, runs: TwoRuns, compute: ComputationOf) ->
     function = fragments.made_difference if tab == "code" else fragments.difference
     found = await compute.shown(ShownDifference, function, *runs)
     lead, notes, body = found.tabs[tab]
-    values = {"compared": _compared(runs, f"/{tab}"), "lead": lead, "notes": notes, "body": body}
+    values = {"compared": _compared(runs, tab), "lead": lead, "notes": notes, "body": body}
     return Page("compare_answer.html", values)
 
 
 def _compared(runs: list[Run], here: str) -> Compared:
-    names = [each.run_id for each in runs]
-    tabs = [(tab, title, link(f"/compare{tab}", {"run": names})) for tab, title in TABS]
-    letters = [letter(i) for i in range(len(runs))]
     compared = [
-        ComparedRun(head_of(each), each.recording, letter, f"{letter}: {each.name}", i % 7)
-        for i, (each, letter) in enumerate(zip(runs, letters, strict=True))
+        ComparedRun(head_of(each), letter(i), f"{letter(i)}: {each.name}", i % 7)
+        for i, each in enumerate(runs)
     ]
     are_jobs = [each.can_train_again for each in runs]
-    if not any(are_jobs):
-        tabs = [tab for tab in tabs if tab[0] != "/tables"]
+    tabs = [tab for tab in TABS if len(runs) == 2 and (any(are_jobs) or tab[0] != "tables")]
     differ = len({repr(_flat(each)) for each in runs}) > 1
     can_explain = len(runs) == 2 and all(are_jobs) and differ
-    return Compared(compared, tabs if len(runs) == 2 else [], here, can_explain)
+    return Compared(compared, tabs, here, can_explain)
 
 
 def _flat(run: Run) -> dict[str, str]:
     return {key: humanize.setting(value) for key, value in flat_config(run.file.config).items()}
 
 
-def _results(runs: list[Run]) -> Rows:
-    """Return the results of runs, a row for each measure."""
+def _results(runs: list[Run]) -> list[tuple[str, ...]]:
+    """Return the name and the value of each run, for each measure."""
     last = [last_results(each).last_evaluation or EvaluationMetrics() for each in runs]
     metrics = [metric for metric in METRICS if any(each.values.get(metric.name) is not None for each in last)]
-    digests = [str(each.summary.content_digest or humanize.UNKNOWN)[:16] for each in runs]
-    return [
-        ("Status", [each.status for each in runs]),
-        *(
-            (result_of(metric, last[0])[0], [result_of(metric, each)[1] for each in last])
-            for metric in metrics
-        ),
-        ("Training episodes", [humanize.number(each.summary.episodes, 0) for each in runs]),
-        ("Training steps", [humanize.number(each.summary.train_steps, 0) for each in runs]),
-        ("Content digest", digests),
+    names = [
+        "Status",
+        *(result_of(metric, last[0])[0] for metric in metrics),
+        "Training episodes",
+        "Training steps",
+        "Content digest",
     ]
+    columns = [
+        (
+            run.status,
+            *(result_of(metric, evaluation)[1] for metric in metrics),
+            humanize.number(run.summary.episodes, 0),
+            humanize.number(run.summary.train_steps, 0),
+            str(run.summary.content_digest or humanize.UNKNOWN)[:16],
+        )
+        for run, evaluation in zip(runs, last, strict=True)
+    ]
+    return list(zip(names, *columns, strict=True))

@@ -14,6 +14,7 @@ from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 from starlette.concurrency import run_in_threadpool
 
+from runner.analysis.sections import Grid
 from runner.debugging.explanation_files import explanations_in
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
@@ -41,34 +42,22 @@ For each what computes it, and what the page says meanwhile.
 """
 
 
-@dataclass(frozen=True)
-class ListedSweep:
-    """A sweep in the list; with a problem, only its name is known."""
-
-    name: str
-    problem: str
-    strategy: str = ""
-    parameters: str = ""
-    objective: str = ""
-    runs: int = 0
-
-
 @router.get("")
 def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
     """Show the sweeps."""
-    listed_sweeps: list[ListedSweep] = []
+    rows: list[tuple[str, ...]] = []
     for folder in settings.recordings:
         for name in sweeps_in(folder):
             try:
                 sweep = read_sweep(name, folder)
             except RunnerError as error:
-                listed_sweeps.append(ListedSweep(name, message_of(error, request)))
+                rows.append((name, message_of(error, request), "", "", ""))
                 continue
-            runs = _tagged(catalogue, name)
             parameters = ", ".join(sweep.file.parameters)
-            listed_sweeps.append(
-                ListedSweep(name, "", sweep.file.strategy, parameters, sweep.objective.description, runs)
-            )
+            runs = f"{_tagged(catalogue, name):,}"
+            rows.append((name, sweep.file.strategy, parameters, sweep.objective.description, runs))
+    headings = ("name", "strategy", "parameters", "objective", "runs")
+    listed_sweeps = Grid(headings, rows, links=[f"/sweeps/{name}" for name, *_ in rows], left=headings[:4])
     names = [name for folder in settings.recordings for name in explanations_in(folder)]
     return Page("sweeps.html", {"sweeps": listed_sweeps, "explanations": names})
 
