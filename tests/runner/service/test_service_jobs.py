@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import errno
 import json
+import re
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -133,6 +134,18 @@ def test_watchers_read_the_log_only_for_new_events(client, submit, monkeypatch):
             client.post(f"/api/v1/jobs/{number}/cancel")
         assert [data["state"] for _, _, data in watcher.result(30)] == ["queued", "cancelled"]
     assert 0 not in counts
+
+
+def test_the_page_of_a_job_loads_its_state_and_the_rest_of_its_log(client, submit):
+    *running, queued = [submit(ENDLESS) for _ in range(3)]
+    (last,) = re.findall(r'<li data-id="(\d+)"', client.get(f"/queue/{queued}").text)
+    status, log = f"/queue/{queued}/status?state=queued", f"/queue/{queued}/log?after={last}"
+    assert client.get(status).status_code == 200
+    assert "<li" not in client.get(log).text
+    for number in (queued, *running):
+        client.post(f"/api/v1/jobs/{number}/cancel")
+    assert client.get(status).status_code == 204, "the whole page is loaded again"
+    assert client.get(log).text.count("job cancelled") == 1
 
 
 def test_a_late_watcher_receives_the_last_progress(client, submit):
