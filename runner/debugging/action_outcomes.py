@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Final
 
 import numpy as np
 
 from runner.analysis.contents import END_WORDS
-from runner.analysis.sections import Grid, Section, html
+from runner.analysis.sections import Figure, Grid, Section, html
 from runner.drawing import svg, svg_maps
 from runner.drawing.palette import ink_on, ramp_colour
 from runner.environments.mdp import Mdp
@@ -22,6 +21,14 @@ _CELL: Final = (116, 44)
 """Width and height of a cell of the matrix."""
 _HEAD: Final = (96, 60)
 """Width and height of its headings."""
+_OF_MATRIX: Final = (
+    "The exact value of each joint action if the policy acts from there on. The recorded one has a frame."
+)
+_OF_TABLE: Final = (
+    "Return and length are those of the whole episode. Policy: how likely it takes the action. Learned: the "
+    "Q-value. Value: the exact discounted return from here on under that policy; optimal: if all act "
+    "optimally after the action, together. Regret: how much more the best action is worth."
+)
 
 
 @dataclass(frozen=True)
@@ -142,12 +149,12 @@ class WhatIf:
         places = drawing.places(self.mdp, np.array([self.state]))
         return drawing.frame(places[0], f"The state of the step: {self.state_in_words}", style=style)
 
-    def matrix(self, address: Callable[[int], str] | None = None) -> str:
+    def matrix(self, base: str = "") -> str:
         """Return the actions of two agents as a matrix, as SVG; empty for other environments.
 
         The first agent's actions are the rows. A cell has the exact values of its joint action, or its
-        returns where there are none, and the colour of their sum; `address` returns what the cell of a joint
-        action links to.
+        returns where there are none, and the colour of their sum. It links to the page of the action if
+        `base`, the address of the run, is given.
         """
         mdp = self.mdp
         if len(mdp.agents) != 2 or len(self.actions) < mdp.joint_actions:
@@ -182,23 +189,35 @@ class WhatIf:
             title = (
                 f"<title>{escape(row.name)}: {escape(END_WORDS[row.end])} after {row.length:,} steps</title>"
             )
-            link = "" if address is None else f' href="{escape(address(row.action))}"'
-            parts.append(f"<a{link}>{title}{cell}</a>" if link else f"<g>{title}{cell}</g>")
+            link = f'a href="{escape(base + self._page(row))}"' if base else "g"
+            parts.append(f"<{link}>{title}{cell}</{link[0]}>")
         width, height = _HEAD[0] + _CELL[0] * len(columns), _HEAD[1] + _CELL[1] * len(rows)
         label = f"The value of each action of {first} (rows) and {second} (columns)"
         drawn = svg.picture(width + 4, height + 4, label, "".join(parts))
-        return drawn if address is None else drawn.replace('role="img"', 'role="group"', 1)
+        return drawn.replace('role="img"', 'role="group"', 1) if base else drawn
+
+    def _page(self, row: ActionOutcome) -> str:
+        return f"what-if/{self.at}/{row.action}"
+
+    def sections(self, base: str = "") -> list[Section]:
+        """Return what people see: the step, its pictures, and where each action leads.
+
+        The pictures have links, and the style of a page, if `base`, the address of the run, is given.
+        """
+        drawn = (
+            Figure(self.picture("" if base else svg.STYLE)),
+            Figure(self.matrix(base), _OF_MATRIX, is_wide=True),
+        )
+        figures = [figure for figure in drawn if figure.svg]
+        grid = replace(self.grid, links=list(map(self._page, self.actions)))
+        return [
+            Section("The step", facts=self.facts),
+            Section("", list(map(sentence, self.notes)), figures=figures, layout="split matrix"),
+            Section("Where each action leads", [_OF_TABLE], [grid]),
+        ]
 
     def _repr_html_(self) -> str:
-        """Return the result as a notebook shows it."""
-        facts = [f"{name}: {text}" for name, text in self.facts.items()]
-        notes = list(map(sentence, self.notes))
-        return (
-            f"{html([Section('What if?', facts)])}"
-            f'<div style="display:flex;gap:1rem;max-width:60rem"><div style="flex:1">{self.picture()}</div>'
-            f'<div style="flex:2">{self.matrix()}</div></div>'
-            f"{html([Section('Where each action leads', notes, [self.grid])])}"
-        )
+        return html(self.sections())
 
 
 def _short(value: float) -> str:

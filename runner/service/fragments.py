@@ -21,7 +21,7 @@ from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.sections import made_sections, summary
 from runner.analysis.episodes import TYPICAL, EpisodeRef, StepLike
 from runner.analysis.histograms import histograms
-from runner.analysis.sections import Figure, Grid, Link, Section
+from runner.analysis.sections import Figure, Link, Section
 from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if
@@ -56,26 +56,6 @@ _STEPS_BEFORE: Final = 1
 
 
 @dataclass(frozen=True)
-class ShownBranches:
-    """Where each joint action at a step leads, and a part of the episode to which one of them leads."""
-
-    facts: dict[str, str]
-    notes: Sequence[str]
-    action: int
-    """The action whose branch is shown, and its name."""
-    name: str
-    picture: str
-    """The grid in the state of the step, as SVG; empty without a scene."""
-    matrix: str
-    """The actions of two agents, as SVG; empty for other environments."""
-    grid: Grid
-    addresses: list[str]
-    """The page of each action's branch."""
-    part: Json
-    """As for `episode_part`."""
-
-
-@dataclass(frozen=True)
 class ShownDifference:
     """What differs between two runs."""
 
@@ -104,29 +84,24 @@ def _compact(part: Json) -> bytes:
     return json.dumps(part, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 
-def what_if_page(run: Run, at: EpisodeRef, action: str | None, start: int, steps: int) -> bytes:
-    """Return `ShownBranches` as JSON; the branch shown is that of `action`, None for the recorded one."""
+def what_if_page(path: Path, at: EpisodeRef, action: str | None, start: int, steps: int) -> bytes:
+    """Return a part as `branch_part` does, with its action and, as HTML, where each joint action leads.
 
-    def address(number: int) -> str:
-        return f"/runs/{run.run_id}/what-if/{at}/{number}"
-
-    with open_recording(run.recording) as recording:
-        branches = what_if(recording, at=at)
-        number = next(row.action for row in branches.actions if row.is_recorded)
+    It is the branch of `action`, None for the recorded one.
+    """
+    with open_recording(path) as recording:
+        found, base = what_if(recording, at=at), f"/runs/{recording.run_id}/"
+        number = next(row.action for row in found.actions if row.is_recorded)
         if action is not None:
             number = joint_action(recording.mdp, action)
-        shown = ShownBranches(
-            facts=branches.facts,
-            notes=branches.notes,
-            action=number,
-            name=str(actions_in_words(recording.mdp)[number]),
-            picture=branches.picture(style=""),
-            matrix=branches.matrix(address),
-            grid=branches.grid,
-            addresses=[address(row.action) for row in branches.actions],
-            part=_branch_part(recording, at, str(number), start, steps),
-        )
-        return as_json(shown)
+        *before, after = found.sections(base)
+        texts = {
+            "action": str(number),
+            "name": str(actions_in_words(recording.mdp)[number]),
+            "before": str(partials().answer(before, base)),
+            "after": str(partials().answer([after], base)),
+        }
+        return _compact(_branch_part(recording, at, str(number), start, steps) | texts)
 
 
 def answer(subject: Path | Run, question: Callable[..., Answer], values: Given) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated
 
 from fastapi import APIRouter, Response
@@ -11,7 +12,6 @@ from runner.service import fragments
 from runner.service.api.debugging import At
 from runner.service.api.replay import STEPS
 from runner.service.dependencies import ComputationOf, RecordedRun
-from runner.service.fragments import ShownBranches
 from runner.service.pages.frame import RunPage
 from runner.service.pages.replay import BEFORE, T, stage_of, step_of
 
@@ -33,16 +33,10 @@ async def what_if(
     step = await step_of(run, compute, at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
-    branches = await compute.shown(ShownBranches, fragments.what_if_page, run, step, action, start, STEPS)
-
-    def show() -> dict[str, object]:
-        return {
-            "at": str(step),
-            "title": f"What if? {step.heading}, step {step.t:,}",
-            "found": branches,
-            "stage": stage_of(branches.part, shown_t),
-            "source": f"/api/v1/runs/{run.run_id}/what-if/{step}/{branches.action}",
-            "recorded": f"/runs/{run.run_id}/replay/{step.episode_path}?t={step.t}",
-        }
-
-    return RunPage(run, "replay", "run_what_if.html", show)
+    found = json.loads(await compute(fragments.what_if_page, run.recording, step, action, start, STEPS))
+    return RunPage(
+        run,
+        "replay",
+        "run_what_if.html",
+        lambda: {"step": step, "found": found, "stage": stage_of(found, shown_t)},
+    )
