@@ -252,7 +252,14 @@ def html(sections: Sequence[Section]) -> str:
             body = "".join(f"<tr>{row}</tr>" for row in rows)
             parts.append(f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
         parts += [f"<pre>{escape(chr(10).join(lines))}</pre>" for lines in section.diffs]
-        parts += [f'<figure style="max-width: 46em">{figure.svg}</figure>' for figure in section.figures]
+        is_row = "split" in section.layout
+        figures = [
+            f'<figure style="flex: 1; max-width: {22 if is_row and not figure.is_wide else 46}em">'
+            f"{figure.svg}</figure>"
+            for figure in section.figures
+        ]
+        if figures:
+            parts.append(f'<div style="display: {"flex" if is_row else "block"}">{"".join(figures)}</div>')
     return "\n".join(parts)
 
 
