@@ -131,7 +131,7 @@ class SweepFile(ConfigSection):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        self.searched.check(self)
+        self.searched.check(self.strategy, self.trials, self.parameters)
         if self.pruning is not None and self.objective.at == "first_over":
             raise refusal(("pruning",), "found one, but objective.at is first_over, which can come late")
         return self

@@ -39,7 +39,7 @@ class Search:
         self._optuna = require_optuna()
         self._sweep, self._file = sweep, (file := sweep.file)
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
-        sampler = file.searched.sampler(self._optuna.samplers, file, file.search_seed % 2**32)
+        sampler = file.searched.sampler(self._optuna.samplers, file.batch, file.search_seed % 2**32)
         self._study = self._optuna.create_study(sampler=sampler, direction=file.objective.direction)
         self._asked_trials: list[Trial] = []
         self._suggested: set[str] = set()

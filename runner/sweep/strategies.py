@@ -5,7 +5,7 @@ A strategy proposes values by a sampler of Optuna, asked for a batch at a time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Final
@@ -13,28 +13,26 @@ from typing import TYPE_CHECKING, Annotated, Final
 from pydantic import AfterValidator, Field
 
 from runner.config.values import refusal
-from runner.sweep.parameters import MAX_TRIALS, Range, points_of
+from runner.sweep.parameters import MAX_TRIALS, Parameter, Range, points_of
 
 if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
 
-    from runner.sweep.model import SweepFile
+
+def _check_search(strategy: str, trials: int | None, _: Mapping[str, Parameter]) -> None:
+    if trials is None:
+        raise refusal(("trials",), f"missing, expected a whole number: {strategy} has no end")
 
 
-def _check_search(file: SweepFile) -> None:
-    if file.trials is None:
-        raise refusal(("trials",), f"missing, expected a whole number: {file.strategy} has no end")
-
-
-def _check_grid(file: SweepFile) -> None:
-    if file.trials is not None:
-        raise refusal(("trials",), f"found {file.trials}, but a grid tries all of its points")
-    for name, parameter in file.parameters.items():
+def _check_grid(_: str, trials: int | None, parameters: Mapping[str, Parameter]) -> None:
+    if trials is not None:
+        raise refusal(("trials",), f"found {trials}, but a grid tries all of its points")
+    for name, parameter in parameters.items():
         if isinstance(parameter, Range) and parameter.step is None and not parameter.is_integer:
             raise refusal(("parameters", name), "found a range without step: a grid needs one")
         if isinstance(parameter, Range) and parameter.log:
             raise refusal(("parameters", name, "log"), "found true, but a grid has steps")
-    if points_of(file.parameters.values()) > MAX_TRIALS:
+    if points_of(parameters.values()) > MAX_TRIALS:
         message = (
             f"found a grid of more points than {MAX_TRIALS:,}: take larger steps, or a strategy that "
             "tries some of them"
@@ -48,10 +46,10 @@ class Strategy:
 
     text: str
     """The values that it tries, for the help of the key `strategy` and the documentation."""
-    sampler: Callable[[ModuleType, SweepFile, int], BaseSampler]
-    """Returns the sampler, from the module `optuna.samplers`, the sweep's file and a seed of 32 bits."""
-    check: Callable[[SweepFile], None] = _check_search
-    """Refuses settings that do not fit the strategy."""
+    sampler: Callable[[ModuleType, int, int], BaseSampler]
+    """Returns the sampler, from the module `optuna.samplers`, the size of a batch and a seed of 32 bits."""
+    check: Callable[[str, int | None, Mapping[str, Parameter]], None] = _check_search
+    """Refuses a number of trials, or parameters, that do not fit the strategy, which has this name."""
     is_grid: bool = False
     """Whether it tries every point of a grid, rather than a number of trials."""
     is_adaptive: bool = True
@@ -75,12 +73,12 @@ STRATEGIES: Final = {
     ),
     "tpe": Strategy(
         "`trials` combinations, by a tree-structured Parzen estimator of good values",
-        lambda samplers, file, seed: samplers.TPESampler(seed=seed, n_startup_trials=2 * file.batch),
+        lambda samplers, batch, seed: samplers.TPESampler(seed=seed, n_startup_trials=2 * batch),
         skips_repeats=True,
     ),
     "genetic": Strategy(
         "`trials` combinations, by the genetic algorithm NSGA-II; a batch is a generation",
-        lambda samplers, file, seed: samplers.NSGAIISampler(population_size=max(2, file.batch), seed=seed),
+        lambda samplers, batch, seed: samplers.NSGAIISampler(population_size=max(2, batch), seed=seed),
     ),
 }
 """By the name in a sweep's file."""

@@ -217,7 +217,7 @@ def test_two_loops_are_compared_after_the_same_number_of_steps(folder):
             ["--at-step", "9000"],
             "found no values after 9,000 training steps; the nearest are those after 2,000",
         ),
-        (["--at-step", "10", "--axis", "steps"], "excludes --axis and --moment"),
+        (["--at-step", "10", "--axis", "steps"], "excludes axis and moment"),
         (["--axis", "step"], "Did you mean 'steps'?"),
         (["--axis", "steps", "--moment", "1.5"], "or a number of training steps"),
     ],
