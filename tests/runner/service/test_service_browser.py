@@ -379,7 +379,7 @@ def test_a_narrow_comparison_cuts_no_word(page, browser):
     page("/compare?run=first&run=second")
     lines = browser.execute_script(
         """
-        const cells = [...document.querySelectorAll(".against td")];
+        const cells = [...document.querySelectorAll(".against tbody td")];
         return cells.filter((cell) => !/\\s/.test(cell.textContent)).map((cell) => {
           const words = document.createRange();
           words.selectNodeContents(cell);

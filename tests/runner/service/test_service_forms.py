@@ -87,9 +87,9 @@ def test_the_page_of_a_finished_job_links_to_its_run_and_requests_no_events(clie
     assert f'href="/runs/{run_id}">The run</a>' in page
     assert f'run <a href="/runs/{run_id}">{run_id}</a> started' in page
     assert "started</small>" not in page
-    assert "data-active" not in page
+    assert "data-live" not in page
     assert re.search(r"ago, finished <time[^>]* data-age>[^<]+</time> ago, took [\d.]+ s<", page)
-    place = re.search(r'data-place="(\d+)"', page)[1]
+    place = re.findall(r'data-id="(\d+)"', page)[-1]
     assert client.get(f"/api/v1/jobs/{number}/events?after={place}").status_code == 204
 
 
