@@ -161,8 +161,8 @@ class CommandGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find a command, or suggest one."""
-        names = self.list_commands(ctx)
-        if args[0] not in names and not args[0].startswith("-") and not ctx.resilient_parsing:
+        is_known = args[0] in self.shipped() or args[0].startswith("-") or ctx.resilient_parsing
+        if not is_known and args[0] not in (names := self.list_commands(ctx)):
             commands = {name: self.get_command(ctx, name) for name in self.shipped()}
             inside = [
                 f" Did you mean '{name} {args[0]}'?"

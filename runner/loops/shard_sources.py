@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError
 from runner.recording import schema
+from runner.recording.blocks import MAGIC
 from runner.recording.integrity import check_up_to_cut
 from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording, open_recording
@@ -228,6 +228,6 @@ def _comparable(description: Any) -> Any:
 def _is_foreign(path: Path) -> bool:
     """Return whether a file begins with anything but a recording, or nothing."""
     with contextlib.suppress(OSError), open_regular(path) as stream:
-        start = stream.read(len(MCAP0_MAGIC))
-        return any(start) and not MCAP0_MAGIC.startswith(start)
+        start = stream.read(len(MAGIC))
+        return any(start) and not MAGIC.startswith(start)
     return False

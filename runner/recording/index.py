@@ -29,10 +29,9 @@ from mcap.records import (
     Schema,
     Statistics,
 )
-from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import CutOff, RecordingError
-from runner.recording.blocks import MESSAGE_HEAD, RECORD_HEAD
+from runner.recording.blocks import MAGIC, MESSAGE_HEAD, RECORD_HEAD
 from runner.recording.layout import Layout
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import (
@@ -238,7 +237,7 @@ class Index:
                 self.channel_records += RECORD_HEAD.pack(*raw[:2]) + raw.body
             case Opcode.STATISTICS:
                 self.message_counts = dict(_parse(Statistics, raw).channel_message_counts)
-            case Opcode.HEADER if raw.offset != len(MCAP0_MAGIC):
+            case Opcode.HEADER if raw.offset != len(MAGIC):
                 raise RecordingError(f"found a second header at {raw.offset}")
 
     def add_metadata(self, name: str, place: Place) -> None:
@@ -251,7 +250,7 @@ class Index:
         self.media_types[name] = media_type
 
     def _check_place(self, what: str, offset: int, length: int) -> None:
-        if offset < len(MCAP0_MAGIC) or length < RECORD_HEAD.size or offset + length > self.end:
+        if offset < len(MAGIC) or length < RECORD_HEAD.size or offset + length > self.end:
             raise RecordingError(
                 f"the index points to {what} of {length} bytes at {offset}, outside the data"
             )
@@ -262,7 +261,7 @@ class Index:
         Raises:
             RecordingError: one cannot be read, or contradicts those before it.
         """
-        self.end = len(MCAP0_MAGIC)
+        self.end = len(MAGIC)
         for raw in raw_records(stream, self.end, self.size):
             if not raw.is_data or (raw.is_message_index and not self.chunks):
                 return
@@ -272,7 +271,7 @@ class Index:
     def _take_summary(self, stream: BinaryIO, footer: Footer) -> None:
         """Add the records of the summary section, after comparing its checksum."""
         start, end = footer.summary_start, self.size - _TAIL.size
-        if not len(MCAP0_MAGIC) < start <= footer.summary_offset_start <= end:
+        if not len(MAGIC) < start <= footer.summary_offset_start <= end:
             raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`")
         fields = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, footer.summary_offset_start)
         if crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
@@ -322,7 +321,7 @@ class Index:
             summary += data
         footer = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, start + len(summary))
         crc = crc32(footer, crc32(summary + offsets))
-        return b"".join((data_end, summary, offsets, footer, struct.pack("<I", crc), MCAP0_MAGIC))
+        return b"".join((data_end, summary, offsets, footer, struct.pack("<I", crc), MAGIC))
 
     def count_messages(self) -> dict[int, int]:
         """Return the number of messages of each channel that has any, by the entries of the chunks."""
@@ -377,15 +376,15 @@ def check_beginning(stream: BinaryIO) -> int:
         RecordingError: it is such a file, or is empty.
     """
     stream.seek(0)
-    magic = stream.read(len(MCAP0_MAGIC))
+    magic = stream.read(len(MAGIC))
     if not magic:
         raise RecordingError("found an empty file, expected a recording")
-    if magic != MCAP0_MAGIC:
-        error = CutOff if MCAP0_MAGIC.startswith(magic) else RecordingError
+    if magic != MAGIC:
+        error = CutOff if MAGIC.startswith(magic) else RecordingError
         raise error(f"found {magic!r} at its start, expected an MCAP file: not a dualtaxi recording")
-    header = next(raw_records(stream, len(MCAP0_MAGIC), stream.seek(0, 2)), None)
+    header = next(raw_records(stream, len(MAGIC), stream.seek(0, 2)), None)
     if header is None or header.kind != Opcode.HEADER:
-        raise CutOff(f"the Header record at {len(MCAP0_MAGIC)} cannot be read")
+        raise CutOff(f"the Header record at {len(MAGIC)} cannot be read")
     try:
         profile = _parse(Header, header).profile
     except RecordingError as error:
@@ -438,11 +437,11 @@ def _beginning(messages: Mapping[Topic, MessageType]) -> Beginning:
 
 def _footer(stream: BinaryIO, size: int) -> Footer | None:
     """Return the footer if the file ends as a finished one does."""
-    if size < _TAIL.size + len(MCAP0_MAGIC):
+    if size < _TAIL.size + len(MAGIC):
         return None
     stream.seek(size - _TAIL.size)
     opcode, length, start, offsets, crc, magic = _TAIL.unpack(stream.read(_TAIL.size))
-    is_footer = (opcode, length, magic) == (Opcode.FOOTER, _FOOTER_BODY_BYTES, MCAP0_MAGIC)
+    is_footer = (opcode, length, magic) == (Opcode.FOOTER, _FOOTER_BODY_BYTES, MAGIC)
     return Footer(start, offsets, crc) if is_footer else None
 
 

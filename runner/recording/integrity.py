@@ -14,11 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.writer import MCAP0_MAGIC
-
 from runner.errors import CutOff, OtherVersion, RecordingError
 from runner.recording import schema
-from runner.recording.blocks import RECORD_HEAD
+from runner.recording.blocks import MAGIC, RECORD_HEAD
 from runner.recording.extras import ExtraNames
 from runner.recording.index import Index, beginning_of, check_beginning, checksum
 from runner.recording.layout import Layout
@@ -228,9 +226,9 @@ def _ends_torn(stream: BinaryIO, contents: Index) -> bool:
     Before it may stand a good chunk without its index, which is written again.
     """
     offset = contents.end
-    if contents.size > len(MCAP0_MAGIC):
-        stream.seek(-len(MCAP0_MAGIC), os.SEEK_END)
-        if stream.read() == MCAP0_MAGIC:
+    if contents.size > len(MAGIC):
+        stream.seek(-len(MAGIC), os.SEEK_END)
+        if stream.read() == MAGIC:
             return False  # it was closed: a damaged length may look like a cut
     if offset == 0:
         return contents.size == 0 or _only_zeros(stream, 0)

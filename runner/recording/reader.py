@@ -400,7 +400,7 @@ class Phase:
         layouts = {layout.number: layout for layout in extra_layouts(self._recording)} if table else {}
         index, parts = self._recording.file.index, []
         channels = self._recording.file.channels[table.places]
-        for channel in np.unique(channels).tolist():
+        for channel in sorted(set(channels.tolist())):
             layout = layouts.get(channel // schema.LAYOUT_STRIDE)
             if layout is None or not layout.is_declared_in(index):
                 raise RecordingError(

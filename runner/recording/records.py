@@ -21,7 +21,6 @@ from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import McapRecord, Metadata
-from mcap.writer import MCAP0_MAGIC
 from numpy.lib.stride_tricks import sliding_window_view
 
 from runner.errors import RecordingError
@@ -29,6 +28,7 @@ from runner.recording import schema
 from runner.recording.blocks import (
     HEADER,
     HEADER_BYTES,
+    MAGIC,
     MESSAGE_HEAD,
     RECORD_HEAD,
     constant_bytes,
@@ -237,7 +237,7 @@ def walk(stream: BinaryIO, size: int) -> Iterator[RawRecord]:
 
     Ends early at a record that is cut off or makes no sense.
     """
-    for raw in raw_records(stream, len(MCAP0_MAGIC), size, whole=True):
+    for raw in raw_records(stream, len(MAGIC), size, whole=True):
         if raw.length > MAX_CHUNK_BYTES or not raw.is_known:
             return
         yield raw

@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 import numpy as np
-from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype
+from runner.recording.blocks import HEADER_BYTES, MAGIC, RECORD_HEAD, record_dtype
 from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import decode
@@ -314,12 +313,12 @@ class DamagedFile:
         """The beginning of a chunk that was cut off at the end of the file, after its head."""
         if not self.size:
             raise RecordingError(f"{path}: found an empty file, expected a recording.")
-        if (magic := self._read(0, len(MCAP0_MAGIC))) != MCAP0_MAGIC:
+        if (magic := self._read(0, len(MAGIC))) != MAGIC:
             raise RecordingError(f"{path}: found {magic!r} at its start, expected an MCAP file.")
 
     def good_records(self, report: Report = lambda *_: None) -> Iterator[Record]:
         """Yield the readable metadata, attachments and chunks, skipping all that is damaged."""
-        offset = len(MCAP0_MAGIC)
+        offset = len(MAGIC)
         while offset + RECORD_HEAD.size <= self.size:
             report(offset, self.size)
             raw = RawRecord.of(self._read(offset, RECORD_HEAD.size), offset)

@@ -15,9 +15,9 @@ from typing import BinaryIO, Self
 
 from isal.isal_zlib import crc32
 from mcap.records import Attachment, Header
-from mcap.writer import MCAP0_MAGIC
 
 from runner.errors import StorageError
+from runner.recording.blocks import MAGIC
 from runner.recording.index import Beginning, Index, beginning_of, checksum
 from runner.recording.layout import Layout
 from runner.recording.records import (
@@ -62,7 +62,7 @@ class RecordingFile:
             self.cut_back()
             return
         try:
-            self._append(MCAP0_MAGIC + bytes_of(Header(PROFILE, _LIBRARY)))
+            self._append(MAGIC + bytes_of(Header(PROFILE, _LIBRARY)))
             if layout is not None:
                 self.begin(layout)
         except OSError:

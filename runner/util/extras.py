@@ -7,12 +7,14 @@ import json
 import os
 import shlex
 import sys
-from importlib import metadata
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from runner.errors import MissingExtra
 from runner.util.values import Json
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution
 
 _PROJECT: Final = "dualtaxi"
 _PACKAGES: Final = {
@@ -60,6 +62,8 @@ def install_command(extra: str) -> str:
 
     `direct_url.json` (PEP 610) names a clone, a wheel or a repository; there is none if it is from an index.
     """
+    from importlib import metadata  # takes 10 ms to load
+
     code = Path(__file__).parents[1]
     try:
         distribution = metadata.distribution(_PROJECT)
@@ -86,7 +90,7 @@ def install_command(extra: str) -> str:
     return _command(_installer(distribution), [wanted])
 
 
-def _installer(distribution: metadata.Distribution) -> str:
+def _installer(distribution: Distribution) -> str:
     """Return the tool that installed the project: `pipx`, `uv tool`, `uv` or `pip`."""
     prefix = Path(sys.prefix)
     if (prefix / "pipx_metadata.json").exists():
