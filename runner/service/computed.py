@@ -24,23 +24,22 @@ from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
-from runner.analysis.groups import groups_of
+from runner.analysis.groups import duplicates, groups_of
 from runner.analysis.histograms import histograms
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.series import (
     RunSeries,
     read_series,
     series_of,
-    values_left_out,
 )
 from runner.archive.places import default_target
 from runner.errors import RunnerError
 from runner.export.encoder import FORMATS
 from runner.export.film import Shot, usual_speed, write_film
 from runner.export.pictures import Pictures
-from runner.export.plots.curves import curves_sheet
+from runner.export.plots.curves import curves_sheet, footnote
 from runner.export.plots.image import svg_file
-from runner.export.plots.style import CurveStyle
+from runner.export.plots.style import CurveStyle, style_of, visible
 from runner.export.plugin import installed_export
 from runner.export.reports.report import render_report
 from runner.export.rerun.cache import cached_export
@@ -50,6 +49,7 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service.errors import Refused
+from runner.util import humanize
 from runner.util.extras import require
 from runner.util.values import finite
 from runner.views.view import Answer, FileAnswer, Given
@@ -70,8 +70,8 @@ AxisName = Annotated[
 RecordKind = Literal["training", "optimality"]
 
 
-class _MetricOptions(BaseModel, frozen=True):
-    """Which metrics are shown, over which axis."""
+class FigureOptions(BaseModel, frozen=True):
+    """Which metrics are shown, and how."""
 
     metric: tuple[str, ...] = Field(
         (),
@@ -86,9 +86,16 @@ class _MetricOptions(BaseModel, frozen=True):
         allow_inf_nan=False,
         description="Memory of an exponential mean, in percent of the axis from start to stop; 0: none.",
     )
+    log_x: bool = Field(False, description="A logarithmic horizontal axis, without points at 0.")
+    log_y: bool = Field(False, description="Logarithmic vertical axes, without points at 0 or below.")
+
+    @property
+    def style(self) -> CurveStyle:
+        """How the curves are drawn."""
+        return CurveStyle(smooth=self.smooth, log_x=self.log_x, log_y=self.log_y)
 
 
-class CurveOptions(_MetricOptions, frozen=True):
+class CurveOptions(FigureOptions, frozen=True):
     """Which curves are shown, and what of them."""
 
     start: float = Field(0, ge=0, allow_inf_nan=False, description="The first position.")
@@ -96,13 +103,6 @@ class CurveOptions(_MetricOptions, frozen=True):
         None, ge=0, allow_inf_nan=False, description="The first position not included."
     )
     points: int = Field(0, ge=0, le=100_000, description="Maximum of a curve; 0: all.")
-
-
-class FigureOptions(_MetricOptions, frozen=True):
-    """What a figure of curves shows."""
-
-    log_x: bool = Field(False, description="A logarithmic horizontal axis.")
-    log_y: bool = Field(False, description="Logarithmic vertical axes.")
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class ShownCurve:
     runs: list[list[float | None]]
     """The values of each run of the group, if they were requested."""
     of: int
-    """The number of points between `start` and `stop`."""
+    """The number of points between `start` and `stop` that the axes can show."""
     thinned: bool
     """Whether only the lowest and the highest point of each section are included."""
 
@@ -162,7 +162,7 @@ class Curves:
     averaged: str
     """What the values of loops are means over; empty if every recorded point is there."""
     notes: list[str]
-    """What is left out, a sentence each."""
+    """What is drawn, and what is left out."""
     names: list[str]
     """Names of logged values, the first 10,000, of which `training.logged.NAME` is a metric."""
 
@@ -183,18 +183,25 @@ def curves(paths: Sequence[Path], options: CurveOptions, lines: bool = False) ->
     if over not in common and options.axis not in AXES:
         common.append(over)
     groups = groups_of(series)
+    panels: list[Panel] = []
     shown: list[ShownCurve] = []
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
             if not options.metric or panel.metric in options.metric:
+                panels.append(panel)
                 shown += [_shown_curve(panel, curve, options, lines) for curve in panel.curves]
+    most = max((curve.of for curve in shown if curve.thinned), default=0)
+    notes = [footnote(groups, panels, options.style), *map(humanize.sentence, duplicates(groups))]
+    if most:
+        drawn = "the lowest and highest of each stretch are drawn; zoom in for all of them."
+        notes.insert(0, f"Thinned: of up to {most:,} points a curve {drawn}")
     result = Curves(
         over.name,
         [AxisInfo(each.name, each.title, each.label) for each in common],
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
         shown,
         " ".join(dict.fromkeys(run.averaged for run in series if run.averaged)),
-        values_left_out(series),
+        notes if shown else ["No metrics were recorded."],
         list(dict.fromkeys(name for run in series for name in run.names))[:MAX_NAMES],
     )
     return as_json(result)
@@ -209,7 +216,8 @@ def run_histograms(path: Path, axis: str) -> bytes:
 
 def _shown_curve(panel: Panel, curve: Curve, options: CurveOptions, lines: bool) -> ShownCurve:
     start, stop = options.start, math.inf if options.stop is None else options.stop
-    inside = np.flatnonzero((curve.places >= start) & (curve.places < stop))
+    drawn = visible(curve.places, curve.middle, style_of(panel, options.style))
+    inside = np.flatnonzero((curve.places >= start) & (curve.places < stop) & drawn)
     chosen = inside[thinned(curve.middle[inside], options.points)]
     memory = max((panel.last if options.stop is None else stop) - start, 0) * options.smooth / 100
     has_band = len(curve.runs) > 1
@@ -349,8 +357,7 @@ def plot(paths: Sequence[Path], options: FigureOptions) -> bytes:
     panels = [panel for panel in panels_of(groups) if not metrics or panel.metric in metrics]
     if not panels:
         raise RunnerError(f"metric: found {', '.join(metrics)[:200]}, expected metrics that a run recorded.")
-    style = CurveStyle(smooth=options.smooth, log_x=options.log_x, log_y=options.log_y)
-    return svg_file(curves_sheet(groups, panels, style))
+    return svg_file(curves_sheet(groups, panels, options.style))
 
 
 def replay(runs: Sequence[Run], request: Request) -> bytes:

@@ -1,6 +1,6 @@
 // Metrics of one or several runs over an axis; runs that differ in nothing but the seed are one line with a band.
 // Of a long curve the server returns the lowest and the highest value of each stretch, with a notice; zooming in
-// requests that part at full resolution.
+// requests that part at full resolution. It also leaves out what logarithmic axes cannot show.
 import { json } from "./page.js";
 
 const box = document.querySelector("[data-charts]");
@@ -74,15 +74,14 @@ function queryOf(values) {
 
 async function draw() {
   const mine = ++requests,
-    { axis, from, to, lines, smooth, logged } = chosen();
-  fields.smoothed.value = Number(smooth) ? `${smooth} % of the axis` : "none";
+    { axis, from, to, logged, ...values } = chosen();
+  fields.smoothed.value = Number(values.smooth) ? `${values.smooth} % of the axis` : "none";
   const query = queryOf({
+    ...values,
     points: Math.max(400, Math.round(plots.clientWidth)),
     start: from,
     stop: to && (axis === "time" ? to : Number(to) + 1),
     metric: logged && `training.logged.${logged}`,
-    smooth,
-    lines,
   });
   box.setAttribute("aria-busy", "true");
   try {
@@ -131,20 +130,7 @@ function show() {
     button.textContent = metrics[metric][0].title;
     button.onclick = () => remember(HIDDEN, metric);
   }
-  message.textContent = [...notes(), ...last.notes].join(" ");
-}
-
-function* notes() {
-  const thinned = last.curves.filter((curve) => curve.thinned).map((curve) => curve.of),
-    repeated = last.groups.flatMap((group) => group.left_out);
-  if (!last.curves.length) yield "No metrics were recorded.";
-  else if (thinned.length)
-    yield `Thinned: of up to ${Math.max(...thinned).toLocaleString("en")} points a curve the lowest and highest of ` +
-      "each stretch are drawn. Zoom in for all of them.";
-  else yield `${last.averaged || "Every recorded point is drawn."} Drag across a plot to zoom; double click shows all.`;
-  if (last.groups.some((group) => group.runs.length > 1))
-    yield "Runs that differ only in the seed: interquartile mean with its 95 % interval; below four runs, mean and range.";
-  if (repeated.length) yield `Left out, as the same run is there: ${repeated.map(named).join(", ")}.`;
+  message.textContent = last.notes.join(" ");
 }
 
 // --- names and numbers ----------------------------------------------------------------------------------
@@ -153,8 +139,7 @@ const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
 const spoken = (name) => name.replaceAll("_", " ");
 const linesOf = (curves) => [...new Set(curves.map(({ line }) => line))];
 const known = (value) => value !== null && value !== undefined;
-const rounded = (value, digits) => Number(value.toPrecision(digits));
-const exact = (value) => rounded(value, 6).toLocaleString("en", { maximumFractionDigits: 6 });
+const exact = (value) => value.toLocaleString("en", { maximumSignificantDigits: 6 });
 const axisLabel = () => last.axes.find(({ name }) => name === last.axis).label;
 
 function groupName(number) {
@@ -174,16 +159,13 @@ function tick(value) {
   if (!known(value)) return "";
   const size = Math.abs(value);
   if (size >= 1e15 || (size > 0 && size < 1e-4)) return value.toExponential(0);
-  const [, unit, by] = [[1e12, "T", 1e12], [1e9, "G", 1e9], [1e6, "M", 1e6], [1e4, "k", 1e3], [0, "", 1]].find(
-    ([least]) => size >= least,
-  );
-  return exact(value / by) + unit;
+  return value.toLocaleString("en", { notation: size < 1e4 ? "standard" : "compact", maximumSignificantDigits: 6 });
 }
 
 function summary(curve, label) {
   const values = curve.values.filter(known);
   if (!values.length) return `${label} has no point in this part`;
-  const [end, low, high] = [values.at(-1), Math.min(...values), Math.max(...values)].map((value) => rounded(value, 4));
+  const [end, low, high] = [values.at(-1), Math.min(...values), Math.max(...values)].map(exact);
   return `${label} ends at ${end}, between ${low} and ${high}`;
 }
 
@@ -217,32 +199,19 @@ function seriesOf(curves) {
 function plot(metric, curves, isPinned) {
   const { log_x, log_y } = chosen(),
     { title, unit } = curves[0],
-    logY = log_y && curves.some(({ values }) => values.some((value) => value > 0)),
     series = seriesOf(curves),
-    looks = series.map(({ positions, values, ...look }) => look);
-  // A logarithmic axis leaves out what is not positive, and is linear if nothing is.
-  const isLeft = (place, value) => (log_x && place <= 0) || (logY && known(value) && value <= 0);
-  const joined = uPlot.join(series.map(({ positions, values }) => [positions, values])),
-    data = joined.map((values) => values.map((value, i) => (isLeft(1, value) ? null : value))),
-    kept = joined[0].map((place) => !isLeft(place, null)),
-    left = curves.flatMap(({ positions, values }) => values.filter((value, i) => isLeft(positions[i], value))).length;
+    looks = series.map(({ positions, values, ...look }) => look),
+    points = uPlot.join(series.map(({ positions, values }) => [positions, values])),
+    logY = log_y && points.slice(1).some((values) => values.some((value) => value > 0));
   const one = shown.get(metric) ?? figureOf(metric, title);
   const { caption, place, key, picture, pin } = one,
     kinds = JSON.stringify([looks, log_x, logY, last.axis, plots.clientWidth < 500]);
   pin.setAttribute("aria-pressed", isPinned);
   picture.href = `/api/v1/curves.svg?${queryOf({ metric, smooth: fields.smooth.value, log_x, log_y })}`;
-  caption.textContent = [
-    unit,
-    curves.some((curve) => curve.thinned) && "thinned",
-    log_y && !logY && "not logarithmic: no value is positive",
-    left && `${left.toLocaleString("en")} point${left > 1 ? "s" : ""} at 0 or below left out`,
-    !kept.some(Boolean) && "no point in this part",
-  ]
-    .filter(Boolean)
-    .join(", ");
+  const parts = [unit, curves.some((curve) => curve.thinned) && "thinned", !points[0].length && "no point in this part"];
+  caption.textContent = parts.filter(Boolean).join(", ");
   const summaries = curves.map((curve) => summary(curve, labelOf(curve, curves)));
   place.setAttribute("aria-label", `${title}, ${unit}: ${summaries.join("; ")}`);
-  const points = data.map((values) => values.filter((_, i) => kept[i]));
   if (one.chart && one.kinds === kinds) return one.chart.setData(points);
   one.chart?.destroy();
   one.kinds = kinds;
