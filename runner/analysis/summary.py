@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -31,6 +32,7 @@ from runner.recording.run_file import RecentTraining, Summary, has_environment
 from runner.recording.spaces import Description
 from runner.replay.recorded import RecordedReset, resets_of
 from runner.runs.branches import Origin, origin_in
+from runner.runs.catalogue.usage import FREED_BY, Sums, Usage
 from runner.runs.checkpoints import Checkpoint, read_checkpoints
 from runner.runs.run import Run, command_for
 from runner.util.humanize import UNKNOWN, counted, duration, measure, number, size
@@ -413,6 +415,38 @@ def results_in_words(loop: Summary) -> dict[str, str]:
     }
     logged = {f"Logged last: {name}": measure(value) for name, value in loop.logged.items()}
     return {name: text for name, text in means.items() if UNKNOWN not in text} | logged
+
+
+def usage_sections(largest: Sequence[Usage], sums: Sums, recordings: Sequence[Path]) -> Iterator[Section]:
+    """Yield the disk usage of the largest runs and of all, and what could be freed in the folders."""
+    total = sums.bytes
+    kinds = [kind for kind, count in total.items() if count or kind == "total"]
+
+    def cells(counts: dict[str, int]) -> list[str]:
+        return [size(counts[kind]) if counts[kind] else UNKNOWN for kind in kinds]
+
+    same_as = ["same as"] if any(usage.row["same_as"] for usage in largest) else []
+    left = ("id", "name", "status", "same as")
+    rows, links = [], []
+    for usage in largest:
+        row = usage.row
+        originals = [row["same_as"] or ""] if same_as else []
+        rows.append((row["id"], row["name"], row["status"], *cells(usage.bytes), *originals))
+        links.append(f"/runs/{row['id']}")
+    if sums.runs > len(largest):
+        rest = {kind: total[kind] - sum(usage.bytes[kind] for usage in largest) for kind in kinds}
+        rows.append((f"{sums.runs - len(largest):,} more", "", "", *cells(rest), *[""] * len(same_as)))
+        links.append("")
+    rows.append(("all", "", "", *cells(total), *[""] * len(same_as)))
+    headings = ("id", "name", "status", *kinds, *same_as)
+    yield Section("", grids=[Grid(headings, rows, links=[*links, ""], left=left, cut=("name",))])
+    reasons = {
+        FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
+        for kind, count in sums.freeable(recordings).items()
+        if count
+    }
+    if reasons:
+        yield Section("Could be freed", facts=reasons)
 
 
 def _extras_in_words(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
 
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Grid
 from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     filter_argument,
@@ -24,7 +24,7 @@ from runner.cli.runs import found_run
 from runner.errors import ExitCode, RunnerError
 from runner.runs.catalogue.columns import with_same_as
 from runner.runs.run import Run, label
-from runner.util.humanize import UNKNOWN, duration, size
+from runner.util.humanize import UNKNOWN, duration
 
 if TYPE_CHECKING:
     from runner.cli.output import Part
@@ -131,6 +131,7 @@ def du_command(
       dualtaxi du
       dualtaxi du 'status == "finished" and age > "30d"' --limit 5
     """
+    from runner.analysis.summary import usage_sections
     from runner.runs.catalogue.filters import parse
     from runner.runs.catalogue.index import look
     from runner.runs.catalogue.usage import usage_of
@@ -156,42 +157,12 @@ def du_command(
     def text() -> Iterator[Part]:
         largest, sums = measured(_LARGEST if limit is None else limit)
         if sums.runs:
-            yield from _text(largest, sums, sums.freeable(recordings))
+            yield from usage_sections(largest, sums, recordings)
         else:
             folders = ", ".join(map(str, recordings))
             yield Remark(f"No run in {folders} matches." if words else "No runs yet.")
 
     return Reply(data, text())
-
-
-def _text(largest: Sequence[Usage], sums: Sums, freeable: dict[str, int]) -> Iterator[Part]:
-    from runner.runs.catalogue.usage import FREED_BY
-
-    total = sums.bytes
-    kinds = [kind for kind, count in total.items() if count or kind == "total"]
-
-    def cells(counts: dict[str, int]) -> list[str]:
-        return [size(counts[kind]) if counts[kind] else UNKNOWN for kind in kinds]
-
-    same_as = ["same as"] if any(usage.row["same_as"] for usage in largest) else []
-    left = ("id", "name", "status", "same as")
-    rows = []
-    for usage in largest:
-        row = usage.row
-        originals = [row["same_as"] or ""] if same_as else []
-        rows.append((row["id"], row["name"], row["status"], *cells(usage.bytes), *originals))
-    if sums.runs > len(largest):
-        rest = {kind: total[kind] - sum(usage.bytes[kind] for usage in largest) for kind in kinds}
-        rows.append((f"{sums.runs - len(largest):,} more", "", "", *cells(rest), *[""] * len(same_as)))
-    rows.append(("all", "", "", *cells(total), *[""] * len(same_as)))
-    yield Grid(("id", "name", "status", *kinds, *same_as), rows, left=left, cut=("name",))
-    reasons = {
-        FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
-        for kind, count in freeable.items()
-        if count
-    }
-    if reasons:
-        yield Section("Could be freed", facts=reasons)
 
 
 @click.group("index", cls=CommandGroup)

@@ -19,6 +19,7 @@ from fastapi.responses import FileResponse
 from filelock import FileLock
 
 from runner.export.rerun import viewer as native_viewer
+from runner.recording.fields import varint
 from runner.service import fragments
 from runner.service.addresses import link
 from runner.service.dependencies import At, ComputationOf, RecordedRun
@@ -70,6 +71,7 @@ async def frame(run: RecordedRun, compute: ComputationOf, at: At = "") -> Respon
         "files": f"/static/rerun/{version()}",
         "recording": link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
         "step": place["time"],
+        "command": _set_time(place["time"]),
     }
     response = Page("rerun_frame.html", values)
     response.headers["content-security-policy"] = FRAME_POLICY
@@ -82,6 +84,16 @@ def viewer_file(number: str, name: str) -> Response:
     if name not in FILES or number != version():
         raise HTTPException(HTTPStatus.NOT_FOUND)
     return FileResponse(viewer_files() / name, media_type=FILES[name], headers={"cache-control": _FOREVER})
+
+
+def _set_time(time: int) -> str:
+    """Return the command that pauses the viewer at a step: Protobuf of `rerun.viewer_control.v1alpha1`."""
+
+    def part(number: int, content: bytes) -> bytes:
+        return bytes((number << 3 | 2, len(content))) + content
+
+    cursor = part(2, part(1, b"step")) + part(3, b"\x08" + varint(time)) + b"\x28\x01"
+    return part(6, cursor).hex()
 
 
 def version() -> str:

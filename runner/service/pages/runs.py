@@ -11,6 +11,7 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
 
 from runner.analysis.sections import Paging
+from runner.analysis.summary import usage_sections
 from runner.errors import RunnerError
 from runner.runs.catalogue.columns import (
     FIELDS,
@@ -25,7 +26,7 @@ from runner.runs.catalogue.columns import (
 )
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import CatalogueIndex, order_of
-from runner.runs.catalogue.usage import FREED_BY, usage_of
+from runner.runs.catalogue.usage import usage_of
 from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
@@ -140,15 +141,8 @@ async def runs(
 def disk(catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
     """Show the use of the disk, and what could be freed."""
     largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
-    freeable = sums.freeable(settings.recordings)
-    values = {
-        "total": sums.bytes,
-        "free": jobs.status().free_bytes,
-        "freeable": [(*FREED_BY[reason], size) for reason, size in freeable.items() if size],
-        "rows": [(usage.row, usage.bytes) for usage in largest],
-        "others": sums.runs - len(largest),
-    }
-    return Page("disk.html", values)
+    usage = list(usage_sections(largest, sums, settings.recordings)) if largest else []
+    return Page("disk.html", {"total": sums.bytes, "free": jobs.status().free_bytes, "usage": usage})
 
 
 def _values(

@@ -1,4 +1,6 @@
 // Opens a recording in the Rerun viewer at a step; the viewer's files come from this service.
+import { request } from "./page.js";
+
 const place = document.body.dataset,
   message = document.getElementById("message");
 const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
@@ -11,32 +13,9 @@ window.fetch = (what, how) =>
     ? own(what, how)
     : Promise.resolve(new Response(null, { status: 204 }));
 
-// Commands to the viewer are Protocol Buffers messages: rerun.viewer_control.v1alpha1.
-function varint(value) {
-  const bytes = [];
-  for (let rest = BigInt(value); ; rest >>= 7n) {
-    if (rest < 128n) return [...bytes, Number(rest)];
-    bytes.push(Number(rest & 127n) | 128);
-  }
-}
-const field = (number, content) => [(number << 3) | 2, ...varint(content.length), ...content];
-
-function setTimeCursor(timeline, time) {
-  const name = field(1, [...new TextEncoder().encode(timeline)]);
-  const paused = [5 << 3, 1];
-  return new Uint8Array(field(6, [...field(2, name), ...field(3, [1 << 3, ...varint(time)]), ...paused]));
-}
-
-async function ready() {
-  const response = await fetch(place.recording, { method: "GET", headers: { range: "bytes=0-0" } });
-  if (response.ok) return;
-  const body = await response.json().catch(() => null);
-  throw new Error(body?.error.message ?? `The service responded with status ${response.status}.`);
-}
-
 async function open() {
   console.debug = () => {};
-  await ready();
+  await request(place.recording, { headers: { range: "bytes=0-0" } });
   message.textContent = "Loading the viewer …";
   await wasm_bindgen({ module_or_path: place.wasm });
   const handle = new wasm_bindgen.WebHandle({
@@ -51,11 +30,11 @@ async function open() {
   });
   await handle.start(document.getElementById("viewer"));
   message.hidden = true;
-  const request = setTimeCursor("step", place.step);
+  const command = Uint8Array.from(place.command.match(/../g), (byte) => Number.parseInt(byte, 16));
   for (let tries = 0; tries < 400; tries++) {
     if (handle.has_panicked()) throw new Error(`The viewer has crashed: ${handle.panic_message()}`);
     try {
-      await handle.viewer_control(request);
+      await handle.viewer_control(command);
       document.body.dataset.opened = place.step;
       return;
     } catch (error) {
