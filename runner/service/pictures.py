@@ -104,6 +104,7 @@ class PictureStream:
         shown: list[int] = []
         end = math.inf
         while self.next < stop and not self._has_ended and time.monotonic() < end:
+            self._arrived.clear()  # first, so that no picture arrives unnoticed meanwhile
             if self._made:
                 number = self.next
                 made = self._take()
@@ -115,7 +116,6 @@ class PictureStream:
             elif await is_gone():
                 break
             else:
-                self._arrived.clear()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._arrived.wait(), _LOOK_SECONDS)
         return Block(pictures, shown, self._note, self._problem if self.next < stop else "")

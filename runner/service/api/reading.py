@@ -162,8 +162,8 @@ def steps(
     if episode is None:
         columns = step_columns(recording, phase, start=rows.start, stop=_stop(rows, total, limit))
         return _columns(recording, columns, rows.start, total)
+    require_few(len(recording.phase(phase).episode(episode)), limit)
     columns = step_columns(recording, phase, episode=episode)
-    require_few(len(columns["step"]), limit)
     return _columns(recording, columns, int(columns["step"][0]), total)
 
 

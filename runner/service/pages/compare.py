@@ -198,8 +198,10 @@ async def difference(request: Request, runs: TwoRuns, compute: ComputationOf) ->
     function = fragments.made_difference if tab == "code" else fragments.difference
     found = await compute.shown(ShownDifference, function, *runs)
     lead, notes, body = found.tabs[tab]
-    values = {"compared": _compared(runs, tab), "lead": lead, "notes": notes, "body": body}
-    return Page("compare_answer.html", values)
+    return Page(
+        "compare_answer.html",
+        lambda: {"compared": _compared(runs, tab), "lead": lead, "notes": notes, "body": body},
+    )
 
 
 def _compared(runs: list[Run], here: str) -> Compared:

@@ -66,14 +66,16 @@ async def frame(run: RecordedRun, compute: ComputationOf, at: At = "") -> Respon
         query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}
         if not run.can_train_again:
             query |= {"trials": place["trials"], "frames": "true"}
-    values = {
-        "title": f"{run.name}, {run.run_id}",
-        "files": f"/static/rerun/{version()}",
-        "recording": link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
-        "step": place["time"],
-        "command": _set_time(place["time"]),
-    }
-    response = Page("rerun_frame.html", values)
+    response = Page(
+        "rerun_frame.html",
+        lambda: {
+            "title": f"{run.name}, {run.run_id}",
+            "files": f"/static/rerun/{version()}",
+            "recording": link(f"/api/v1/runs/{run.run_id}/replay.rrd", query),
+            "step": place["time"],
+            "command": _set_time(place["time"]),
+        },
+    )
     response.headers["content-security-policy"] = FRAME_POLICY
     return response
 

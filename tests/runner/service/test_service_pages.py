@@ -22,7 +22,7 @@ from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from runner.runs.run import RUN_FILE
+from runner.runs.run import RUN_FILE, Run
 from runner.service.processes import ProcessPool
 from tests.runner.loops.making import make, play
 from tests.waiting import until
@@ -207,6 +207,22 @@ def test_the_page_of_a_run_waits_for_no_child_process(client, monkeypatch):
     monkeypatch.setattr(ProcessPool, "submit", hang)
     for name in ("first", "second"):
         assert client.get(f"/runs/{name}").status_code == 200
+
+
+def test_the_event_loop_reads_no_files_of_compared_runs_and_of_the_viewer(client, monkeypatch):
+    read = Run.labels.func
+    on_loop = []
+
+    def labels(run):
+        with contextlib.suppress(RuntimeError):
+            on_loop.append(asyncio.get_running_loop())
+        return read(run)
+
+    monkeypatch.setattr(Run, "labels", property(labels))
+    for tab in ("divergence", "tables", "code"):
+        page_of(client, f"/compare/{tab}?run=first&run=second")
+    page_of(client, "/runs/first/rerun/frame?at=3")
+    assert on_loop == []
 
 
 def test_only_differences_in_settings_can_be_explained(client, recordings):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import itertools
+import threading
 import time
 
 import gymnasium
@@ -199,6 +200,29 @@ def test_a_whole_block_has_a_tag_by_which_it_is_not_sent_again(loops_client, mon
     assert loops_client.get(address).content == first.content
     again = loops_client.get(address, headers={"If-None-Match": tag})
     assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", tag)
+
+
+def test_a_picture_that_arrives_while_the_client_is_looked_for_is_sent_at_once(monkeypatch):
+    monkeypatch.setattr("runner.service.pictures._LOOK_SECONDS", 20)
+
+    async def run():
+        streams, asked = PictureStreams(), threading.Event()
+
+        def make(start):
+            asked.wait()
+            yield b"picture"
+
+        async def look():
+            asked.set()
+            await asyncio.sleep(0.2)
+            return False
+
+        began = time.monotonic()
+        assert (await streams.block("a", make, 0, 1, look)).pictures == [b"picture"]
+        assert time.monotonic() - began < 10
+        streams.close()
+
+    asyncio.run(run())
 
 
 async def until(holds):

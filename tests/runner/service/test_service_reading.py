@@ -56,6 +56,14 @@ def test_a_range_of_records_that_is_too_long_is_refused(connect, settings):
     assert "at most 3" in answer.json()["error"]["message"]
 
 
+def test_an_episode_that_is_too_long_is_refused_before_it_is_read(connect, settings, monkeypatch):
+    client = connect(dataclasses.replace(settings, limits=ServiceLimits(page_records=3)))
+    monkeypatch.setattr("runner.service.api.reading.step_columns", None)
+    answer = client.get(f"{RUN}/steps/train", params={"episode": 2})
+    assert answer.status_code == 422
+    assert "at most 3" in answer.json()["error"]["message"]
+
+
 @pytest.mark.parametrize("phase", ["train", "eval"])
 def test_steps_and_episodes_are_those_recorded(client, recording, phase):
     steps = client.get(f"{RUN}/steps/{phase}", params={"start": 10, "stop": 40}).json()
