@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal
 
 from pydantic import TypeAdapter
 
@@ -248,9 +248,8 @@ class JobStore:
         An event's id is the place in the log where it ends. They follow the event of the id `after`; 0, or
         what is no event of the job, is before the first ones.
         """
-        self.job(number)
         events: list[JobEvent] = []
-        with self.path(number, LOG_FILE).open("rb") as log:
+        with self._open(number, LOG_FILE) as log:
             log.seek(max(after - 1, 0))
             if after and log.read(1) != b"\n":
                 after = log.seek(0)
@@ -264,15 +263,22 @@ class JobStore:
 
     def last_events(self, number: int, limit: int) -> list[JobEvent]:
         """Return the last events of a job."""
-        self.job(number)
-        with self.path(number, LOG_FILE).open("rb") as log:
+        with self._open(number, LOG_FILE) as log:
             lines = deque(log, limit)
             return self.events(number, log.tell() - sum(map(len, lines)))[0]
 
     def submitted(self, number: int) -> str:
         """Return the text of a job as it was submitted."""
+        with self._open(number, TEXT_FILE) as text:
+            return text.read().decode()
+
+    def _open(self, number: int, name: str) -> BinaryIO:
         self.job(number)
-        return self.path(number, TEXT_FILE).read_bytes().decode()
+        try:
+            return self.path(number, name).open("rb")
+        except FileNotFoundError:
+            self.job(number)  # it was forgotten in the meantime
+            raise
 
     def _load(self, number: int) -> None:
         """Read a job from its folder, and remove the folder if its submission was not completed."""

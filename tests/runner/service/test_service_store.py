@@ -201,3 +201,18 @@ def test_the_last_events_are_read(store):
     assert store.events(number, last) == ([], last)
     with pytest.raises(JobNotFound):
         store.last_events(9, 10)
+
+
+def test_a_job_that_is_forgotten_while_its_files_are_opened_is_no_job(store, monkeypatch):
+    check = store.job
+
+    def forgotten_after(number):
+        job = check(number)
+        store._forget(number)
+        return job
+
+    monkeypatch.setattr(store, "job", forgotten_after)
+    for read in (store.events, store.submitted, lambda number: store.last_events(number, 10)):
+        number = added(store).number
+        with pytest.raises(JobNotFound):
+            read(number)
