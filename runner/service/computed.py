@@ -302,11 +302,14 @@ def report(path: Path) -> bytes:
     return render_report([path])[0].encode()
 
 
-def film(run: Run, step: EpisodeRef, ending: str) -> bytes:
-    """Return the film of an episode from a step on; the ending of its file, such as `.mp4`, is its format."""
+def film(path: Path, title: str, step: EpisodeRef, ending: str) -> bytes:
+    """Return the film of an episode from a step on, below the title of its run.
+
+    The ending of its file, such as `.mp4`, is its format.
+    """
     if ending not in FORMATS:
         raise RunnerError(f"format: found {ending[:20]!r}, expected one of {', '.join(FORMATS)}.")
-    with tempfile.TemporaryDirectory() as folder, open_recording(run.recording) as recording:
+    with tempfile.TemporaryDirectory() as folder, open_recording(path) as recording:
         file = Path(folder, f"film{ending}")
         shown = step.resolved(recording)
         pictures = Pictures(recording, shown.phase, shown.number_in(recording))
@@ -317,7 +320,7 @@ def film(run: Run, step: EpisodeRef, ending: str) -> bytes:
                 f"found {steps:,} steps to film, expected at most {MAX_FILM_STEPS:,}: begin at a later step, "
                 "or use `dualtaxi export film`, which has no limit."
             )
-        shot = Shot(f"{run.title}: {shown.title}", pictures, shown.t)
+        shot = Shot(f"{title}: {shown.title}", pictures, shown.t)
         write_film(file, shot, usual_speed(pictures.source), None, lambda _: None)
         return file.read_bytes()
 

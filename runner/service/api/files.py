@@ -168,7 +168,7 @@ async def film(
     ending: Annotated[str, Query(max_length=20, description=f"Of its name: {', '.join(FORMATS)}.")] = ".mp4",
 ) -> Response:
     """Return what `dualtaxi export film` writes, as a download."""
-    body = await compute(computed.film, run, EpisodeRef.parse(at), ending, alone=True)
+    body = await compute(computed.film, run.recording, run.title, EpisodeRef.parse(at), ending, alone=True)
     return attachment(body, f"{run.file_stem}{ending}")
 
 

@@ -168,6 +168,14 @@ def test_a_film_of_an_episode_is_downloaded(client, recordings, tmp_path, at, en
     assert len(list(frames_of(film))) > 1
 
 
+def test_a_film_shows_the_present_name_of_its_run(client):
+    fields = {"at": "3:2", "ending": ".gif"}
+    before = client.post("/runs/first/film", data=fields).content
+    assert client.patch("/api/v1/runs/first", json={"name": "renamed"}).status_code == 200
+    renamed = until(lambda answer: answer.is_success, lambda: client.post("/runs/renamed/film", data=fields))
+    assert renamed.content != before
+
+
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
@@ -188,7 +196,7 @@ def test_a_film_of_very_many_steps_is_refused(client, monkeypatch):
     monkeypatch.setattr(computed, "MAX_FILM_STEPS", 0)  # checked before the film is begun
     step = EpisodeRef.parse("3:0")
     with pytest.raises(RunnerError, match=r"found \d+ steps to film, expected at most 0"):
-        computed.film(client.app.state.catalogue.find("first"), step, ".gif")
+        computed.film(client.app.state.catalogue.find("first").recording, "first", step, ".gif")
 
 
 def test_a_run_is_filmed_and_archived_by_routes(client, recordings, tmp_path):
@@ -217,7 +225,7 @@ def test_an_archive_and_a_film_name_the_extra_that_they_lack(recordings, monkeyp
     with pytest.raises(MissingExtra, match=r"an archive needs pyarrow.*\[archive\]"):
         computed.archive(run, remove=False)
     with pytest.raises(MissingExtra, match=r"a film needs .*\[film\]"):
-        computed.film(run, EpisodeRef.parse("best"), ".gif")
+        computed.film(run.recording, run.title, EpisodeRef.parse("best"), ".gif")
 
 
 def test_a_report_is_downloaded_and_not_shown_as_a_page(client):
