@@ -24,11 +24,12 @@ from runner.service import login, pages, queries, views
 from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, SettingsOf
+from runner.service.error_handlers import add_error_handlers, error_response
 from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
 from runner.service.pictures import PictureStreams
-from runner.service.problems import ERROR_DOCS, add_error_handlers, known_query
+from runner.service.problems import ERROR_DOCS, known_query
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
@@ -90,11 +91,10 @@ def create_app(settings: ServiceSettings) -> FastAPI:
     app.state.tokens = tokens
     app.state.sessions = Sessions(tokens)
     app.add_middleware(
-        Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refusal=pages.refused
+        Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refusal=error_response
     )
     app.add_middleware(AccessLog)
     add_error_handlers(app)
-    pages.add_error_handlers(app)
     return app
 
 

@@ -24,7 +24,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from runner.errors import RunnerError
 from runner.service.errors import Refused, Unauthorized
-from runner.service.problems import status_of
+from runner.service.problems import requests_page, status_of
 from runner.service.settings import ServiceSettings
 from runner.service.tokens import COOKIE, Sessions, Token, Tokens
 
@@ -146,10 +146,9 @@ class Guard:
 
     def _refuse(self, request: Request, error: RunnerError) -> Response:
         """Return the response to a request that is refused; a browser is redirected to the login."""
-        path = request.scope["path"]  # a URL would be made with the Host header, which may be the problem
-        is_page = "text/html" in request.headers.get("accept", "") and not path.startswith("/api/")
-        if is_page and status_of(error) == HTTPStatus.UNAUTHORIZED and request.method == "GET":
-            query = request.scope["query_string"].decode("latin-1")
+        is_login_needed = status_of(error) == HTTPStatus.UNAUTHORIZED and request.method == "GET"
+        if is_login_needed and requests_page(request):
+            path, query = request.scope["path"], request.scope["query_string"].decode("latin-1")
             target = f"{path}?{query}" if query else path
             return RedirectResponse(f"/login?{urlencode({'next': target})}", HTTPStatus.SEE_OTHER)
         return self._refusal(request, error)

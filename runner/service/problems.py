@@ -1,25 +1,21 @@
-"""Error responses: one form, with a message that says what to do.
+"""What is wrong with a request, in words that say what to do.
 
 {"error": {"message": "...", "problems": [{"path": "query.limit", "line": null, "message": "..."}]}}
 """
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Final, TypeVar
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.dependencies.utils import get_flat_params
 from fastapi.exceptions import RequestValidationError
 from fastapi.params import Header
 from fastapi.params import Path as InPath
-from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
-from starlette.exceptions import HTTPException
-from starlette.requests import ClientDisconnect
 
 from runner.config.problems import found
 from runner.errors import (
@@ -38,7 +34,6 @@ from runner.errors import (
     shortened,
 )
 from runner.service.errors import EXPECTED, RequestError
-from runner.service.logs import LOG
 from runner.service.settings import ServiceSettings
 from runner.util.processes import CallFailed
 
@@ -132,6 +127,12 @@ def media_docs(*media: str) -> dict[int | str, dict[str, object]]:
     return {200: {"content": {kind: {} for kind in media}}}
 
 
+def requests_page(request: Request) -> bool:
+    """Return whether a browser requests a page, so that errors are pages, too."""
+    path = request.scope["path"]  # a URL would be made with the Host header, which may be the problem
+    return "text/html" in request.headers.get("accept", "") and not path.startswith("/api/")
+
+
 def status_of(error: RunnerError) -> HTTPStatus:
     """Return the status of the response to an error."""
     if isinstance(error, RequestError):
@@ -156,50 +157,6 @@ def error_body(error: RunnerError, settings: ServiceSettings) -> ErrorBody:
     return ErrorBody(message=message, problems=problems)
 
 
-def json_error(status: HTTPStatus, body: ErrorBody, headers: dict[str, str] | None = None) -> Response:
-    """Return an error response."""
-    return JSONResponse({"error": body.model_dump()}, status, headers)
-
-
-def add_error_handlers(app: FastAPI) -> None:
-    """Make every error of the application a response in the one form."""
-    app.add_exception_handler(RunnerError, _runner_error)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(OSError, _system_error)
-    app.add_exception_handler(ClientDisconnect, _disconnected)
-    app.add_exception_handler(Exception, _unexpected)
-
-
-def error_response(request: Request, error: RunnerError) -> Response:
-    """Return the response to a request that raised one of the project's errors."""
-    headers = error.headers if isinstance(error, RequestError) else None
-    return json_error(status_of(error), error_body(error, request.app.state.settings), headers)
-
-
-async def _runner_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RunnerError)
-    return error_response(request, error)
-
-
-async def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    status = HTTPStatus(error.status_code)
-    if status == HTTPStatus.NO_CONTENT:
-        return Response(status_code=status)
-    messages = {
-        HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}.",
-        HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} is not supported at {request.url.path}.",
-    }
-    message = messages.get(status, str(error.detail))
-    return json_error(status, ErrorBody(message=message), dict(error.headers or {}))
-
-
-async def _invalid(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    return error_response(request, _as_config_error(error))
-
-
 def filled(kind: type[Question], fields: Mapping[str, object]) -> Question:
     """Return what the fields of a form ask that are not empty.
 
@@ -209,10 +166,10 @@ def filled(kind: type[Question], fields: Mapping[str, object]) -> Question:
     try:
         return kind.model_validate({name: value for name, value in fields.items() if value})
     except ValidationError as error:
-        raise _as_config_error(error) from error
+        raise as_config_error(error) from error
 
 
-def _as_config_error(error: ValidationError | RequestValidationError) -> ConfigError:
+def as_config_error(error: ValidationError | RequestValidationError) -> ConfigError:
     """Return the error with what is wrong in a request, each with the parameter or field."""
     return _wrong((".".join(map(str, detail["loc"])), _in_words(detail)) for detail in error.errors())
 
@@ -250,22 +207,3 @@ def _in_words(detail: ErrorDetails) -> str:
     value = detail["input"]
     given = "a body without the type application/json" if isinstance(value, bytes) else found(value)
     return f"found {given}, expected {expected}"
-
-
-async def _disconnected(request: Request, error: Exception) -> Response:  # noqa: ARG001
-    body = ErrorBody(message="the client closed the connection.")
-    return json_error(HTTPStatus.BAD_REQUEST, body)
-
-
-async def _system_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, OSError)
-    if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None)):
-        message = f"the disk is full ({error.strerror}); free some of it: `dualtaxi du` lists what uses it."
-        return json_error(HTTPStatus.INSUFFICIENT_STORAGE, ErrorBody(message=message))
-    return await _unexpected(request, error)
-
-
-async def _unexpected(request: Request, error: Exception) -> Response:
-    LOG.error("error", exc_info=error, extra={"path": request.url.path, "method": request.method})
-    message = "something unexpected went wrong; see the service's log."
-    return json_error(HTTPStatus.INTERNAL_SERVER_ERROR, ErrorBody(message=message))

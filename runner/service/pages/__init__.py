@@ -21,9 +21,6 @@ from runner.service.pages import (
     submit,
     sweeps,
 )
-from runner.service.pages.rendering import add_error_handlers, refused
-
-__all__ = ["add_error_handlers", "refused", "router"]
 
 router = APIRouter(include_in_schema=False)
 for _module in (

@@ -1,19 +1,18 @@
-"""Pages and the forms that they send: filled templates, also for errors."""
+"""Pages and the forms that they send: filled templates."""
 
 from __future__ import annotations
 
 import functools
-import json
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from http import HTTPStatus
 from importlib.resources import files
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 from urllib.parse import parse_qsl
 
 import jinja2
-from fastapi import Depends, FastAPI, Request, Response
+from fastapi import Depends, Request, Response
 from fastapi.responses import RedirectResponse
 from markupsafe import Markup
 from starlette.concurrency import run_in_threadpool
@@ -22,9 +21,9 @@ from starlette.types import Receive, Scope, Send
 from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
 from runner.export.reports.rendering import code, environment_of
-from runner.service import problems
 from runner.service.addresses import link
 from runner.service.pages import static
+from runner.service.problems import error_body
 from runner.util import humanize
 
 TEMPLATES: Final = files("runner.service.pages") / "templates"
@@ -151,35 +150,4 @@ Form = Annotated[dict[str, str], Depends(form_of)]
 
 def message_of(error: RunnerError, request: Request) -> str:
     """Return the message of an error for a page, the same as that of the API."""
-    return problems.error_body(error, request.app.state.settings).message
-
-
-def add_error_handlers(app: FastAPI) -> None:
-    """Respond to errors of pages with a page, instead of the JSON of the API."""
-
-    def with_page(handler: Any) -> Callable[[Request, Exception], Awaitable[Response]]:
-        async def respond(request: Request, error: Exception) -> Response:
-            return _error_page(request, await handler(request, error))
-
-        return respond
-
-    for kind, handler in list(app.exception_handlers.items()):
-        app.add_exception_handler(kind, with_page(handler))
-
-
-def refused(request: Request, error: RunnerError) -> Response:
-    """Return the response to a request that is refused before it is routed."""
-    return _error_page(request, problems.error_response(request, error))
-
-
-def _error_page(request: Request, response: Response) -> Response:
-    """Return an error as a page, if a browser requested a page."""
-    if "text/html" not in request.headers.get("accept", "") or request.url.path.startswith("/api/"):
-        return response
-    status = HTTPStatus(response.status_code)
-    message = json.loads(bytes(response.body))["error"]["message"]
-    values = {"title": status.phrase.capitalize(), "message": message}
-    error_page = Page("problem.html", values, status)
-    headers = {key: value for key, value in response.headers.items() if not key.startswith("content-")}
-    error_page.headers.update(headers)
-    return error_page
+    return error_body(error, request.app.state.settings).message
