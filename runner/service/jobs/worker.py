@@ -19,9 +19,9 @@ from runner.execution.session import Progress, Report, evaluation_brief, run_job
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
 from runner.runs.run import Run, create_run
+from runner.service.jobs.branches import parent_in, run_episode_job
 from runner.service.jobs.channel import JobChannel, JobSpec, wait_for_owners
 from runner.service.jobs.cluster import do_on_cluster
-from runner.service.jobs.episodes import parent_in, run_episode_job
 from runner.service.jobs.explanations import run_explain_job
 from runner.service.jobs.sweeps import run_sweep_job
 from runner.service.processes import lower_priority

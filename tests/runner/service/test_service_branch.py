@@ -17,9 +17,8 @@ from runner.client.jobs import RunProgress
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
+from runner.service.jobs.branches import BranchQuestion, check_branch, run_episode_job
 from runner.service.jobs.channel import JobChannel, JobSpec
-from runner.service.jobs.checking import BranchQuestion, check_branch
-from runner.service.jobs.episodes import run_episode_job
 from runner.service.jobs.store import JobStore
 from runner.service.jobs.worker import do_job
 from runner.service.settings import ServiceSettings
