@@ -44,6 +44,7 @@ PRELOADED: Final = (
     "runner.replay.environment",
     "runner.runs.importing",
     "runner.service.computed",
+    "runner.service.curves",
     "runner.service.fragments",
     "runner.service.jobs.worker",
     "runner.service.uploads",

@@ -14,10 +14,9 @@ from runner.debugging.explanation import Explanation
 from runner.debugging.explanation_files import explanations_in, read_explanation
 from runner.errors import RunNotFound
 from runner.runs.run import Run
-from runner.service import computed
 from runner.service.api.reading import SVG
 from runner.service.catalogue import Catalogue
-from runner.service.computed import CurveOptions, Curves, FigureOptions
+from runner.service.curves import CurveOptions, Curves, FigureOptions, curves_of, figure_of
 from runner.service.dependencies import CatalogueOf, ComputationOf, SettingsOf, recorded_run
 from runner.service.problems import media_docs
 from runner.service.settings import ServiceSettings
@@ -81,7 +80,7 @@ async def curves(
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
     paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
-    return await compute.json(computed.curves, paths, options, options.lines)
+    return await compute.json(curves_of, paths, options, options.lines)
 
 
 @router.get(
@@ -95,7 +94,7 @@ async def curves_picture(
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
     paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
-    return Response(await compute(computed.plot, paths, options), media_type=SVG)
+    return Response(await compute(figure_of, paths, options), media_type=SVG)
 
 
 def found_runs(catalogue: Catalogue, names: Sequence[str], several: bool = False) -> list[Run]:

@@ -12,7 +12,8 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import ValueCounts
 from runner.recording.reader import Recording
 from runner.service import computed
-from runner.service.computed import AxisName, CurveOptions, Curves, FigureOptions, require_few
+from runner.service.computed import require_few
+from runner.service.curves import AxisName, CurveOptions, Curves, FigureOptions, curves_of, figure_of
 from runner.service.dependencies import (
     ComputationOf,
     OpenRecording,
@@ -83,7 +84,7 @@ async def metrics(
     With `points`, longer curves have the lowest and the highest value of each section only, and `thinned` is
     true; `start` and `stop` select a part at full resolution.
     """
-    return await compute.json(computed.curves, [run.recording], options)
+    return await compute.json(curves_of, [run.recording], options)
 
 
 @router.get(
@@ -177,7 +178,7 @@ async def plot(
     run: RecordedRun, compute: ComputationOf, options: Annotated[FigureOptions, Query()]
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
-    return Response(await compute(computed.plot, [run.recording], options), media_type=SVG)
+    return Response(await compute(figure_of, [run.recording], options), media_type=SVG)
 
 
 def _stop(rows: range, total: int, limit: int) -> int:
