@@ -8,14 +8,16 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from runner.analysis.axes import Axis
-from runner.analysis.series import RunSeries, full_name, lines_in
-from runner.errors import RunnerError, nearest
+from runner.analysis.series import LOGGED, RunSeries, full_name, lines_in
+from runner.errors import RunnerError, nearest, shortened
 from runner.recording.metrics import METRICS, SHARES
 from runner.util.humanize import listed, setting
 from runner.util.values import JsonView, flatten
 
 Key = TypeVar("Key", bound=Hashable)
 
+_MAX_EXPECTED: Final = 2000
+"""Characters of the metrics that a message lists."""
 _NOT_CONTENT: Final = ("seeds", "recording", "name")
 _TRAINING_METRICS: Final = ("training.mean_return", "training.mean_reward", "training.mean_length")
 
@@ -123,13 +125,15 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
 
     Args:
         groups: the runs.
-        chosen: metrics (`mean_return`, of all its agents), or single lines of them (`mean_return.taxi_1`).
+        chosen: metrics (`mean_return`, of all its agents), single lines of them (`mean_return.taxi_1`), or
+            names under which loops logged values (`loss`, or `training.logged.loss`).
 
     Raises:
         RunnerError: no run has one of them, or any at all.
     """
+    runs = [run for group in groups for run in group.runs]
     by_name: dict[str, list[tuple[str, str]]] = {}
-    for metric, line in lines_in(run for group in groups for run in group.runs):
+    for metric, line in lines_in(runs):
         if metric != SHARES:
             for name in {metric, full_name(metric, line)}:
                 by_name.setdefault(name, []).append((metric, line))
@@ -145,11 +149,17 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
         or [name for name in usual if name in by_name]
         or [name for name in _TRAINING_METRICS if name in by_name]
     )
+    pairs: dict[tuple[str, str], None] = {}
     for name in names:
-        if name not in by_name:
-            expected = ", ".join(sorted(by_name))
-            raise RunnerError(f"metric: found {name!r}, expected one of {expected}.{nearest(name, by_name)}")
-    return list(dict.fromkeys(pair for name in names for pair in by_name[name]))
+        of_name = by_name.get(name) or by_name.get(f"{LOGGED}{name}")
+        if of_name is None:
+            logged = {other for run in runs for other in run.names}
+            known = sorted(logged | {other.removeprefix(LOGGED) for other in by_name})
+            expected = shortened(", ".join(known), _MAX_EXPECTED)
+            near = nearest(name.removeprefix(LOGGED), known)
+            raise RunnerError(f"metric: found {name!r}, expected one of {expected}.{near}")
+        pairs |= dict.fromkeys(of_name)
+    return list(pairs)
 
 
 def flat_config(config: JsonView) -> dict[str, object]:

@@ -201,7 +201,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     out of the means, and counted in `not_finite`.
 
     Of the names under which values were logged the first 64 are read; or those among `metrics`, such as
-    `training.logged.loss`, if any are given.
+    `loss` or `training.logged.loss`, if any are given.
 
     Raises:
         RecordingError: the recording is damaged, or does not have the axis.
@@ -234,9 +234,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     else:
         axis = moments.axis
         readings = [single_agent_unnamed(values) for values in readings]
-        names = dict.fromkeys(name.removeprefix(LOGGED) for name in metrics if name.startswith(LOGGED))
-        max_further = 0 if metrics else _MAX_NAMES
-        training, averaged = _loop_training(recording, moments, names, max_further, not_finite)
+        wanted = {name.removeprefix(LOGGED) for name in metrics}
+        training, averaged = _loop_training(recording, moments, names, wanted, not_finite)
         is_unended = not recording.train.episodes.count()
         if recording.status == "finished" and len(last := recording.train.recent_episodes()):
             recent = _episode_readings(
@@ -343,17 +342,17 @@ def _loop_training(
     recording: Recording,
     moments: Positions,
     names: dict[str, None],
-    max_further: int,
+    wanted: Collection[str],
     not_finite: Counter[str],
 ) -> tuple[list[tuple[float, Readings]], str]:
     """Return means over stretches of training by the end of the stretch, and a sentence on the stretches.
 
-    Logged values are read under `names`, and under the first `max_further` other names. All names that were
-    logged are added to `names`.
+    Logged values are read under the names `wanted`, or under the first 64 names if that is empty. All names
+    that were logged are added to `names`.
     """
     edges, averaged = _edges(recording, moments)
     training = _mean_episodes(recording, moments, edges, not_finite)
-    means, has_several = _mean_scalars(recording, moments, edges, names, max_further, not_finite)
+    means, has_several = _mean_scalars(recording, moments, edges, names, wanted, not_finite)
     for name, values in means.items():
         for k in np.flatnonzero(~np.isnan(values)).tolist():
             training.setdefault(k, {})[f"{LOGGED}{name}"] = {"": float(values[k])}
@@ -442,14 +441,14 @@ def _mean_scalars(
     moments: Positions,
     edges: Floats,
     names: dict[str, None],
-    max_further: int,
+    wanted: Collection[str],
     not_finite: Counter[str],
 ) -> tuple[dict[str, Floats], bool]:
     """Return the means of the values logged under each name in each stretch; NaN where there are none.
 
     Also whether any is the mean of several values.
     """
-    wanted, bins = set(names), len(edges) - 1
+    bins = len(edges) - 1
     sums: dict[str, Floats] = {}
     counts: dict[str, Floats] = {}
     for series, rows in recording.scalars():
@@ -470,9 +469,10 @@ def _mean_scalars(
             names[name] = None
             of_series = rows["series"] == k
             if name not in sums:
-                if name not in wanted and len(sums) >= max_further:
-                    if max_further:
-                        not_finite[FURTHER_NAMES] += int(of_series.sum())
+                if wanted and name not in wanted:
+                    continue
+                if not wanted and len(sums) >= _MAX_NAMES:
+                    not_finite[FURTHER_NAMES] += int(of_series.sum())
                     continue
                 sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
             if left_out := int((of_series & ~usable).sum()):

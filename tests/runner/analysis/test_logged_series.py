@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+
+import gymnasium
 import pytest
 from click.testing import CliRunner
 
@@ -91,6 +94,28 @@ def test_names_beyond_the_first_64_are_read_by_name():
     chosen = series_over(path, metrics=[f"{LOGGED}m99"])
     assert curve(chosen, "m99") == {0: 99.0}
     assert not values_left_out([chosen])
+
+
+@pytest.mark.parametrize("name", ["m70", f"{LOGGED}m70"])
+def test_a_logged_value_is_compared_by_its_name(name):
+    ids = []
+    for seed in range(2):
+        with runner.record(gymnasium.make("CartPole-v1"), seed=seed, config={"lr": seed}) as env:
+            ids.append(env.run.run_id)
+            env.reset(seed=0)
+            env.step(0)
+            for i in range(100):
+                env.log(f"m{i}", float(seed))
+    done = CliRunner().invoke(cli, ["compare", *ids, "--metric", name, "--json"])
+    assert done.exit_code == 0, done.output
+    (metric,) = json.loads(done.stdout)["metrics"]
+    assert metric["metric"] == f"{LOGGED}m70"
+    assert [group["values"] for group in metric["groups"]] == [[0.0], [1.0]]
+    done = CliRunner().invoke(cli, ["compare", *ids, "--metric", f"{name}x"])
+    assert done.exit_code == 2
+    assert "training.mean_length" in done.output
+    assert f"found '{name}x', expected one of m0, m1, " in done.output
+    assert "Did you mean 'm70'?" in done.output
 
 
 def test_a_run_of_values_alone_is_plotted_over_its_steps():
