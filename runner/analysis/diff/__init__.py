@@ -27,7 +27,7 @@ from runner.analysis.diff.divergence import (
     training_divergence,
     unbroken,
 )
-from runner.analysis.diff.metrics import MetricDiff, loop_means, metric_diffs
+from runner.analysis.diff.metrics import MetricDiff, metric_diffs
 from runner.analysis.diff.overlap import Overlap, VisitsDiff, training_overlap, visits_diff
 from runner.analysis.diff.tables import TableDiff, table_diffs
 from runner.environments.mdp import Mdp
@@ -134,7 +134,7 @@ def diff(
     by_path: dict[str, list[Mapping[str, object]]] = {"config": [_settings(run) for run in (a, b)]}
     if not (first and are_jobs):
         by_path["provenance"] = [run.provenance for run in (a, b)]
-        by_path["costs"] = [_costs(run) | ({} if are_jobs else loop_means(run)) for run in (a, b)]
+        by_path["costs"] = [_costs(run) for run in (a, b)]
     changes = {name: changes_in(*values) for name, values in by_path.items()}
     difference = RunDiff(
         a=_identity(a),
@@ -212,10 +212,12 @@ def _diff_loops(
     difference: RunDiff, a: Recording, b: Recording, targets: Mapping[str, float] | None
 ) -> RunDiff:
     """Add to the difference of two runs, of which one is a loop, where they diverge; with targets metrics."""
-    if not have_same_spaces(a, b):
-        return replace(difference, notes=["the environments have other spaces: no steps are compared"])
     if difference.same_content:
         return difference
+    if targets is not None:
+        difference = replace(difference, metrics=metric_diffs(a, b, targets))
+    if not have_same_spaces(a, b):
+        return replace(difference, notes=["the environments have other spaces: no steps are compared"])
     runs = {"A": a, "B": b}
     notes = [_left_out(name, run) for name, run in runs.items() if run.leaves_out_steps]
     notes += _differing_checkpoints(a, b)
@@ -229,8 +231,7 @@ def _diff_loops(
         compared = "actions" if any(run.leaves_out_steps for run in runs.values()) else "steps"
         if topics and (compared == "steps" or (a.has_actions and b.has_actions)):
             notes.append(f"all {compared} are the same; what differs is in {', '.join(topics)}")
-    difference = replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
-    return difference if targets is None else replace(difference, metrics=metric_diffs(a, b, targets))
+    return replace(difference, divergence=train, evaluation_divergence=evaluation, notes=notes)
 
 
 def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:

@@ -37,11 +37,11 @@ def test_diff_names_the_step_at_which_loops_diverge(folder):
     assert "other spaces" in foreign.stdout
 
 
-def test_the_evaluations_of_loops_are_compared(tmp_path):
+def test_the_metrics_of_loops_are_compared(tmp_path):
     for name, steps in (("a", 10), ("b", 20)):
         env = gymnasium.make("CartPole-v1", max_episode_steps=steps)
         with runner.record(env, tmp_path, name=name) as rec:
-            list(play(rec, 5))
+            list(play(rec, 50))
             with rec.phase("eval"):
                 rec.reset(seed=1)
                 truncated, step = False, 0
@@ -55,6 +55,13 @@ def test_the_evaluations_of_loops_are_compared(tmp_path):
     ((_, crossings),) = returns["crossings"].items()
     assert crossings[0] is None
     assert crossings[1] is not None
+    training = {m["name"]: m["end_a"] for m in table["metrics"] if m["name"].startswith("training.")}
+    with open_recording(runner.find_run("a", tmp_path).recording) as a:
+        episodes = a.train.episodes.array()
+    assert training["training.mean_length"] == pytest.approx(episodes["length"].mean())
+    assert training["training.mean_return"] == pytest.approx(episodes["returns"].mean())
+    costs = {change["path"] for change in table["costs"]}
+    assert costs <= {"train_steps", "eval_steps", "episodes", "bytes", "seconds"}
     assert dualtaxi(tmp_path, "diff", "a", "b", "--target", "success=1").exit_code == 2
 
 
