@@ -233,9 +233,10 @@ def difference(a: Run, b: Run) -> bytes:
         shown[title] = replace(shown[title], links=_links([a, b], divergence))
     body = [section for title, section in shown.items() if title not in ("Metrics", "Q-tables", "Runs")]
     first = next(iter(known.values()), None)
+    tables = shown.get("Q-tables", Section("Q-tables", ["There are none to compare."]))
     tabs = {
         "divergence": (summary(found), found.notes, partials().answer(body)),
-        "tables": ("", [], partials().answer([shown["Q-tables"]])),
+        "tables": ("", [] if "Q-tables" in shown else found.notes, partials().answer([tables])),
     }
     return as_json(ShownDifference(tabs, None if first is None else str(first.frame)))
 

@@ -120,6 +120,8 @@ class RunDiff:
     """Paths that differ but were excluded by the options."""
     notes: list[str] = field(default_factory=list)
     """What could not be compared, and why."""
+    not_compared: list[str] = field(default_factory=list)
+    """Titles of the sections without anything to compare, or left out by `first`."""
 
 
 def diff(
@@ -150,7 +152,16 @@ def diff(
         alike={name: equal_values(*values) for name, values in by_path.items()},
     )
     if are_jobs:
-        return _diff_jobs(difference, a, b, targets or {}, first)
+        difference = _diff_jobs(difference, a, b, targets or {}, first)
+    elif (branch := _branch_of_the_other(a, b)) is not None:
+        difference = _diff_branch(difference, a, b, *branch)
+    else:
+        difference = _diff_loops(difference, a, b, None if first else targets or {})
+    return replace(difference, not_compared=_not_compared(difference, a, b, first))
+
+
+def _branch_of_the_other(a: Recording, b: Recording) -> tuple[Cause, BranchOrigin] | None:
+    """Return why two loops differ of which one is a branch of the other, and where; None if neither is."""
     for branch, parent, names in ((b, a, "B is a branch of A"), (a, b, "A is a branch of B")):
         origin = origin_in(branch.config)
         if (
@@ -159,8 +170,20 @@ def diff(
             and have_same_spaces(a, b)
             and a.train.steps.dtype is not None
         ):
-            return _diff_branch(difference, a, b, Cause("branch", f"{names}, {origin}"), origin)
-    return _diff_loops(difference, a, b, None if first else targets or {})
+            return Cause("branch", f"{names}, {origin}"), origin
+    return None
+
+
+def _not_compared(difference: RunDiff, a: Recording, b: Recording, first: bool) -> list[str]:
+    """Return the titles of the sections that have nothing to compare, or that `first` leaves out."""
+    are_jobs, is_same, has_steps = _are_jobs(a, b), difference.same_content, can_compare_steps(a, b)
+    known = {
+        "Training": is_same or has_steps,
+        "Evaluation": is_same or (has_steps and not (are_jobs and first)),
+        "Q-tables": are_jobs and (is_same or bool(difference.tables)),
+        "Metrics": is_same or bool(difference.metrics),
+    } | dict.fromkeys(("Costs", "Code", "Provenance"), not (are_jobs and first))
+    return [title for title, is_known in known.items() if not is_known]
 
 
 def _diff_jobs(

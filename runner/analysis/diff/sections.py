@@ -42,6 +42,7 @@ def sections(difference: RunDiff, everything: bool = False) -> list[Section]:
         return [
             section if section.sentences or section.grids else Section(section.title, ["the same"])
             for section in all_sections
+            if section.sentences or section.grids or section.title not in difference.not_compared
         ]
     return [section for section in all_sections if section.sentences or section.grids]
 

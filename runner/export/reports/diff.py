@@ -53,7 +53,9 @@ def difference_sections(
     difference: RunDiff, a: Recording, b: Recording, curves: Iterable[Figure] = ()
 ) -> dict[str, Section]:
     """Return the text of a difference with pictures, by title; `curves` are the metrics of both runs."""
-    known = {"Metrics", "Q-tables", *(section.title for section in sections(difference))}
+    known = {"Metrics", *(section.title for section in sections(difference))}
+    if "Q-tables" not in difference.not_compared:
+        known.add("Q-tables")
     others = {section.title: section for section in sections(difference, everything=True)}
     others["Runs"] = replace(others["Runs"], sentences=[])
     drawn = {}
@@ -63,7 +65,7 @@ def difference_sections(
         ("Metrics", curves, ""),
         ("Q-tables", _table_figures(difference, a, b), "pair"),
     ):
-        section = others.pop(title)
+        section = others.pop(title, Section(title))
         if title in known:
             drawn[title] = replace(section, figures=list(figures), layout=layout)
     return drawn | others

@@ -210,7 +210,7 @@ def _compared(runs: list[Run], here: str) -> Compared:
         for i, each in enumerate(runs)
     ]
     are_jobs = [each.can_train_again for each in runs]
-    tabs = [tab for tab in TABS if len(runs) == 2 and (any(are_jobs) or tab[0] != "tables")]
+    tabs = [tab for tab in TABS if len(runs) == 2 and (all(are_jobs) or tab[0] != "tables")]
     differ = len({repr(_flat(each)) for each in runs}) > 1
     can_explain = len(runs) == 2 and all(are_jobs) and differ
     return Compared(compared, tabs, here, can_explain)

@@ -132,6 +132,8 @@ def test_pages_of_a_loop_show_its_evaluations_and_link_to_their_replays(folder, 
             assert "<dd>–</dd>" not in overview
         compared = page("/compare?run=lake&run=pole")
         assert "Mean return in the last evaluation" in compared
+        assert "Q-tables" not in compared
+        assert "There are none to compare." in page("/compare/tables?run=lake&run=pole")
         answer = client.get("/api/v1/runs/pole/evaluations").json()
         assert answer["total"] == len(answer["records"]) == 1
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ def test_diff_names_the_step_at_which_loops_diverge(folder):
     foreign = dualtaxi(folder, "diff", "pole", "rooms")
     assert foreign.exit_code == 1
     assert "other spaces" in foreign.stdout
+    everything = dualtaxi(folder, "diff", "pole", "rooms", "--all").stdout
+    assert not re.search(r"^(Training|Evaluation|Q-tables)$", everything, re.MULTILINE)
+    assert "Environment" in everything
 
 
 def test_the_metrics_of_loops_are_compared(tmp_path):
@@ -147,6 +151,7 @@ def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
     printed = dualtaxi(tmp_path, "diff", "one", "two", "--html", "-")
     assert (printed.exit_code, printed.stdout) == (1, page.read_text())
     assert "in the reset before evaluation step 0 of A, in the evaluation after" in page.read_text()
+    assert "Q-tables" not in page.read_text()
 
 
 def test_diff_names_the_topics_that_differ_between_loops_of_equal_steps(tmp_path):
