@@ -12,6 +12,7 @@ from runner.analysis.diff.code import FileChange, code_changes, made_in_words
 from runner.analysis.diff.divergence import Divergence
 from runner.analysis.sections import Grid, Section
 from runner.environments.naming import spoken
+from runner.errors import shortened
 from runner.recording.reader import Recording
 from runner.runs.branches import PATHS
 from runner.util.differences import Change, changes_in
@@ -19,6 +20,8 @@ from runner.util.humanize import UNKNOWN, counted, setting
 
 _MAX_SETTINGS: Final = 4
 """Settings that are named in the first sentences."""
+_MAX_TEXT: Final = 80
+"""Characters of a value."""
 _MAX_VALUES: Final = 6
 """Q-values of each run that are listed where everything is: the highest."""
 
@@ -80,7 +83,8 @@ def summary(difference: RunDiff) -> str:
         if change.path.split(".")[0] not in NOT_CONTENT and not (is_branch and change.path in PATHS)
     ]
     if settings:
-        named = [f"{c.path} ({setting(c.a)} in A, {setting(c.b)} in B)" for c in settings]
+        pairs = [(c.path, *_shortened_pair(setting(c.a), setting(c.b))) for c in settings]
+        named = [f"{path} ({a} in A, {b} in B)" for path, a, b in pairs]
         if len(named) > _MAX_SETTINGS:
             named[_MAX_SETTINGS:] = [f"and {len(named) - _MAX_SETTINGS} more"]
         listed = "; ".join(named)
@@ -109,6 +113,16 @@ def _text(value: object) -> str:
     return UNKNOWN if value is None else setting(value)
 
 
+def _shortened_pair(a: str, b: str) -> tuple[str, str]:
+    """Return two texts, of long ones a part from shortly before where they differ."""
+    if max(len(a), len(b)) <= _MAX_TEXT:
+        return a, b
+    same = next((i for i, pair in enumerate(zip(a, b, strict=False)) if pair[0] != pair[1]), 0)
+    start = max(same - _MAX_TEXT // 4, 0)
+    first, second = (shortened(f"…{text[start:]}" if start else text, _MAX_TEXT) for text in (a, b))
+    return first, second
+
+
 def _amount(value: object) -> str:
     return f"{value:,}" if isinstance(value, int | float) else _text(value)
 
@@ -116,14 +130,15 @@ def _amount(value: object) -> str:
 def _values(title: str, difference: RunDiff, field: str, text: Callable[[object], str] = _text) -> Section:
     """Return the values by path of a field: those that differ, then those that are alike."""
     changes: list[Change] = getattr(difference, field)
-    alike = [(path, text(value)) for path, value in difference.alike.get(field, {}).items()]
+    values = difference.alike.get(field, {}).items()
+    alike = [(path, shortened(text(value), _MAX_TEXT)) for path, value in values]
     same = [Grid(("", "A and B"), alike)] if alike else []
     return Section(title, grids=[*_changes_grid(changes, text), *same])
 
 
 def _changes_grid(changes: Sequence[Change], text: Callable[[object], str] = _text) -> list[Grid]:
     """Return a table of values by path in both runs; none without any."""
-    rows = [(change.path, text(change.a), text(change.b)) for change in changes]
+    rows = [(change.path, *_shortened_pair(text(change.a), text(change.b))) for change in changes]
     return [Grid(("", "A", "B"), rows)] if rows else []
 
 
@@ -227,7 +242,8 @@ def _why_in_words(divergence: Divergence, cause: Cause | None) -> str:
         has, lacks = ("B", "A") if _is_beyond_a(divergence) else ("A", "B")
         return f"{has} has that step, {lacks} ended before it"
     name = spoken(divergence.field.removeprefix("reset."))
-    return f"{name} is {_text(divergence.a)} in A, {_text(divergence.b)} in B"
+    a, b = _shortened_pair(_text(divergence.a), _text(divergence.b))
+    return f"{name} is {a} in A, {b} in B"
 
 
 def _evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:

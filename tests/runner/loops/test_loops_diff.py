@@ -154,6 +154,21 @@ def test_diff_names_the_step_at_which_evaluations_of_loops_diverge(tmp_path):
     assert "Q-tables" not in page.read_text()
 
 
+def test_long_values_are_shown_where_they_differ(tmp_path):
+    numbers = list(range(100))
+    for last in (7, 8):
+        config = {"layers": [*numbers, last, *numbers]}
+        with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name=f"of{last}", config=config) as rec:
+            list(play(rec, 3))
+    text = dualtaxi(tmp_path, "diff", "of7", "of8").stdout
+    (row,) = (line for line in text.splitlines() if line.startswith("config.layers"))
+    assert "98, 99, 7, 0" in row
+    assert "98, 99, 8, 0" in row
+    assert len(row) < 200
+    (change, _) = json.loads(dualtaxi(tmp_path, "diff", "of7", "of8", "--json").stdout)["config"]
+    assert change["a"] == [*numbers, 7, *numbers]
+
+
 def test_diff_names_the_topics_that_differ_between_loops_of_equal_steps(tmp_path):
     reply = diff_of_two(tmp_path, logged=1.0)
     assert "all steps are the same; what differs is in /scalar." in reply
