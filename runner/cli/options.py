@@ -25,6 +25,7 @@ from runner.cli.parameter_types import (
     TRIAL,
     TRIAL_FROM_STEP,
     ConfigName,
+    Number,
     RunName,
     RunOrFilter,
 )
@@ -118,7 +119,7 @@ def curve_options(
     lines: bool = option("--lines", is_flag=True, help="Draw each run as a thin line too."),
     smooth: float = option(
         "--smooth",
-        type=click.FloatRange(0, 100),
+        type=Number(0, 100, float),
         default=0.0,
         metavar="PERCENT",
         help="Draw exponential means with this memory, in percent of the axis; values faintly behind.",
@@ -251,7 +252,7 @@ def workers_option(default: int | str, text: str = "Number of runs to do in para
     """Return the option --workers, with a default number, or a text that describes the default."""
     return option(
         "--workers",
-        type=click.IntRange(1, 1024),
+        type=Number(1, 1024),
         default=default if isinstance(default, int) else None,
         metavar="N",
         help=f"{text}  [default: {default}]",

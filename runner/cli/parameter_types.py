@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from click.shell_completion import CompletionItem
@@ -54,6 +55,30 @@ class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generi
             self.fail(f"found {value!r}, expected {self.expected}", param, ctx)
         except RunnerError as error:
             self.fail(str(error), param, ctx)
+
+
+class Number(click.FloatRange):
+    """A number between two bounds, a whole one unless another type is named."""
+
+    def __init__(
+        self, lowest: float, highest: float | None = None, kind: type = int, above: bool = False
+    ) -> None:
+        super().__init__(lowest, highest, min_open=above)
+        self.lowest, self.highest, self.kind = lowest, math.inf if highest is None else highest, kind
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number."""
+        try:
+            number = self.kind(value)
+        except ValueError:
+            number = math.nan
+        is_enough = self.lowest < number if self.min_open else self.lowest <= number
+        if not (is_enough and number <= self.highest and number < math.inf):
+            kind = "a whole number" if self.kind is int else "a number"
+            lowest = f"{'above' if self.min_open else 'from'} {self.lowest}"
+            highest = "" if self.max is None else f" to {self.max}"
+            self.fail(f"found {value!r}, expected {kind} {lowest}{highest}", param, ctx)
+        return number
 
 
 class RunName(Completed):
@@ -216,5 +241,5 @@ STEP: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _step)
 PATH: Final = click.Path(path_type=Path)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)
-COUNT: Final = click.IntRange(1)
-INDEX: Final = click.IntRange(0)
+COUNT: Final = Number(1)
+INDEX: Final = Number(0)

@@ -20,7 +20,7 @@ from runner.cli.options import (
     workers_option,
 )
 from runner.cli.output import Reply, say
-from runner.cli.parameter_types import COUNT
+from runner.cli.parameter_types import COUNT, Number
 from runner.cli.progress import total_line
 from runner.util.humanize import counted, duration
 
@@ -54,7 +54,7 @@ def explain_command(
     ),
     seeds: int = option(
         "--seeds",
-        type=click.IntRange(1, 10_000),
+        type=Number(1, 10_000),
         default=20,
         show_default=True,
         metavar="N",

@@ -18,7 +18,7 @@ from runner.cli.options import (
     writing_options,
 )
 from runner.cli.output import Reply, say, written
-from runner.cli.parameter_types import GRID
+from runner.cli.parameter_types import GRID, Number
 from runner.cli.progress import count_line
 from runner.cli.runs import open_for_export, recorded_run
 from runner.errors import ExitCode
@@ -55,13 +55,13 @@ def command(
     ),
     fps: float | None = option(
         "--fps",
-        type=click.FloatRange(0.1, 240),
+        type=Number(0.1, 240, float),
         metavar="STEPS",
         help="Steps per second.  [default: 4 of a drawn scene, else 30]",
     ),
     width: int | None = option(
         "--width",
-        type=click.IntRange(160, 4096),
+        type=Number(160, 4096),
         metavar="PIXELS",
         help="Width of the film.  [default: about that of the pictures]",
     ),

@@ -17,6 +17,7 @@ from runner.cli.options import (
     episode_options,
 )
 from runner.cli.output import Remark, Reply, console, json_lines
+from runner.cli.parameter_types import Number
 from runner.cli.runs import recorded_run
 from runner.runs.run import Run
 
@@ -49,7 +50,7 @@ def play_command(
     chosen: EpisodeRef = episode_options,
     speed: float = option(
         "--speed",
-        type=click.FloatRange(0, min_open=True),
+        type=Number(0, kind=float, above=True),
         default=4.0,
         show_default=True,
         metavar="STEPS",

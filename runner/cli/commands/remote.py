@@ -13,7 +13,7 @@ from runner.cli import Failure
 from runner.cli.command import CommandGroup, argument, option, record
 from runner.cli.options import limit_option, recordings_option, workers_option
 from runner.cli.output import Remark, Reply, say
-from runner.cli.parameter_types import FILE, ConfigName, RunName
+from runner.cli.parameter_types import COUNT, FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
 from runner.cli.runs import find_recorded, received
 from runner.errors import ExitCode, RunnerError
@@ -73,7 +73,7 @@ def server_options(
     return Server(url, find_token(token, token_file))
 
 
-_job_argument = argument(metavar="JOB", type=click.IntRange(1))
+_job_argument = argument(metavar="JOB", type=COUNT)
 
 
 @click.group("remote", cls=CommandGroup)

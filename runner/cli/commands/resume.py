@@ -18,7 +18,7 @@ from runner.cli.options import (
     trust_option,
 )
 from runner.cli.output import Reply, say
-from runner.cli.parameter_types import COUNT, INDEX
+from runner.cli.parameter_types import COUNT, INDEX, Number
 from runner.cli.progress import count_line
 from runner.cli.runs import (
     found_run,
@@ -141,7 +141,7 @@ def evaluate_command(
     ),
     seed: int = option(
         "--seed",
-        type=click.IntRange(0, 2**64 - 1),
+        type=Number(0, 2**64 - 1),
         default=0,
         show_default=True,
         metavar="S",

@@ -10,7 +10,7 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import served_folders_option, workers_option
 from runner.cli.output import echo, say
-from runner.cli.parameter_types import FILE
+from runner.cli.parameter_types import FILE, Number
 from runner.service.settings import ServiceSettings
 from runner.util.extras import require
 from runner.util.files import storage_errors
@@ -24,7 +24,7 @@ def serve_command(
     ),
     port: int = option(
         "--port",
-        type=click.IntRange(0, 65535),
+        type=Number(0, 65535),
         default=8000,
         show_default=True,
         metavar="PORT",

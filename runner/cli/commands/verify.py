@@ -11,7 +11,7 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import trust_option
 from runner.cli.output import Reply
-from runner.cli.parameter_types import COUNT
+from runner.cli.parameter_types import COUNT, Number
 from runner.cli.progress import bytes_line, count_line
 from runner.cli.runs import folded, job_progress, recording_and_run, require_over
 from runner.errors import ExitCode, RunnerError
@@ -38,7 +38,7 @@ def verify_command(
     ),
     tolerance: float = option(
         "--tolerance",
-        type=click.FloatRange(0, 1),
+        type=Number(0, 1, float),
         default=0.0,
         metavar="X",
         help="Accept this absolute and relative difference of a loop's observations and rewards.",

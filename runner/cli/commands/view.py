@@ -13,7 +13,7 @@ from runner.cli.command import Command, argument, option
 from runner.cli.commands.export import print_selection
 from runner.cli.options import force_option, recordings_option, selection_options
 from runner.cli.output import echo, say
-from runner.cli.parameter_types import FILE, PICTURE_SIZE, STEP, RunName
+from runner.cli.parameter_types import FILE, PICTURE_SIZE, STEP, Number, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded
 from runner.export.places import require_new
@@ -39,7 +39,7 @@ def view_command(
     ),
     port: int = option(
         "--port",
-        type=click.IntRange(0, 65535),
+        type=Number(0, 65535),
         default=0,
         metavar="PORT",
         help="Port of the viewer.  [default: any free port]",
