@@ -171,7 +171,7 @@ class RunDescription:
         """
         if not self.can_train_again:
             raise RunnerError(
-                f"{self.path}: was recorded from somebody's own loop, by {self.config.get('made_by')}; "
+                f"{self.path}: was recorded from a training loop, by {self.config.get('made_by')}; "
                 f"{purpose} is for runs that were trained here. {instead}"
             )
 

@@ -91,7 +91,7 @@ def test_what_is_wrong_is_refused_before_it_is_queued(client, sent, status, mess
 
 @pytest.fixture
 def loop(recordings):
-    """Return a run of somebody's own loop among the recordings, of two episodes."""
+    """Return a recorded loop among the recordings, of two episodes."""
     with runner.record(gymnasium.make("CartPole-v1"), recordings, name="pole") as rec:
         for seed in range(2):
             rec.reset(seed=seed)
