@@ -7,6 +7,7 @@ from http import HTTPStatus
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Query, Response
+from fastapi.responses import RedirectResponse
 
 from runner.analysis.sections import Grid, Paging
 from runner.client.jobs import JobStatus
@@ -89,10 +90,10 @@ def job_log(jobs: JobsOf, number: Number, after: After) -> Response:
 
 
 @router.post("/{number}/cancel")
-def cancel(jobs: JobsOf, number: Number) -> Response:
-    """Cancel a job."""
+def cancel(jobs: JobsOf, number: Number, page: PageNumber | None = None) -> Response:
+    """Cancel a job; a page of the queue is shown again."""
     jobs.cancel(number)
-    return to_job(number)
+    return to_job(number) if page is None else RedirectResponse(f"/queue?page={page}", HTTPStatus.SEE_OTHER)
 
 
 @router.post("/{number}/resume")
