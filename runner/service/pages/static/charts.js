@@ -301,11 +301,15 @@ function options(unit, series, log_x, logY, { place, key }) {
   const scale = (log, range) => ({
     time: false,
     distr: log ? 3 : 1,
-    range: (_, low, high) =>
-      log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high),
+    range: (chart, low, high) =>
+      log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high, chart.data[0]),
   });
   const end = (name, other) => (fields[name].value === "" ? other : Number(fields[name].value));
-  const x = scale(log_x, (low, high) => [end("from", low ?? 0), end("to", high ?? 1)]);
+  // To the only position where there is one: uPlot proposes an axis to twice that.
+  const x = scale(log_x, (low, high, positions) => {
+    const [first, last] = positions.length > 1 ? [low, high] : [0, positions[0] || 1];
+    return [end("from", first), end("to", last)];
+  });
   const y = scale(logY, (low, high) => {
     if (unit.startsWith("percent") && high <= 100 && low >= 0) return [0, 100];
     if (low === null || (low === 0 && high === 0)) return [0, 1];
