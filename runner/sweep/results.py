@@ -236,10 +236,12 @@ def _heading(results: Results, shown: int) -> list[str]:
     states = [trial.state for trial in results.suggested]
     counts = [f"{states.count(state)} {state}" for state in get_args(State) if state in states]
     duplicates = sum(len(entry.duplicates) for entry in ranking)
+    tied = [entry for entry in ranking if entry.state == "finished" and entry.median == ranking[0].median]
     return [
         f"{sweep.file.strategy}, {results.trials:,} trials ({', '.join(counts) or 'none started'}), "
         f"{counted(len(sweep.seeds), 'seed')} each. Objective: {sweep.objective.description}.",
         *([f"{duplicates} trials repeated earlier values, and are listed with them."] if duplicates else []),
+        *([f"{len(tied)} trials tie for the best; trial {tied[0].number} is the first."] if tied[1:] else []),
         *([f"The best {shown} of {len(ranking):,}; --all shows all."] if shown < len(ranking) else []),
     ]
 

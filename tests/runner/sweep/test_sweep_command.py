@@ -42,12 +42,21 @@ def test_a_sweep_runs_and_its_best_configuration_loads(type_in, file, tmp_path):
     shown = json.loads(type_in("show", "small", "--json").stdout)
     assert shown["best"] == reply["best"]["trial"] == shown["ranking"][0]["number"]
     assert len(shown["ranking"]) == 6
-    assert "median" in type_in("show", "small").stdout
+    text = type_in("show", "small").stdout
+    assert "median" in text
+    medians = [entry["median"] for entry in shown["ranking"]]
+    assert ("trials tie for the best" in text) == (medians[0] == medians[1])
     best = tmp_path / "best.yaml"
     type_in("show", "small", "--write-best", str(best))
     assert load(best).step_size == reply["best"]["values"]["step_size"]
     assert load(best).seeds == tuple(range(2, 12))  # the search saw 0 and 1
     assert json.loads(type_in("ls", "--json").stdout) == {"sweeps": ["small"]}
+
+
+def test_trials_that_tie_for_the_best_are_counted(type_in, file):
+    never = {"metric": "success_percent", "at": "first_over", "level": 101, "direction": "minimize"}
+    type_in("run", str(file(objective=never)))
+    assert "6 trials tie for the best; trial 0 is the first." in type_in("show", "small").stdout
 
 
 def test_a_limit_stops_a_sweep_and_a_raised_limit_resumes_it(type_in, file, tmp_path):
