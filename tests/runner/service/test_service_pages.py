@@ -370,7 +370,7 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     assert [(one["metric"], one["values"][:2]) for one in curves["curves"]] == [
         ("training.logged.v/99", [99.0, 100.0])
     ]
-    assert (curves["axis"], curves["notes"]) == ("v/0", [])
+    assert (curves["axis"], curves["notes"]) == ("v/0", ["Each line is one run, as reported."])
 
 
 def test_variations_are_of_jobs(client, recordings):
