@@ -204,7 +204,7 @@ class Replay {
     if (i > 0 && together) {
       add(list, "reward", this.several(episode.reward[i - 1]));
       const events = episode.events.filter((_, bit) => (episode.event[i - 1] >>> bit) & 1);
-      const names = events.map((name) => make("span", { class: "event" }, name));
+      const names = events.map((name) => make("span", { class: "tag" }, name));
       if (episode.events.length) add(list, "events", ...(names.length ? names : ["none"]));
       add(list, "return so far", this.several(total));
     }
@@ -226,10 +226,8 @@ class Replay {
   }
 
   total(i) {
-    const { agents, reward, before, begins } = this.episode,
-      from = begins?.findLast((begin) => begin <= Math.max(0, i - 1)) ?? 0;
-    const sum = (agent) =>
-      reward.slice(from, i).reduce((sum, row) => sum + Number(row[agent]), from ? 0 : (before[agent] ?? 0));
+    const { agents, reward, before } = this.episode;
+    const sum = (agent) => reward.slice(0, i).reduce((sum, row) => sum + Number(row[agent]), before[agent] ?? 0);
     return agents.map((_, agent) => Math.round(sum(agent) * 1e4) / 1e4);
   }
 
@@ -244,7 +242,7 @@ class Replay {
         far = Math.abs(at[j] - now);
       const steps = `${far.toLocaleString("en")} ${far === 1 ? "step" : "steps"} ${at[j] > now ? "later" : "before"}`,
         when = far ? steps : this.first + i ? "now" : "before the first step";
-      return make("tr", {}, make("th", { scope: "row" }, name), make("td", {}, values[j]), make("td", {}, when));
+      return rowOf("td", [name, values[j], when]);
     });
     box.hidden = !rows.length;
     box.replaceChildren(make("table", {}, make("caption", {}, "Logged near this step"), make("tbody", {}, rows)));
@@ -253,15 +251,14 @@ class Replay {
   // Where there is nothing but texts: the steps around this one.
   list(i) {
     const { actions, reward, texts } = this.episode,
-      row = (tag, cells, isNow) => make("tr", isNow ? { class: "now" } : {}, cells.map((cell) => make(tag, {}, String(cell)))),
       named = ({ agent, name }) => `${agent} ${name}`.trim(),
       text = ({ values, at }, j) => values[at[j]] ?? "",
       rows = [];
     for (let j = Math.max(0, i - 6); j <= Math.min(reward.length, i + 6); j++) {
       const taken = [...actions.map((words) => (j ? text(words, j - 1) : "")), j ? reward[j - 1].join(", ") : ""];
-      rows.push(row("td", [this.first + j, ...taken, ...texts.map((words) => text(words, j))], j === i));
+      rows.push(rowOf("td", [this.first + j, ...taken, ...texts.map((words) => text(words, j))], j === i ? "now" : ""));
     }
-    const head = row("th", ["step", ...actions.map(named), "reward", ...texts.map(named)]);
+    const head = rowOf("th", ["step", ...actions.map(named), "reward", ...texts.map(named)]);
     this.table.replaceChildren(make("thead", {}, head), make("tbody", {}, rows));
   }
 
@@ -302,7 +299,10 @@ class Replay {
   }
 }
 
-const isNumber = (value) => typeof value === "number",
+// A row with a heading; the first row of a table has only headings.
+const rowOf = (tag, [name, ...cells], kind = "") =>
+    make("tr", { class: kind }, make("th", { scope: tag === "td" ? "row" : "col" }, name), cells.map((cell) => make(tag, {}, cell))),
+  isNumber = (value) => typeof value === "number",
   signed = (value) => (value > 0 ? "+" : "") + value,
   spaced = (name) => name.replaceAll("_", " ");
 

@@ -198,7 +198,7 @@ def _overview(
             "form": form,
             "max_note": MAX_NOTE,
             "removal": plan(run, settings.recordings[0]) if viewer_of(request).can_write else None,
-            "film_endings": tuple(FORMATS),
+            "film_endings": {ending: ending[1:].upper() for ending in FORMATS},
         }
 
     return RunPage(run, "", "run_overview.html", values)

@@ -70,21 +70,9 @@ class RunCell(NamedTuple):
     """A cell of the table."""
 
     text: str
-    kind: str
     address: str
-    is_status: bool
     note: str
     """What a branch changed, shown after its name."""
-
-
-class RunRow(NamedTuple):
-    """A row of the table: a run, or the first one of all runs of a name."""
-
-    id: str
-    name: str
-    runs: int
-    """Number of the runs that the row stands for."""
-    cells: list[RunCell]
 
 
 @dataclass(frozen=True)
@@ -92,7 +80,8 @@ class RunsTable:
     """The rows of a page."""
 
     headings: list[Heading]
-    rows: list[RunRow]
+    rows: list[tuple[IndexRow, int, list[RunCell]]]
+    """A run, or the first one of all runs of a name; the number of runs that it stands for; its cells."""
     total: int
     """Runs that match the filter."""
     all_runs: int
@@ -169,15 +158,7 @@ def _values(
     folded = FOLDED if is_usual else ()
     table = RunsTable(
         headings=[_heading(column, query, column in folded) for column in shown],
-        rows=[
-            RunRow(
-                row["id"],
-                row["name"],
-                runs,
-                [_cell(row, column, column in folded, runs) for column in shown],
-            )
-            for row, runs in counted
-        ],
+        rows=[(row, runs, [_cell(row, column, runs) for column in shown]) for row, runs in counted],
         total=total,
         all_runs=all_runs,
         paging=Paging(number, pages_of, ROWS, link("/runs", query)),
@@ -214,7 +195,7 @@ def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:
     return Heading(
         text=HEADINGS.get(column, column).replace("_", " "),
         meaning="" if is_setting or not is_sortable else field_of(column).meaning,
-        kind=_classes(not is_setting and kind in LEFT_KINDS, folded),
+        kind=" ".join(["text"] * (not is_setting and kind in LEFT_KINDS) + ["fold"] * folded),
         sorted={rising: "ascending", falling: "descending"}.get(query["sort"]),
         address=link("/runs", {**query, "sort": second if query["sort"] == first else first})
         if is_sortable
@@ -222,11 +203,7 @@ def _heading(column: str, query: Mapping[str, str], folded: bool) -> Heading:
     )
 
 
-def _classes(left: bool, folded: bool) -> str:
-    return " ".join(name for name, holds in (("text", left), ("fold", folded)) if holds)
-
-
-def _cell(row: IndexRow, column: str, folded: bool, runs: int) -> RunCell:
+def _cell(row: IndexRow, column: str, runs: int) -> RunCell:
     """Return a cell of a run; where it stands for several, their name leads to them."""
     text, address, note = as_text(row, column), "", ""
     if column == "name" and runs > 1:
@@ -236,5 +213,4 @@ def _cell(row: IndexRow, column: str, folded: bool, runs: int) -> RunCell:
         note = as_text(row, "change") if column == "name" else ""
     elif column == "same_as" and row["same_as"]:
         address = f"/runs/{row['same_as']}"
-    kind = _classes(column in FIELDS and field_of(column).kind in LEFT_KINDS, folded)
-    return RunCell(text[:16] if column == "digest" else text, kind, address, column == "status", note)
+    return RunCell(text[:16] if column == "digest" else text, address, note)
