@@ -123,17 +123,21 @@ class Evaluation:
     """Number of the evaluation from 0, also where a repair lost others."""
 
     @property
+    def trials(self) -> int:
+        """How many trials it has."""
+        return self.stop - self.start
+
+    @property
     def episodes(self) -> Ints:
         """The numbers of its trials."""
         return np.arange(self.start, self.stop)
 
     def trial(self, number: int, where: str) -> int:
         """Return the number of a trial, counted from 0, among those of all evaluations."""
-        trials = self.stop - self.start
-        if not 0 <= number < trials:
+        if not 0 <= number < self.trials:
             raise NotInRecording(
                 f"{where}: found no trial {number:,} of the evaluation after {self.after:,} episodes; "
-                f"it has {trials:,}, from 0."
+                f"it has {self.trials:,}, from 0."
             )
         return self.start + number
 

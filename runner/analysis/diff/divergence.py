@@ -145,7 +145,7 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
         right = others.get(left.after)
         if right is None:
             continue
-        trials = min(left.stop - left.start, right.stop - right.start)
+        trials = min(left.trials, right.trials)
         ours, theirs = _trial_steps(a, left.start, trials), _trial_steps(b, right.start, trials)
         if ours is None or theirs is None:
             continue

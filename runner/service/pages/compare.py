@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
@@ -29,7 +30,7 @@ from runner.service.pages.frame import RunHead, head_of, last_results, result_of
 from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
 from runner.util import humanize
-from runner.util.humanize import counted
+from runner.util.humanize import UNKNOWN, counted
 from runner.views.compare import MAX_SCORES
 
 router = APIRouter(prefix="/compare", include_in_schema=False)
@@ -95,7 +96,7 @@ def chosen_runs(
     Raises:
         RunnerError: there are fewer than two of them, or too many.
     """
-    ids = [found.run_id for each in name or () for found in catalogue.find_all(each)]
+    ids = [named.run_id for text in name or () for named in catalogue.find_all(text)]
     names = list(dict.fromkeys([*(run or ()), *ids]))
     if not 2 <= len(names) <= MAX_RUNS:
         raise RunnerError(
@@ -122,23 +123,20 @@ TwoRuns = Annotated[list[Run], Depends(two_runs)]
 @router.get("")
 def overview(runs: ChosenRuns, scores: Scores = "") -> Response:
     """Show the differences of runs, and their curves in common plots."""
-    settings = [{**({"seed": str(each.seed)} if each.has_seed else {}), **_flat(each)} for each in runs]
-    rows = [
-        (key, *(each.get(key, humanize.UNKNOWN) for each in settings))
-        for key in dict.fromkeys(key for each in settings for key in each)
-    ]
-    digests = {each.summary.content_digest for each in runs}
-    environments = {json.dumps(each.file.config.get("env"), sort_keys=True) for each in runs}
-    tasks_address = link("/compare/tasks", {"run": [each.run_id for each in runs], "scores": scores})
+    settings = _rows([({"seed": str(run.seed)} if run.has_seed else {}) | _settings(run) for run in runs])
+    results = _rows([_results(run) for run in runs])
+    digests = {run.summary.content_digest for run in runs}
+    environments = {json.dumps(run.file.config.get("env"), sort_keys=True) for run in runs}
+    tasks_address = link("/compare/tasks", {"run": [run.run_id for run in runs], "scores": scores})
     compared = _compared(runs, "")
     headings = ("", *(run.label for run in compared.runs))
     values = {
         "compared": compared,
-        "differing": Grid(headings, [row for row in rows if len(set(row[1:])) > 1], left=headings),
-        "results": Grid(headings, _results(runs), left=headings),
+        "differing": Grid(headings, [row for row in settings if len(set(row[1:])) > 1], left=headings),
+        "results": Grid(headings, [row for row in results if {*row[1:]} != {UNKNOWN}], left=headings),
         "same": len(digests) == 1 and None not in digests,
         # The latest episodes of these replay by themselves.
-        "running": [each for each in compared.runs if each.head.status == "running"][:MAX_LATEST],
+        "running": [run for run in compared.runs if run.head.status == "running"][:MAX_LATEST],
         "scores": scores,
         "tasks": tasks_address if len(environments) > 1 else "",
     }
@@ -150,7 +148,7 @@ async def tasks(
     runs: ChosenRuns, compute: ComputationOf, scores: Scores = "", axis: AxisOf = EPISODES.name
 ) -> Response:
     """Return the comparison over environments by normalised scores, as a part of the page."""
-    paths = [each.recording for each in runs]
+    paths = [run.recording for run in runs]
     return HTMLResponse(await compute(fragments.tasks, paths, axis, scores))
 
 
@@ -162,22 +160,22 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
     else:
         first = (await compute.shown(ShownDifference, fragments.difference, *runs)).first_frame
         step = EpisodeRef.parse(first) if first else EpisodeRef(0)
-    names, places = [each.run_id for each in runs], places_in(runs, step)
+    names, steps = [run.run_id for run in runs], places_in(runs, step)
 
     def neighbour(by: int) -> str:
         other = replace(step, episode=step.episode + by, t=0)
-        has_one = other.episode >= 0 and places == [step, step]
+        has_one = other.episode >= 0 and steps == [step, step]
         return link("/compare/replay", {"run": names, "at": str(other)}) if has_one else ""
 
     def show() -> dict[str, object]:
-        head, shown = _compared(runs, "replay"), []
-        for run, one, place in zip(runs, head.runs, places, strict=True):
-            source = f"/api/v1/runs/{one.head.id}/replay/{place.episode_path}"
+        compared, panels = _compared(runs, "replay"), []
+        for run, side, own_step in zip(runs, compared.runs, steps, strict=True):
+            source = f"/api/v1/runs/{run.run_id}/replay/{own_step.episode_path}"
             with open_recording(run.recording) as recording:
-                shown.append(panel_of(recording, place.phase, source, one.label, one.number))
+                panels.append(panel_of(recording, own_step.phase, source, side.label, side.number))
         return {
-            "compared": head,
-            "shown": shown,
+            "compared": compared,
+            "shown": panels,
             "episode": step.heading,
             "prefix": step.episode_text,
             "t": step.t,
@@ -206,39 +204,31 @@ async def difference(request: Request, runs: TwoRuns, compute: ComputationOf) ->
 
 def _compared(runs: list[Run], here: str) -> Compared:
     compared = [
-        ComparedRun(head_of(each), letter(i), f"{letter(i)}: {each.name}", i % 7)
-        for i, each in enumerate(runs)
+        ComparedRun(head_of(run), letter(i), f"{letter(i)}: {run.name}", i % 7) for i, run in enumerate(runs)
     ]
-    are_jobs = [each.can_train_again for each in runs]
+    are_jobs = [run.can_train_again for run in runs]
     tabs = [tab for tab in TABS if len(runs) == 2 and (all(are_jobs) or tab[0] != "tables")]
-    differ = len({repr(_flat(each)) for each in runs}) > 1
+    differ = len({repr(_settings(run)) for run in runs}) > 1
     can_explain = len(runs) == 2 and all(are_jobs) and differ
     return Compared(compared, tabs, here, can_explain)
 
 
-def _flat(run: Run) -> dict[str, str]:
+def _settings(run: Run) -> dict[str, str]:
     return {key: humanize.setting(value) for key, value in flat_config(run.file.config).items()}
 
 
-def _results(runs: list[Run]) -> list[tuple[str, ...]]:
-    """Return the name and the value of each run, for each measure."""
-    last = [last_results(each).last_evaluation or EvaluationMetrics() for each in runs]
-    metrics = [metric for metric in METRICS if any(each.values.get(metric.name) is not None for each in last)]
-    names = [
-        "Status",
-        *(result_of(metric, last[0])[0] for metric in metrics),
-        "Training episodes",
-        "Training steps",
-        "Content digest",
-    ]
-    columns = [
-        (
-            run.status,
-            *(result_of(metric, evaluation)[1] for metric in metrics),
-            humanize.number(run.summary.episodes, 0),
-            humanize.number(run.summary.train_steps, 0),
-            str(run.summary.content_digest or humanize.UNKNOWN)[:16],
-        )
-        for run, evaluation in zip(runs, last, strict=True)
-    ]
-    return list(zip(names, *columns, strict=True))
+def _results(run: Run) -> dict[str, str]:
+    evaluation = last_results(run).last_evaluation or EvaluationMetrics()
+    return {
+        "Status": run.status,
+        **dict(result_of(metric, evaluation) for metric in METRICS),
+        "Training episodes": humanize.number(run.summary.episodes, 0),
+        "Training steps": humanize.number(run.summary.train_steps, 0),
+        "Content digest": str(run.summary.content_digest or UNKNOWN)[:16],
+    }
+
+
+def _rows(columns: Sequence[Mapping[str, str]]) -> list[tuple[str, ...]]:
+    """Return a row for each name that any column has, which begins with the name."""
+    names = dict.fromkeys(name for column in columns for name in column)
+    return [(name, *(column.get(name, UNKNOWN) for column in columns)) for name in names]

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import RedirectResponse
@@ -97,14 +97,6 @@ class ReplayStage:
     """Why there is no picture, or no better one."""
     has_pictures: bool
     """Whether pictures are fetched."""
-
-
-class EvaluationChoice(NamedTuple):
-    """An evaluation that can be replayed."""
-
-    after: int
-    """Training episodes before it."""
-    trials: int
 
 
 @router.get("")
@@ -200,13 +192,12 @@ async def _replay(
     await preparing
 
     def show() -> dict[str, object]:
-        with open_recording(run.recording) as recording:
-            branches = _branches(recording, run, catalogue)
         stage, problem = (
             (None, part) if isinstance(part, RunnerError) else (stage_of(json.loads(part), at.t), "")
         )
-        shown = {"problem": problem, "refused": str(refused or ""), "form": form}
-        return _values(run, replace(at, t=0), branches, stage) | shown
+        with open_recording(run.recording) as recording:
+            shown = _values(recording, run, replace(at, t=0), catalogue)
+        return shown | {"stage": stage, "problem": problem, "refused": str(refused or ""), "form": form}
 
     wrong = refused or part
     status = status_of(wrong) if isinstance(wrong, RunnerError) else None
@@ -249,6 +240,35 @@ async def mark_step(
     return RedirectResponse(f"{address}#marks", HTTPStatus.SEE_OTHER)
 
 
+def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue) -> dict[str, object]:
+    """Return the values of the page of an episode but its stage."""
+    evaluations = evaluations_of(recording)
+    episodes, is_job = recording.train.known_episodes(), recording.can_train_again
+    if at.after is None:
+        count = episodes
+    else:
+        count = next((found.trials for found in evaluations if found.after == at.after), 0)
+    base = f"/runs/{run.run_id}"
+
+    def neighbour(other: int) -> str:
+        path = replace(at, episode=other).episode_path
+        return f"{base}/replay/{path}" if 0 <= other < max(count, at.episode) else ""
+
+    return {
+        "at": at,
+        "episodes": episodes,
+        "evaluations": evaluations,
+        "before": neighbour(at.episode - 1),
+        "after": neighbour(at.episode + 1),
+        "source": f"/api/v1{base}/replay/{at.episode_path}",
+        "environments": recording.environments,
+        "what_if": f"{base}/what-if/{at.episode_text}" if is_job else "",
+        "branch": "" if is_job and at.after is not None else f"{base}/branch?at={at.episode_text}",
+        "branches": _branches(recording, run, catalogue),
+        "marks": [mark for mark in run.marks if EpisodeRef.parse(mark.at).episode_path == at.episode_path],
+    }
+
+
 def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link]:
     """Return links to the comparisons of a run with its parent, if it is a branch, and with its branches."""
 
@@ -256,45 +276,14 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
         at = origin.at if isinstance(origin, BranchOrigin) else str(reference_to(recording, origin.step))
         return link("/compare/replay", {"run": [parent, branch], "at": at})
 
-    own = origin_in(run.file.config)
-    parent = [] if own is None else [Link(f"Branch of {own.run} {own}", comparison(own.run, run.run_id, own))]
+    origin = origin_in(run.file.config)
+    links = []
+    if origin is not None:
+        links.append(Link(f"Branch of {origin.run} {origin}", comparison(origin.run, run.run_id, origin)))
     branches = catalogue.read(lambda index: index.branches(run.run_id))
-    return parent + [
-        Link(f"Branch {name} {origin}", comparison(run.run_id, name, origin))
-        for name, origin in islice(branches.items(), MAX_BRANCHES)
-    ]
-
-
-def _values(run: Run, at: EpisodeRef, branches: list[Link], stage: ReplayStage | None) -> dict[str, object]:
-    with open_recording(run.recording) as recording:
-        episodes = recording.train.known_episodes()
-        environments, is_job = recording.environments, recording.can_train_again
-        evaluations = [EvaluationChoice(one.after, one.stop - one.start) for one in evaluations_of(recording)]
-    if at.after is None:
-        count = episodes
-    else:
-        count = next((each.trials for each in evaluations if each.after == at.after), 0)
-
-    def neighbour(other: int) -> str:
-        path = replace(at, episode=other).episode_path
-        return f"/runs/{run.run_id}/replay/{path}" if 0 <= other < max(count, at.episode) else ""
-
-    return {
-        "at": at,
-        "stage": stage,
-        "episodes": episodes,
-        "evaluations": evaluations,
-        "before": neighbour(at.episode - 1),
-        "after": neighbour(at.episode + 1),
-        "source": f"/api/v1/runs/{run.run_id}/replay/{at.episode_path}",
-        "environments": environments,
-        "what_if": f"/runs/{run.run_id}/what-if/{at.episode_text}" if is_job else "",
-        "branch": ""
-        if is_job and at.after is not None
-        else f"/runs/{run.run_id}/branch?at={at.episode_text}",
-        "branches": branches,
-        "marks": [mark for mark in run.marks if EpisodeRef.parse(mark.at).episode_path == at.episode_path],
-    }
+    for name, branched in islice(branches.items(), MAX_BRANCHES):
+        links.append(Link(f"Branch {name} {branched}", comparison(run.run_id, name, branched)))
+    return links
 
 
 def stage_of(part: JsonView, t: int) -> ReplayStage:
