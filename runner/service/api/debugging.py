@@ -19,7 +19,7 @@ router = APIRouter(
     tags=["reading"],
 )
 MAX_ACTIONS = 1000
-At = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
+StepPath = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 
 
@@ -31,7 +31,7 @@ WhatIfAnswer = create_model("WhatIfAnswer", __doc__=WhatIf.__doc__, **_FIELDS)
 async def what_if(
     run: RecordedRun,
     compute: ComputationOf,
-    at: At,
+    at: StepPath,
     action: Annotated[
         list[str] | None, Query(max_length=MAX_ACTIONS, description="Numbers or names; default: all.")
     ] = None,
@@ -53,7 +53,7 @@ async def what_if(
 async def branch(
     run: RecordedRun,
     compute: ComputationOf,
-    at: At,
+    at: StepPath,
     action: ActionPath,
     start: Start = 0,
     steps: Steps = STEPS,

@@ -1,4 +1,4 @@
-"""The replay of a run in its page: any step of any episode."""
+"""The replay of a run in its page: any step of any episode, and where other actions lead from there."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import RedirectResponse
+from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
@@ -26,6 +27,7 @@ from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link
+from runner.service.api.debugging import StepPath
 from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import (
@@ -44,7 +46,7 @@ from runner.service.pictures import PictureStreams
 from runner.service.problems import status_of
 from runner.util.values import JsonView
 
-router = APIRouter(prefix="/runs/{run}/replay", include_in_schema=False)
+router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
 MAX_BRANCHES: Final = 20
 """Branches of a run that a page lists, the newest."""
@@ -52,6 +54,7 @@ BEFORE: Final = 250
 """Steps before the requested one in the part that a page shows first, as in `player.js`."""
 
 T = Annotated[int, Query(ge=0, lt=2**62)]
+Action = Annotated[str, Field(max_length=200)]
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ class ReplayStage:
     """Whether pictures are fetched."""
 
 
-@router.get("")
+@router.get("/replay")
 async def chosen_replay(
     run: RecordedRun,
     compute: ComputationOf,
@@ -132,14 +135,14 @@ async def step_of(run: Run, compute: Computation, text: str) -> EpisodeRef:
     )
 
 
-@router.get("/thumbnail")
+@router.get("/replay/thumbnail")
 async def thumbnail(run: RecordedRun, compute: ComputationOf, at: At = TYPICAL) -> Response:
     """Return a small picture of an episode, which takes no environment."""
     picture = await compute(fragments.episode_thumbnail, run.recording, EpisodeRef.parse(at))
     return Response(picture, media_type="image/svg+xml")
 
 
-@router.get("/latest")
+@router.get("/replay/latest")
 async def latest(
     run: RecordedRun,
     compute: ComputationOf,
@@ -205,7 +208,7 @@ async def _replay(
 
 
 def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
-    @router.get(path)
+    @router.get(f"/replay{path}")
     async def replay(
         run: RecordedRun,
         compute: ComputationOf,
@@ -222,7 +225,7 @@ for _path, _episode in EPISODES.items():
     _add_route(_path, _episode)
 
 
-@router.post("/mark")
+@router.post("/replay/mark")
 async def mark_step(
     run: WrittenRun, form: Form, compute: ComputationOf, streams: PicturesOf, catalogue: CatalogueOf
 ) -> Response:
@@ -238,6 +241,28 @@ async def mark_step(
         return await _replay(run, compute, streams, catalogue, step, error, form)
     address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
     return RedirectResponse(f"{address}#marks", HTTPStatus.SEE_OTHER)
+
+
+@router.get("/what-if/{at}")
+@router.get("/what-if/{at}/{action}")
+async def what_if(
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: StepPath,
+    action: Action | None = None,
+    t: T | None = None,
+) -> Response:
+    """Show where each joint action leads, and the replay of one: the recorded one unless it is named."""
+    step = await step_of(run, compute, at)
+    shown_t = step.t if t is None else t
+    start = max(0, shown_t - BEFORE)
+    found = json.loads(await compute(fragments.what_if_page, run.recording, step, action, start, STEPS))
+    return RunPage(
+        run,
+        "replay",
+        "run_what_if.html",
+        lambda: {"step": step, "found": found, "stage": stage_of(found, shown_t)},
+    )
 
 
 def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue) -> dict[str, object]:

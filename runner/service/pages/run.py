@@ -1,16 +1,17 @@
-"""The pages of a run: its status and metrics, its evaluations, its maps."""
+"""The pages of a run: its status and metrics, its pictures and maps, how it was made; and what changes it."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from http import HTTPStatus
 from itertools import islice
 from types import MappingProxyType
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
 from fastapi.routing import APIRoute
 from starlette.concurrency import run_in_threadpool
@@ -19,12 +20,15 @@ from runner.analysis.axes import EPISODES
 from runner.analysis.contents import damage_of
 from runner.analysis.episodes import TYPICAL
 from runner.analysis.evaluations import loop_summary
-from runner.analysis.summary import results_in_words
+from runner.analysis.sections import Grid, Link, Section
+from runner.analysis.summary import describe_run, results_in_words
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.export.encoder import FORMATS
+from runner.recording import schema
 from runner.recording.composition import composition_of
 from runner.recording.labels import MAX_NOTE
+from runner.recording.messages import log_level
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
@@ -49,12 +53,18 @@ from runner.service.pages.frame import RunPage, StatusName, result_of
 from runner.service.pages.rendering import Form, Page, form_of, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
+from runner.util.plugins import EXPORTS, plugin_names
 from runner.util.values import Json, JsonView
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
 
+MAX_LINES: Final = 500
+"""Lines at the end of a run's log that its page shows."""
 MAX_RESULTS: Final = 10
 """Means of training and logged values on the first page of a run."""
+StateParts = Annotated[
+    list[str] | None, Query(max_length=20, description="The parts of the name of a state.")
+]
 
 
 @dataclass(frozen=True)
@@ -180,6 +190,59 @@ async def random_policy(run: FoundRun, compute: ComputationOf) -> Response:
 async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisOf = EPISODES.name) -> Response:
     """Return the histograms of training, as a part of the run's page."""
     return HTMLResponse(await compute(fragments.distributions, run.recording, axis))
+
+
+@router.get("/pictures")
+async def pictures(run: RecordedRun, compute: ComputationOf) -> Response:
+    """Show the logged pictures."""
+    body = (await compute(fragments.pictures, run.recording)).decode()
+    return RunPage(run, "pictures", "run_body.html", {"body": body})
+
+
+@router.get("/learned")
+async def learned(run: RecordedRun, compute: ComputationOf, state: StateParts = None) -> Response:
+    """Show the maps of what was learned, in the situation of a state."""
+    body = (await compute(fragments.maps, run.recording, tuple(state or ()))).decode()
+    return RunPage(run, "learned", "run_body.html", {"body": body})
+
+
+@router.get("/config")
+def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
+    """Show configuration, provenance and log."""
+    log: list[tuple[str, ...]] = []
+    details = describe_run(run, with_results=False)
+    try:
+        with open_recording(run.recording) as recording:
+            log = [
+                (
+                    f"{line['log_time'] // schema.STEP_NANOSECONDS:,}",
+                    log_level(line["level"]).lower(),
+                    line["message"],
+                )
+                for line in deque(recording.table(schema.LOG_TOPIC).decoded(), MAX_LINES)
+            ]
+    except RecordingError as error:
+        details = replace(details, damage=details.damage or str(error))
+    origin = [
+        replace(each, facts={name: settings.without_folders(text) for name, text in each.facts.items()})
+        for each in details.origin_sections()
+    ]
+    files = {
+        "Download the recording": "recording",
+        "For Rerun": "replay.rrd",
+        "Report": "report.html",
+        **{f"As {name}": f"exports/{name}" for name in plugin_names(EXPORTS)},
+    }
+    links = [Link(text, f"/api/v1/runs/{run.run_id}/{path}") for text, path in files.items()]
+    if viewer_of(request).can_write and "made_by" not in run.file.config:  # a loop cannot be submitted
+        links.insert(0, Link("Submit a variation", f"/submit?from={run.run_id}"))
+    lines = Grid(("step", "level", "message"), log, left=("level", "message"))
+    sections = [
+        Section("", parts=origin, layout="tables"),
+        Section("", links=links),
+        Section("Log", grids=[lines]) if log else Section("Log", ["The run logged no texts."]),
+    ]
+    return RunPage(run, "config", "run_config.html", {"setup": sections})
 
 
 def _overview(
