@@ -309,6 +309,15 @@ class TopicChunks:
         for time, fields in self.parsed(parse, max_bytes, times, chunks):
             yield {"log_time": time} | fields | self.unknown
 
+    def newest(self) -> Iterator[Message]:
+        """Yield the messages of a topic of variable size as `decoded` does, the last one first.
+
+        Raises:
+            RecordingError: one cannot be read.
+        """
+        for k in reversed(range(len(self))):
+            yield from reversed([*self.decoded(chunks=[k])])
+
     def parsed(
         self,
         parse: Callable[[bytes], M],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import json
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -199,26 +198,21 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
 
 def pictures(path: Path) -> bytes:
     """Return the last pictures and films that were logged under a name, the newest first, as HTML."""
-    last: deque[tuple[str, int, bytes]] = deque()
-    size = 0
-    total = 0
+    figures, size = list[Figure](), 0
     with open_recording(path) as recording:
-        for image in recording.table(schema.IMAGE_TOPIC).decoded():
-            total, size = total + 1, size + len(image["data"])
-            last.append((image["frame_id"], image["log_time"] // schema.STEP_NANOSECONDS, image["data"]))
-            while len(last) > MAX_PICTURES or size > MAX_PICTURE_BYTES:
-                size -= len(last.popleft()[2])
-    figures = [
-        Figure(
-            f'<img src="data:{kind};base64,{base64.b64encode(data).decode()}" alt="">',
-            f"{name}, step {step:,}",
-        )
-        for name, step, data in reversed(last)
-        if (kind := media_type(data))
-    ]
-    texts = ["No picture was logged."] if not total else []
-    if len(figures) < total:
-        texts = [f"The last {len(figures):,} of {total:,} pictures."]
+        images = recording.table(schema.IMAGE_TOPIC)
+        for image in images.newest():
+            name, data, step = image["frame_id"], image["data"], image["log_time"] // schema.STEP_NANOSECONDS
+            size += len(data)
+            if len(figures) == MAX_PICTURES or size > MAX_PICTURE_BYTES:
+                break
+            if kind := media_type(data):
+                source = f"data:{kind};base64,{base64.b64encode(data).decode()}"
+                figures.append(Figure(f'<img src="{source}" alt="">', f"{name}, step {step:,}"))
+        total = images.count()
+    texts = [f"The last {len(figures):,} of {total:,} pictures."] if len(figures) < total else []
+    if not total:
+        texts = ["No picture was logged."]
     return str(partials().answer([Section("", texts, figures=figures, layout="pictures")])).encode()
 
 

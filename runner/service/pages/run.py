@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -209,17 +208,17 @@ async def learned(run: RecordedRun, compute: ComputationOf, state: StateParts = 
 @router.get("/config")
 def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     """Show configuration, provenance and log."""
-    log: list[tuple[str, ...]] = []
+    lines: list[tuple[str, ...]] = []
     details = describe_run(run, with_results=False)
     try:
         with open_recording(run.recording) as recording:
-            log = [
+            lines = [
                 (
                     f"{line['log_time'] // schema.STEP_NANOSECONDS:,}",
                     log_level(line["level"]).lower(),
                     line["message"],
                 )
-                for line in deque(recording.table(schema.LOG_TOPIC).decoded(), MAX_LINES)
+                for line in islice(recording.table(schema.LOG_TOPIC).newest(), MAX_LINES)
             ]
     except RecordingError as error:
         details = replace(details, damage=details.damage or str(error))
@@ -236,11 +235,11 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     links = [Link(text, f"/api/v1/runs/{run.run_id}/{path}") for text, path in files.items()]
     if viewer_of(request).can_write and "made_by" not in run.file.config:  # a loop cannot be submitted
         links.insert(0, Link("Submit a variation", f"/submit?from={run.run_id}"))
-    lines = Grid(("step", "level", "message"), log, left=("level", "message"))
+    log = Grid(("step", "level", "message"), lines[::-1], left=("level", "message"))
     sections = [
         Section("", parts=origin, layout="tables"),
         Section("", links=links),
-        Section("Log", grids=[lines]) if log else Section("Log", ["The run logged no texts."]),
+        Section("Log", grids=[log]) if lines else Section("Log", ["The run logged no texts."]),
     ]
     return RunPage(run, "config", "run_config.html", {"setup": sections})
 

@@ -21,6 +21,8 @@ from runner.execution.branching import branch_training
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
 from runner.recording.reader import open_recording
+from runner.recording.record_store import RecordStore
+from runner.recording.schema import LOG_TOPIC
 from runner.runs.resolve import find_run
 from runner.runs.run import RUN_FILE, Run
 from runner.service.processes import ProcessPool
@@ -348,6 +350,20 @@ def test_logged_pictures_are_shown_newest_first_with_their_steps(client, recordi
     assert "/pictures" in page_of(client, "/runs/pictured")
     assert "/pictures" not in page_of(client, "/runs/first")
     assert "No picture was logged" in page_of(client, "/runs/first/pictures")
+
+
+def test_the_end_of_a_log_is_shown_in_its_order_and_only_that_is_read(client, recordings, monkeypatch):
+    texts = [f"line {i:04}" for i in range(2000)]
+    with SummaryWriter("runs/wordy", recordings=recordings, monitor_gym=False) as writer:
+        for step, text in enumerate(texts):
+            writer.add_text("said", text + "." * 2000, step)
+    read = []
+    chunk = RecordStore.chunk
+    monkeypatch.setattr(RecordStore, "chunk", lambda store, entry: read.append(entry) or chunk(store, entry))
+    shown = re.findall(r"line \d{4}", page_of(client, "/runs/wordy/config"))
+    assert shown == texts[-500:]
+    with open_recording(find_run("wordy", recordings).recording) as recording:
+        assert len(read) < len(recording.table(LOG_TOPIC)) / 2
 
 
 def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recordings):
