@@ -37,7 +37,7 @@ AxisName = Annotated[
 
 
 class FigureOptions(BaseModel, frozen=True):
-    """Which metrics are shown, and how."""
+    """Metrics, and how they are drawn."""
 
     metric: tuple[str, ...] = Field(
         (),
@@ -62,7 +62,7 @@ class FigureOptions(BaseModel, frozen=True):
 
 
 class CurveOptions(FigureOptions, frozen=True):
-    """Which curves are shown, and what of them."""
+    """Metrics, axis and range of curves."""
 
     start: float = Field(0, ge=0, allow_inf_nan=False, description="The first position.")
     stop: float | None = Field(

@@ -79,7 +79,7 @@ def branch_part(path: Path, at: str, action: str, start: int, steps: int) -> byt
 
 
 def _compact(part: Json) -> bytes:
-    """Return a part of an episode, whose numbers are finite, as JSON without blanks."""
+    """Return a part of an episode as JSON without blanks; its numbers are finite."""
     return json.dumps(part, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
 
 

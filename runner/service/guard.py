@@ -101,7 +101,7 @@ class Guard:
             )
         is_read = request.method in SAFE_METHODS
         path = request.scope["path"]
-        if not any(path.startswith(each) if each.endswith("/") else path == each for each in OPEN_PATHS):
+        if not any(path.startswith(known) if known.endswith("/") else path == known for known in OPEN_PATHS):
             token = self._token(request)
             request.state.token = token
             if token is not None and not is_read and not token.can_write:

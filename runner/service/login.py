@@ -51,7 +51,7 @@ def logout(request: Request) -> Response:
 
 
 def _local(target: str) -> str:
-    """Return an address if it is a path of this service, or else that of the first page."""
+    """Return an address of this service, or the first page in place of any other address."""
     # Browsers take `//host` and `/\host` for addresses of other sites.
     is_local = target.startswith("/") and not target.startswith(("//", "/\\")) and target.isprintable()
     return target if is_local else "/"

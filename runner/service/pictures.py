@@ -73,13 +73,9 @@ class PictureStream:
         self._made: deque[bytes | str | RunnerError | None] = deque()
         self._arrived = asyncio.Event()
         self._places = threading.Semaphore(AHEAD)
-        self._thread = threading.Thread(target=self._work, args=(make, start), name="pictures", daemon=True)
-        self._thread.start()
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether its thread runs: also a closed one, until the environment has returned."""
-        return self._thread.is_alive()
+        self.thread = threading.Thread(target=self._work, args=(make, start), name="pictures", daemon=True)
+        """Runs until the environment has returned, also after the stream was closed."""
+        self.thread.start()
 
     @property
     def can_continue(self) -> bool:
@@ -90,10 +86,6 @@ class PictureStream:
         """End the thread, and the process of an environment, as soon as possible."""
         self.is_closed = True
         self._places.release()
-
-    def join(self, seconds: float) -> None:
-        """Wait for the thread to end, at most some seconds."""
-        self._thread.join(seconds)
 
     async def block(self, start: int, stop: int, is_gone: Gone) -> Block:
         """Return the pictures from step `start` up to `stop`, as far as there are any.
@@ -173,27 +165,28 @@ class PictureStreams:
         for stream in self._streams:
             stream.close()
         for stream in self._streams:
-            stream.join(_JOIN_SECONDS)
+            stream.thread.join(_JOIN_SECONDS)
 
     def open(self, key: Hashable, make: Make, start: int) -> PictureStream:
-        """Return a stream that has the picture at step `start` before it: one that was kept, or a new one.
+        """Return a kept stream that has not passed step `start`, or a new one.
 
         Raises:
             Busy: there are too many.
         """
-        self._streams = [stream for stream in self._streams if stream.is_alive or stream.can_continue]
-        own = [stream for stream in self._streams if stream.key == key and stream.can_continue]
-        for stream in own:
+        self._streams = [
+            stream for stream in self._streams if stream.thread.is_alive() or stream.can_continue
+        ]
+        for stream in [stream for stream in self._streams if stream.key == key and stream.can_continue]:
             if stream.next <= start:
                 stream.idle_since = None
                 return stream
             self._close(stream)  # it would have to go back
-        alive = [stream for stream in self._streams if stream.is_alive]
-        if len([stream for stream in alive if not stream.is_closed]) >= MAX_STREAMS:
-            continuing = [stream for stream in alive if stream.can_continue]
-            if not continuing:
+        alive = [stream for stream in self._streams if stream.thread.is_alive()]
+        if sum(not stream.is_closed for stream in alive) >= MAX_STREAMS:
+            kept = [stream for stream in alive if stream.can_continue]
+            if not kept:
                 raise Busy(_BUSY)
-            self._close(min(continuing, key=lambda stream: stream.idle_since or 0.0))
+            self._close(min(kept, key=lambda stream: stream.idle_since or 0.0))
         if len(alive) >= 2 * MAX_STREAMS:  # environments that hang
             raise Busy(_BUSY)
         stream = PictureStream(key, make, start)
@@ -228,5 +221,5 @@ class PictureStreams:
 
     def _close(self, stream: PictureStream) -> None:
         stream.close()
-        if not stream.is_alive:
+        if not stream.thread.is_alive():
             self._streams.remove(stream)

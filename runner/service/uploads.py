@@ -1,11 +1,11 @@
 """Uploads: recordings on their way into a recordings folder.
 
-    recordings/.uploads/4f0c…/upload.json    the upload with what its sender says of it; replaced atomically
+    recordings/.uploads/4f0c…/upload.json    the upload, with its sender's facts; replaced atomically
     recordings/.uploads/4f0c…/body           the bytes so far
 
 An upload is received, in pieces and in order. When it has all of its bytes it is verified, by a child
 process; then it is stored, which is one renaming, or refused. A server that was killed continues from these
-folders. One that is stored remains until its sender knows; after that its run answers. Idle ones are dropped.
+folders. A stored upload is kept so that its sender learns the result; an idle upload is dropped.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ FOLDER: Final = ".uploads"
 STATE_FILE: Final = "upload.json"
 BODY_FILE: Final = "body"
 IDLE_SECONDS: Final = 7 * 86_400
-"""An upload whose sender says nothing for so long is dropped."""
+"""An upload is dropped after this time without a request from its sender."""
 VERIFY_SECONDS: Final = 120.0
 VERIFY_BYTES_A_SECOND: Final = 2 << 20
 """The time limit of a verification grows with the size of the upload."""
@@ -60,7 +60,7 @@ Facts = dict[str, Fact | dict[str, Fact | list[str] | list[dict[str, int | Fact 
 
 
 class UploadSource(BaseModel):
-    """What a client says of a file: nothing of it is trusted, and all of it may be unknown yet."""
+    """Unverified facts from the client; every field may still be missing."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
     digest: Digest | None = None
@@ -73,7 +73,7 @@ class UploadSource(BaseModel):
     checkpoint_of: Text = ""
     """The run with a checkpoint of these bytes, if they are not a recording."""
     run: Annotated[Facts, expecting("facts of a run, as `dualtaxi export mcap` stores them")] = {}
-    """What is known of the run besides its recording, as `import_record` returns it."""
+    """Facts of the run that its recording lacks, as `import_record` returns them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,8 +92,8 @@ _STORED: Final = TypeAdapter(Upload)
 class Uploads:
     """The uploads into one recordings folder; thread-safe.
 
-    An upload that is unknown, or another owner's, is a `RunNotFound`. `on_verified` is called with each one
-    that was verified, by another thread.
+    Methods raise `RunNotFound` for an unknown upload, or another owner's. `on_verified` is called with each
+    verified upload, on another thread.
     """
 
     def __init__(
@@ -135,15 +135,15 @@ class Uploads:
         raise RunNotFound("no such upload: it was deleted, is stored, or belongs to another token.")
 
     def put(self, owner: str, upload_id: str, source: UploadSource) -> Upload:
-        """Begin an upload, or continue it with what its sender knows by now; return it.
+        """Begin an upload, or continue it with new facts from its sender; return it.
 
-        It begins again if the file has become shorter. When its run or content is here already, it is stored
-        at once, and nothing of it is kept.
+        It begins again if the file has become shorter. If the server has its run or content already, it
+        counts as stored at once, and its bytes are dropped.
 
         Raises:
             UploadConflict, RunNotFound: another digest was announced, or a run has no such checkpoint.
             UploadTooLarge, TooManyUploads, StorageError: there is no room for it.
-            Busy: it could not be verified, for a reason of the server's own.
+            Busy: the server could not verify it, and will try again.
         """
         with self._lock:
             announced = source.model_dump(include={"run_id", "name", "size"})
@@ -177,14 +177,14 @@ class Uploads:
         return self._proceed(upload)
 
     def append(self, owner: str, upload_id: str, offset: int, data: bytes, more: int = 0) -> Upload:
-        """Append bytes, and return the upload after them. Of bytes that are too many, none is written.
+        """Append bytes, and return the upload. Nothing is written of more bytes than it may have.
 
-        `more` bytes are announced to follow; if there is no room for them, the sender learns it now.
+        `more` bytes are announced to follow; they are refused now if there is no room for them.
 
         Raises:
             UploadConflict: the bytes do not follow those that were received.
             UploadTooLarge: they are more than announced, or than the server accepts.
-            StorageError: the disk is full, apart from the reserve, or fails; what was written stays.
+            StorageError: the disk fails, or has only its reserve left; what was written stays.
         """
         with self._lock:
             upload = self.get(owner, upload_id)
@@ -217,7 +217,7 @@ class Uploads:
         return self._folder / upload.folder / BODY_FILE
 
     def _run_with(self, source: UploadSource, stored_as: str) -> Run | None:
-        """Return the run that has all of these bytes already, or was stored from them; None if none has."""
+        """Return the run that already has these bytes, or was stored from them; None without one."""
         run = run_of_id(source.checkpoint_of or stored_as or source.run_id, self._recordings)
         if not source.checkpoint_of:
             has = run is not None and run.summary.content_digest == source.content_digest is not None
@@ -246,7 +246,7 @@ class Uploads:
         require_room(self._recordings, more, self._limits.spare_bytes)
 
     def _store(self, upload: Upload) -> None:
-        """Write an upload to disk; remove what is not needed any more when it is over."""
+        """Write an upload to disk; once it is over, remove its bytes and its preview."""
         body = self._body(upload)
         try:
             with storage_errors(self._folder):
@@ -260,7 +260,7 @@ class Uploads:
             self._uploads[upload.owner, upload.id] = upload
 
     def _drop_idle(self) -> None:
-        """Drop the uploads whose senders have said nothing for `IDLE_SECONDS`."""
+        """Drop uploads without a request for `IDLE_SECONDS`."""
         for upload in self.all():
             body, changed = self._body(upload), 0.0
             with contextlib.suppress(OSError):
@@ -269,7 +269,7 @@ class Uploads:
                 self.delete(upload.owner, upload.id)
 
     def _proceed(self, upload: Upload) -> Upload:
-        """Verify an upload that is whole, or show what has arrived of a run that is being recorded."""
+        """Verify an upload that is complete, or list the run that is still being recorded."""
         if upload.source.digest is None and upload.state == "receiving":
             run = self._previews.update(upload.id, upload.run_id, self._body(upload))
             return replace(upload, stop_requested=run is not None and run.is_stop_requested)
@@ -286,7 +286,7 @@ class Uploads:
         return upload
 
     def _end(self, upload: Upload, verification: Future[Upload]) -> None:
-        """Store the result of a verification; after a problem of the server's own it can be repeated."""
+        """Store the result of a verification; if the server itself failed, it can be repeated."""
         try:
             upload = verification.result()
         except RunnerError as error:

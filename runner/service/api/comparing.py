@@ -36,14 +36,14 @@ Part = Annotated[str, InPath(max_length=120)]
 
 
 class CurvesOfRuns(CurveOptions, frozen=True):
-    """Which curves of which runs, and what of them."""
+    """Runs, and the options of their curves."""
 
     run: RunNames
     lines: bool = Field(False, description="Include the single runs of each curve.")
 
 
 class FigureOfRuns(FigureOptions, frozen=True):
-    """What a figure shows of which runs."""
+    """Runs, and the options of their figure."""
 
     run: RunNames
 
@@ -79,7 +79,7 @@ async def curves(
     catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[CurvesOfRuns, Query()]
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
-    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
+    paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
     return await compute.json(curves_of, paths, options, options.lines)
 
 
@@ -93,7 +93,7 @@ async def curves_picture(
     catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[FigureOfRuns, Query()]
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
-    paths = [each.recording for each in await run_in_threadpool(found_runs, catalogue, options.run)]
+    paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
     return Response(await compute(figure_of, paths, options), media_type=SVG)
 
 

@@ -95,7 +95,9 @@ def recording(run: RecordedRun, if_none_match: IfNoneMatch = None) -> Response:
 @router.get("/checkpoints", summary="The checkpoints of a loop.")
 def checkpoints(run: RecordedRun) -> CheckpointsResponse:
     """Return the checkpoints in order, with their digests; `here` says whether the content is."""
-    return CheckpointsResponse.model_validate({"checkpoints": [each.as_json() for each in run.checkpoints()]})
+    return CheckpointsResponse.model_validate(
+        {"checkpoints": [checkpoint.as_json() for checkpoint in run.checkpoints()]}
+    )
 
 
 @router.get(
@@ -107,9 +109,9 @@ def checkpoint(
     if_none_match: IfNoneMatch = None,
 ) -> Response:
     """Return the bytes of a checkpoint of this run."""
-    for each in run.checkpoints():
-        if each.digest == digest and each.is_here:
-            return _file(each.path, f"{run.file_stem}-{each.step}.{each.format}", digest, if_none_match)
+    for kept in run.checkpoints():
+        if kept.digest == digest and kept.is_here:
+            return _file(kept.path, f"{run.file_stem}-{kept.step}.{kept.format}", digest, if_none_match)
     raise RunNotFound(f"run {run.run_id} has no checkpoint of the digest {digest[:16]}… here.")
 
 

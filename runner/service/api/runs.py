@@ -73,11 +73,11 @@ async def list_runs(
         )
 
     def make() -> bytes:
-        chosen, order = parse(filter), order_of(sort)
+        condition, order = parse(filter), order_of(sort)
         shown = columns_of(columns) if columns else DEFAULT_JSON
 
         def work(index: CatalogueIndex) -> Json:
-            rows, total = index.page(chosen, *order, limit=limit, offset=offset)
+            rows, total = index.page(condition, *order, limit=limit, offset=offset)
             runs = [row_as_json(row, shown) for row in index.with_same_as(rows)]
             return {"runs": runs, "total": total, "offset": offset, "limit": limit}
 
@@ -158,9 +158,10 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
 )
 def label_run(run: WrittenRun, labels: LabelChanges, catalogue: CatalogueOf) -> dict[str, object]:
     """Change the labels of a run as `dualtaxi label` does, and return them."""
-    now = label(run, labels.name, labels.note, labels.tag, labels.untag)
+    changed = label(run, labels.name, labels.note, labels.tag, labels.untag)
     catalogue.changed()
-    return {"run_id": run.run_id, "name": now.name or run.file.name, "tags": list(now.tags), "note": now.note}
+    name = changed.name or run.file.name
+    return {"run_id": run.run_id, "name": name, "tags": list(changed.tags), "note": changed.note}
 
 
 class MarkSent(BaseModel, extra="forbid"):
@@ -202,7 +203,7 @@ def remove_mark(run: WrittenRun, name: Annotated[str, InPath(max_length=40)]) ->
 
 def marks_of(run: Run) -> dict[str, object]:
     """Return the marks of a run."""
-    return {"run_id": run.run_id, "marks": [each.as_row() for each in run.marks]}
+    return {"run_id": run.run_id, "marks": [mark.as_row() for mark in run.marks]}
 
 
 class StopResponse(BaseModel):

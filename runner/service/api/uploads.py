@@ -39,10 +39,12 @@ def list_uploads(
     uploads: UploadsOf, owner: OwnerOf, state: Annotated[UploadState | None, Query()] = None
 ) -> UploadsResponse:
     """List uploads, the newest first; ids and problems only of one's own."""
-    chosen = [upload for upload in uploads.all() if state in (None, upload.state)]
-    return UploadsResponse(
-        uploads=[each if each.owner == owner else replace(each, id="", problem="") for each in chosen]
-    )
+    listed: list[UploadStatus] = [
+        upload if upload.owner == owner else replace(upload, id="", problem="")
+        for upload in uploads.all()
+        if state in (None, upload.state)
+    ]
+    return UploadsResponse(uploads=listed)
 
 
 @router.put("/{upload_id}", summary="Begin an upload, or continue it; return its state.")

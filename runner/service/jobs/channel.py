@@ -33,7 +33,7 @@ class JobSpec:
 
     @property
     def recordings(self) -> Path:
-        """The recordings folder that the job is of."""
+        """The recordings folder of the job."""
         return self.folder.parents[1]
 
     @property
@@ -42,7 +42,7 @@ class JobSpec:
         return self.job.workers if self.ray is None else None
 
     def values(self) -> dict[str, object]:
-        """Return the configuration, sweep or question, every value present."""
+        """Return the configuration, sweep or question, with every value."""
         return read_values(self.folder)
 
 

@@ -1,6 +1,6 @@
 """Checks of what is submitted, in child processes with limits on time and memory.
 
-A check imports the environment, whose code and memory have no place in the server.
+A check imports the environment; neither its code nor its memory belongs in the server.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def refuse_path(config: ExperimentConfig) -> None:
 
 
 def is_path(name: str) -> bool:
-    """Return whether a name of a run or configuration is that of a file."""
+    """Return whether a run or configuration is named by the path of a file."""
     return "/" in name or "\\" in name or name.endswith((".mcap", ".yaml", ".yml"))
 
 

@@ -77,8 +77,8 @@ class CheckedJob(JobEstimate):
     values: dict[str, object]
     """The configuration, the sweep or the question, every value present."""
     seeds: tuple[int, ...] = ()
-    """The seeds of the runs that it makes one after the other; none of a sweep and an explanation, whose runs
-    are tasks for several workers."""
+    """Seeds of the runs that one worker makes, in order; empty for a sweep or an explanation, whose runs
+    several workers share."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +160,7 @@ class JobStore:
         return job
 
     def is_running(self, number: int) -> bool:
-        """Return whether a job is running; one that was forgotten is not."""
+        """Return whether a job is running, which a forgotten job is not."""
         job = self._jobs.get(number)
         return job is not None and job.state == "running"
 

@@ -39,13 +39,13 @@ for _path, _episode in EPISODES.items():
 
 
 def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
-    """Return the values of the page of an episode and those of the other environments at its first step."""
+    """Return the values of the page: an episode, and the other environments' episodes at its first step."""
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
         shown = at.number_in(recording)
         steps = recording.phase(at.phase).episode(shown)
         turns = steps.table.round_of(steps.first)
-        # Trials are numbered within their evaluation, whose first one this is.
+        # The first trial of the evaluation, within which trials are numbered.
         first = shown - at.episode
         panels = []
         for environment, number in _episodes_at(recording, at.phase, steps, shown)[:MAX_PANELS]:

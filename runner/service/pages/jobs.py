@@ -61,15 +61,15 @@ def queue_status(jobs: JobsOf, number: PageNumber = 1) -> Response:
 def job(jobs: JobsOf, number: Number) -> Response:
     """Show a job: its progress, its log, its runs."""
     events = jobs.store.last_events(number, MAX_LINES)
-    own_job = jobs.store.job(number).status()  # read after its log: the page receives later events
-    is_answered = own_job.kind == "explain" and own_job.is_over
+    status = jobs.store.job(number).status()  # read after its log: the page receives later events
+    is_answered = status.kind == "explain" and status.is_over
     answers = explanations_in(jobs.recordings) if is_answered else []
     values = {
-        "job": own_job,
+        "job": status,
         "log": events,
         "submitted": jobs.store.submitted(number),
-        "seconds": _seconds(own_job),
-        "explanations": [name for name in answers if name.startswith(f"{own_job.name}/")],
+        "seconds": _seconds(status),
+        "explanations": [name for name in answers if name.startswith(f"{status.name}/")],
     }
     return Page("job.html", values)
 
@@ -77,10 +77,10 @@ def job(jobs: JobsOf, number: Number) -> Response:
 @router.get("/{number}/status")
 def job_status(jobs: JobsOf, number: Number, state: StatusName) -> Response:
     """Return the progress and the runs of a job as a part of its page; 204 once it has another state."""
-    own_job = jobs.store.job(number).status()
-    if own_job.state != state:
+    status = jobs.store.job(number).status()
+    if status.state != state:
         return Response(status_code=HTTPStatus.NO_CONTENT)
-    return Page("job_status.html", {"job": own_job})
+    return Page("job_status.html", {"job": status})
 
 
 @router.get("/{number}/log")

@@ -105,7 +105,7 @@ def viewer_of(request: Request) -> Viewer:
 
 @functools.cache
 def templates() -> jinja2.Environment:
-    """Return the templates of pages, and those of reports, whose partial templates they use."""
+    """Return the templates of pages, which use partial templates of reports."""
     environment = environment_of((TEMPLATES, REPORT_TEMPLATES))
     environment.filters |= {
         "size": humanize.size,
@@ -149,5 +149,5 @@ Form = Annotated[dict[str, str], Depends(form_of)]
 
 
 def message_of(error: RunnerError, request: Request) -> str:
-    """Return the message of an error for a page, the same as that of the API."""
+    """Return the message of an error, as in the API."""
     return error_body(error, request.app.state.settings).message

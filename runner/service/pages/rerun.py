@@ -36,7 +36,7 @@ FILES: Final = {"re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "applica
 FRAME_POLICY: Final = POLICY.replace(
     "default-src 'self';", "default-src 'self'; script-src 'self' 'wasm-unsafe-eval';"
 )
-"""This page alone may compile WebAssembly; otherwise its policy is that of all pages."""
+"""The policy of all pages, except that this one may compile WebAssembly."""
 OVERVIEW: Final = "Some training episodes and the last evaluation."
 """Content of the viewer unless it is opened at a step."""
 _FOREVER: Final = "public, max-age=31536000, immutable"

@@ -223,8 +223,8 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     except RecordingError as error:
         details = replace(details, damage=details.damage or str(error))
     origin = [
-        replace(each, facts={name: settings.without_folders(text) for name, text in each.facts.items()})
-        for each in details.origin_sections()
+        replace(section, facts={name: settings.without_folders(text) for name, text in section.facts.items()})
+        for section in details.origin_sections()
     ]
     files = {
         "Download the recording": "recording",

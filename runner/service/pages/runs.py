@@ -137,7 +137,7 @@ def disk(catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response
 def _values(
     catalogue: Catalogue, text: str, sort: str, columns: str, by_name: bool, number: int
 ) -> dict[str, object]:
-    chosen, order = parse(text), order_of(sort)
+    condition, order = parse(text), order_of(sort)
     shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
     is_usual = list(shown) == list(USUAL)
 
@@ -146,7 +146,7 @@ def _values(
         if by_name:
             named, names = index.page_by_name(sort, limit=ROWS, offset=offset)
             return named, names, all_runs, all_runs
-        shown_rows, total = index.page(chosen, *order, limit=ROWS, offset=offset)
+        shown_rows, total = index.page(condition, *order, limit=ROWS, offset=offset)
         return [(row, 1) for row in index.with_same_as(shown_rows)], total, total, all_runs
 
     counted, pages_of, total, all_runs = catalogue.read(work)

@@ -54,7 +54,7 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
                 rows.append((name, message_of(error, request), "", "", ""))
                 continue
             parameters = ", ".join(sweep.file.parameters)
-            runs = f"{_tagged(catalogue, name):,}"
+            runs = f"{_count_runs(catalogue, name):,}"
             rows.append((name, sweep.file.strategy, parameters, sweep.objective.description, runs))
     headings = ("name", "strategy", "parameters", "objective", "runs")
     listed_sweeps = Grid(headings, rows, links=[f"/sweeps/{name}" for name, *_ in rows], left=headings[:4])
@@ -77,15 +77,15 @@ async def sweep(
     waiting = {part: text for part, (_, text) in PARTS.items()}
 
     def show() -> dict[str, object]:
-        own = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
+        sweep_jobs = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
         parameters = [f"config.{path}" for path in read_sweep(name, state.folder).file.parameters]
         columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
-        query = {"filter": f"{json.dumps(tag_of(name))} in tags", "columns": columns}
+        query = {"filter": _filter_of(name), "columns": columns}
         return {
             "name": name,
             "runs": state.runs,
             "runs_address": link("/runs", query),
-            "job": own[-1].status() if own else None,
+            "job": sweep_jobs[-1].status() if sweep_jobs else None,
             "bodies": bodies,
             "waiting": waiting,
         }
@@ -132,8 +132,8 @@ def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Sw
     folder = next((folder for folder in folders if name in sweeps_in(folder)), None)
     if folder is None:
         raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
-    chosen = parse(f"{json.dumps(tag_of(name))} in tags")
-    rows = catalogue.read(lambda index: index.select(chosen))
+    is_of_sweep = parse(_filter_of(name))
+    rows = catalogue.read(lambda index: index.select(is_of_sweep))
     files = sorted(
         (entry.name, facts.st_size, facts.st_mtime_ns)
         for entry in os.scandir(folder_of(name, folder))
@@ -143,9 +143,13 @@ def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Sw
     return _SweepState(name, folder, len(rows), digest)
 
 
-def _tagged(catalogue: Catalogue, name: str) -> int:
-    chosen = parse(f"{json.dumps(tag_of(name))} in tags")
-    return catalogue.read(lambda index: index.count(chosen))
+def _count_runs(catalogue: Catalogue, name: str) -> int:
+    is_of_sweep = parse(_filter_of(name))
+    return catalogue.read(lambda index: index.count(is_of_sweep))
+
+
+def _filter_of(name: str) -> str:
+    return f"{json.dumps(tag_of(name))} in tags"
 
 
 def _key(state: _SweepState, part: str) -> tuple[str, _SweepState]:
