@@ -11,7 +11,6 @@ import click
 
 from runner.cli.command import Declared, argument, option, record
 from runner.cli.parameter_types import (
-    AXIS,
     COUNT,
     DIRECTORY,
     EPISODE,
@@ -104,14 +103,6 @@ checkpoint_option: Final = option(
 policy_option: Final = option(
     "--policy", metavar="MODULE:FUNCTION", help="Your function that makes a policy of a checkpoint."
 )
-axis_option: Final = option(
-    "--axis",
-    type=AXIS,
-    default="episodes",
-    show_default=True,
-    metavar="episodes|steps|updates|time",
-    help="Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.",
-)
 
 
 @record
@@ -133,12 +124,6 @@ def curve_options(
     return CurveStyle(lines, smooth, log_x, log_y)
 
 
-normalise_option: Final = option(
-    "--normalise",
-    type=PATH,
-    metavar="FILE|minmax",
-    help="Compare over environments, by a table of random and expert scores, or the worst and best values.",
-)
 all_option: Final = option("--all", is_flag=True, help="Include everything, not only a selection.")
 episode_option: Final = option(
     "--episode",

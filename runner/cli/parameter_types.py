@@ -18,7 +18,6 @@ from runner.runs.run import recordings_folder
 from runner.util.values import Json, ranges_in, whole_number
 
 if TYPE_CHECKING:
-    from runner.analysis.axes import Axis
     from runner.analysis.episodes import EpisodeRef
 
 
@@ -210,12 +209,6 @@ def _trial(text: str) -> EpisodeRef:
         raise ValueError(text) from None
 
 
-def _axis(text: str) -> Axis:
-    from runner.analysis.axes import axis_of  # loads NumPy
-
-    return axis_of(text)
-
-
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
 FILTER_WORD: Final = ExpressionText(
@@ -236,7 +229,6 @@ PICTURE_SIZE: Final = Parsed(
     "WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", lambda text: "{}x{}".format(*_pair(text, 8192))
 )
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
-AXIS: Final = Parsed("axis", "episodes, steps, updates, time or a logged name", _axis)
 STEP: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _step)
 PATH: Final = click.Path(path_type=Path)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)

@@ -94,6 +94,11 @@ def _declared(given: Input, view: View) -> Declared:
     """Return the argument or option of an input; an argument completes the words that the view lists."""
     if given.required:
         return argument(metavar=given.name.upper(), type=ExpressionText(given.name, view.words))
+    return option_of(given)
+
+
+def option_of(given: Input) -> Declared:
+    """Return the option of an input."""
     flag = f"--{given.name}"
     if given.kind is bool:
         return option(flag, is_flag=True, help=given.help)

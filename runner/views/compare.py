@@ -26,10 +26,20 @@ def check_target(text: str) -> object:
     return parse_target(text)
 
 
-def _axis(text: str) -> object:
-    from runner.analysis.axes import axis_of
-
-    return axis_of(text)
+AXIS: Final = view_input(
+    "axis",
+    "Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.  "
+    "[default: episodes]",
+    default="episodes",
+    metavar="episodes|steps|updates|time",
+)
+NORMALISE: Final = view_input(
+    "normalise",
+    "Compare over environments, by a table of random and expert scores, or the worst and best values.",
+    metavar="FILE|minmax",
+    max_length=MAX_SCORES,
+    is_file=True,
+)
 
 
 def compare(
@@ -52,14 +62,7 @@ def compare(
         metavar="last|best|area|N",
         max_length=20,
     ),
-    axis: str = view_input(
-        "axis",
-        "Read metrics over training episodes, training steps, updates as a loop logged them, or wall time.  "
-        "[default: episodes]",
-        default="episodes",
-        metavar="episodes|steps|updates|time",
-        check=_axis,
-    ),
+    axis: str = AXIS,
     at_step: int | None = view_input(
         "at-step", "Compare after N training steps: --axis steps --moment N.", kind=int, metavar="N"
     ),
@@ -70,13 +73,7 @@ def compare(
         max_length=200,
         check=check_target,
     ),
-    normalise: str | Path | None = view_input(  # noqa: B008
-        "normalise",
-        "Compare over environments, by a table of random and expert scores, or the worst and best values.",
-        metavar="FILE|minmax",
-        max_length=MAX_SCORES,
-        is_file=True,
-    ),
+    normalise: str | Path | None = NORMALISE,
     report: Callable[[str], None] = lambda _: None,
 ) -> AnswerOfRuns:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.

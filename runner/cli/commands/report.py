@@ -11,10 +11,8 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.options import (
     Writing,
-    axis_option,
     compared_argument,
     curve_options,
-    normalise_option,
     recordings_option,
     writing_options,
 )
@@ -22,13 +20,14 @@ from runner.cli.output import Reply, require_page, say, written
 from runner.cli.parameter_types import EPISODE, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded
+from runner.cli.views import option_of
 from runner.export.places import new_file, write_text_new
 from runner.runs.run import recordings_folder
 from runner.sweep import is_sweep
 from runner.util.humanize import counted, sentence, size
+from runner.views.compare import AXIS, NORMALISE
 
 if TYPE_CHECKING:
-    from runner.analysis.axes import Axis
     from runner.analysis.episodes import EpisodeRef
     from runner.analysis.series import RunSeries
     from runner.export.plots.style import CurveStyle
@@ -37,9 +36,9 @@ if TYPE_CHECKING:
 @click.command("plot", cls=Command)
 def plot_command(
     run_names: tuple[str, ...] = compared_argument,
-    axis: Axis = axis_option,
+    axis: str = option_of(AXIS),
     style: CurveStyle = curve_options,
-    normalise: Path | None = normalise_option,
+    normalise: Path | None = option_of(NORMALISE),
     to: Writing = writing_options("exports/plot.png", "FILE.png|svg|pdf"),
     recordings: Path | None = recordings_option,
 ) -> Reply:
@@ -63,6 +62,7 @@ def plot_command(
       dualtaxi plot ppo dqn --axis steps --normalise minmax
       dualtaxi plot hyperparameters -o hyperparameters.png
     """
+    from runner.analysis.axes import axis_of
     from runner.analysis.contents import shortcomings
     from runner.analysis.groups import duplicates, groups_of
     from runner.analysis.panels import panels_of
@@ -83,12 +83,12 @@ def plot_command(
         if normalise is not None:
             raise click.UsageError("--normalise: found a sweep, expected runs.")
         return _plot_sweep(run_names[0], folder, to)
-    series = []
+    series, over = [], axis_of(axis)
     runs = find_all_recorded(run_names, folder)
     with count_line("runs read", len(runs)) as progress:
         for run in runs:
             with open_recording(run.recording) as recording:
-                series.append(read_series(recording, axis))
+                series.append(read_series(recording, over))
                 for shortcoming in shortcomings(recording):
                     say(shortcoming)
             progress(len(series))
@@ -125,11 +125,9 @@ def _plot_tasks(series: list[RunSeries], normalise: Path, to: Writing) -> Reply:
     return written(text, output, groups=len(comparison.algorithms), environments=len(comparison.tasks))
 
 
-def _refuse_style(axis: Axis, style: CurveStyle) -> None:
-    if axis.name != "episodes":
-        raise click.UsageError(
-            f"--axis: found {axis.name}, expected episodes, as sweeps are drawn over them."
-        )
+def _refuse_style(axis: str, style: CurveStyle) -> None:
+    if axis != "episodes":
+        raise click.UsageError(f"--axis: found {axis}, expected episodes, as sweeps are drawn over them.")
     if any(astuple(style)):
         raise click.UsageError("--lines, --smooth, --log-x, --log-y: found a sweep, expected runs.")
 
@@ -169,7 +167,7 @@ def report_command(
         metavar="N:TRIAL",
         help="Also show this trial of the evaluation after N training episodes; may be repeated.",
     ),
-    axis: Axis = axis_option,
+    axis: str = option_of(AXIS),
     style: CurveStyle = curve_options,
     to: Writing = writing_options("exports/report.html", "FILE.html"),
     recordings: Path | None = recordings_option,
@@ -189,6 +187,7 @@ def report_command(
       dualtaxi report hyperparameters -o hyperparameters.html
       dualtaxi report k3v9m2xq --episode 500 --eval 3000:7 --force
     """
+    from runner.analysis.axes import axis_of
     from runner.export.reports.report import render_report
 
     output, folder = to.path(), recordings_folder(recordings)
@@ -200,7 +199,7 @@ def report_command(
         return _report_sweep(run_names[0], folder, to)
     paths = [run.recording for run in find_all_recorded(run_names, folder)]
     with stage_line("reading") as progress:
-        page, notes = render_report(paths, [*episodes, *trials], progress, axis, style)
+        page, notes = render_report(paths, [*episodes, *trials], progress, axis_of(axis), style)
     write_text_new(output, to.force, page)
     for note in notes:
         say(note)
