@@ -100,6 +100,13 @@ def compare(
       dualtaxi compare ppo dqn --normalise scores.csv --metric training.mean_return
       dualtaxi compare cooperative competitive --html comparison.html
     """
+    if at_step is not None:
+        if moment != "last" or axis != "episodes":
+            raise ConfigError(
+                "at-step: it stands for the axis steps and the moment N, so it excludes axis and moment; "
+                "drop it or them."
+            )
+        moment, axis = str(at_step), "steps"
     from runner.analysis.axes import axis_of
     from runner.analysis.compare import compare
     from runner.analysis.compare.moments import moment_of
@@ -113,13 +120,6 @@ def compare(
     from runner.export.reports.compare import render_comparison, render_tasks
 
     require_scipy()
-    if at_step is not None:
-        if moment != "last" or axis != "episodes":
-            raise ConfigError(
-                "at-step: it stands for the axis steps and the moment N, so it excludes axis and moment; "
-                "drop it or them."
-            )
-        moment, axis = str(at_step), "steps"
     over = axis_of(axis)
     read_at, chosen = moment_of(moment, parse_target(target) if target else None, metrics, over)
     report("reading runs")
