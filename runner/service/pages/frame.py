@@ -54,6 +54,8 @@ class RunHead:
     tabs: tuple[tuple[str, str], ...]
     lacking: Mapping[str, str]
     """The tabs that it does not have, and what they need."""
+    steps: str
+    """Which steps it records: `all`, `actions` or `none`."""
 
 
 class RunPage(Page):
@@ -70,7 +72,7 @@ def head_of(run: Run) -> RunHead:
     has_episodes = has_environment(run.file.config)
     has_tables = run.can_train_again or _has_recorded_tables(run)
     is_running_loop = run.status == "running" and not run.can_train_again
-    messages = run.summary.messages
+    messages, packing = run.summary.messages, run.file.config.get("recording")
     met = {
         "": True,
         "checkpoints": bool(messages.get(schema.CHECKPOINT_TOPIC.name)) or is_running_loop,
@@ -102,6 +104,7 @@ def head_of(run: Run) -> RunHead:
             for name, need in needs.items()
             if not met[need] and need in ("tables", "training")
         },
+        steps=str(packing.get("steps", "all")) if isinstance(packing, Mapping) else "all",
     )
 
 

@@ -117,6 +117,20 @@ def test_the_latest_whole_episode_is_sent_until_the_run_is_over(connect, setting
     assert "data-latest" not in client.get("/runs/growing", headers={"Accept": "text/html"}).text
 
 
+@pytest.mark.parametrize("steps", ["actions", "none"])
+def test_the_page_of_a_running_run_says_that_it_records_no_steps(client, recordings, steps):
+    env = runner.record(make("CartPole-v1"), recordings, name=f"without_{steps}", steps=steps)
+    with env:
+        for _ in play(env, 100):
+            pass
+        for address in (f"/runs/{env.run.run_id}", f"/compare?run={env.run.run_id}&run=first"):
+            page = client.get(address, headers={"Accept": "text/html"}).text
+            assert "data-latest" not in page
+            assert "episode has ended yet" not in page
+        page = client.get(f"/runs/{env.run.run_id}", headers={"Accept": "text/html"}).text
+        assert f"does not record its steps (<code>recording.steps: {steps}</code>)" in page
+
+
 def test_two_loops_replay_next_to_each_other(server, browser):
     with (
         runner.record(make("CartPole-v1"), server.url, name="left") as left,
