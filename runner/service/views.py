@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import BaseModel, Field, create_model
+from pydantic import AfterValidator, BaseModel, Field, create_model
+from pydantic_core import PydanticCustomError
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.contents import damage_of
@@ -21,6 +23,7 @@ from runner.service.api.comparing import RunName, RunNames, found_runs
 from runner.service.api.replay import OCTETS
 from runner.service.computed import require_few
 from runner.service.dependencies import CatalogueOf, Computation, ComputationOf, RecordedRun, SettingsOf
+from runner.service.errors import EXPECTED
 from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import filled, media_docs, status_of
 from runner.views import OF_RUNS, VIEWS, view_named
@@ -156,6 +159,8 @@ def _type_of(view: View) -> type[BaseModel]:
 
     def declared(given: Input) -> tuple[Any, Any]:
         kind: Any = Literal[given.values] if given.values else given.kind
+        if given.check is not None:
+            kind = Annotated[kind, AfterValidator(partial(_checked, given.check, given.metavar))]
         if not (given.required or given.multiple or given.default is not None):
             kind |= None
         limits: dict[str, Any] = (
@@ -171,6 +176,15 @@ def _type_of(view: View) -> type[BaseModel]:
     fields: Any = _NAMES.get(view.subject, {}) | {name: declared(each) for name, each in view.inputs.items()}
     made: type[BaseModel] = create_model(view.title, **fields)
     return made
+
+
+def _checked(check: Callable[[str], object], expected: str, text: str) -> str:
+    """Return a text that passes the check of an input."""
+    try:
+        check(text)
+    except RunnerError:
+        raise PydanticCustomError(EXPECTED, "{expected}", {"expected": expected}) from None
+    return text
 
 
 def _form_values(run: Run, view: View) -> dict[str, object]:

@@ -206,6 +206,11 @@ def test_diff_and_compare_equal_the_commands(client, recordings):
     alone = client.get("/api/v1/compare", params={"run": "first"})
     assert alone.status_code == 400
     assert "expected at least two" in alone.json()["error"]["message"]
+    for path, runs in (("diff", {"a": "first", "b": "second"}), ("compare", {"run": ["first", "second"]})):
+        wrong = client.get(f"/api/v1/{path}", params={**runs, "target": "foo"})
+        assert wrong.status_code == 422
+        assert "query.target" in wrong.json()["error"]["message"]
+        assert "found 'foo', expected METRIC=LEVEL" in wrong.json()["error"]["message"]
 
 
 def test_the_recording_is_served_whole_and_in_ranges(client, recordings):
