@@ -192,14 +192,19 @@ def redacted_line(text: str) -> str:
 
 
 def redacted_settings(value: Any, name: str = "") -> Any:
-    """Return settings, as JSON has them, with secrets among their texts replaced by `[redacted]`.
+    """Return settings, as JSON has them, with secrets replaced by `[redacted]`.
 
     As in sources, a mere `key` in a name does not count. Placeholders such as `${TOKEN}` and `<pad>` stay.
+    All parts of a mapping with the name of a secret are secrets. Of numbers, only whole ones are, and not
+    under `token`: `max_tokens` is a setting.
     """
     if isinstance(value, dict):
-        return {key: redacted_settings(part, key) for key, part in value.items()}
+        return {key: redacted_settings(part, f"{name}.{key}" if name else key) for key, part in value.items()}
     if isinstance(value, list):
         return [redacted_settings(part, name) for part in value]
+    if isinstance(value, int) and not isinstance(value, bool):
+        is_secret = _SECRET_SETTING.search(name.lower().replace("token", "")) and not _stays(name, str(value))
+        return REDACTED if is_secret else value
     if not isinstance(value, str):
         return value
     is_secret = _SECRET_SETTING.search(name) and not _stays(name, value)

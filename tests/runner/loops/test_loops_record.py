@@ -458,6 +458,8 @@ def test_secrets_among_the_settings_are_not_recorded(tmp_path):
         "db": {"password": "hunter2", "url": "postgres://user:hunter2@host/db", "PASSWD": "hunter2"},
         "callbacks": [{"auth_token": "hunter2"}],
         "passwords": ["hunter2", "$hunter2", "%hunter2", "{hunter2"],
+        "access_keys": {"production": "hunter2", "others": [{"staging": "hunter2"}], "pin": 86753090001},
+        "password": 4711,
     }
     harmless = {
         "key_dim": 64,
@@ -467,15 +469,21 @@ def test_secrets_among_the_settings_are_not_recorded(tmp_path):
         "special_tokens": ["[PAD]", "<s>"],
         "hf_token": "${HF_TOKEN}",
         "monkey": "see",
+        "keys": {"left": "a", "count": 1_000_000},
+        "secret_key_bits": 4096,
+        "cookies": {"enabled": True, "weight": 0.123456789, "none": None},
     }
     given = json.loads(json.dumps(settings | harmless))
     path, _ = recorded(tmp_path, "CartPole-v1", 3, config=given)
     assert given == settings | harmless
     assert b"hunter2" not in path.read_bytes()
+    assert b"86753090001" not in path.read_bytes()
     assert "hunter2" not in path.with_name("run.json").read_text()
     with open_recording(path) as recording:
         kept = recording.config["config"]
     assert kept["api_key"] == kept["db"]["password"] == kept["callbacks"][0]["auth_token"] == "[redacted]"
     assert kept["passwords"] == ["[redacted]"] * 4
+    assert kept["access_keys"]["others"] == [{"staging": "[redacted]"}]
+    assert kept["access_keys"]["pin"] == kept["password"] == "[redacted]"
     assert kept["db"]["url"] == "postgres://[redacted]@host/db"
     assert {name: kept[name] for name in harmless} == harmless
