@@ -286,7 +286,7 @@ def ranked_episodes(recording: Recording) -> tuple[str, Ints]:
     """
     require_steps(recording, "show", may_redo=True)
     phase = "eval" if recording.eval.episodes.count() else "train"
-    records = recording.phase(phase).episodes.array()
+    records = _ranked_fields(recording, phase)
     records = records[records["last_step"] < recording.phase(phase).steps.total()]
     if not len(records):
         raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
@@ -305,14 +305,26 @@ def ranked(recording: Recording, phase: str, start: int, stop: int) -> list[Epis
     return references(recording, phase, numbers[[0, len(numbers) // 2, -1]])
 
 
-def in_order(records: Records, order: str) -> Ints:
-    """Return the places of episodes in an order, such as `longest` first."""
+def in_order(recording: Recording, phase: str, order: str) -> Ints:
+    """Return the numbers of the episodes of a phase in an order, such as `longest` first."""
+    records = _ranked_fields(recording, phase)
     places = np.arange(len(records))
     if order in ("longest", "shortest"):
         places = np.argsort(records["length"], kind="stable")
     elif order in ("worst", "best"):
         places = _by_rank(records)
-    return places[::-1] if order in ("newest", "longest", "best") else places
+    numbers: Ints = records["episode"][places]
+    return numbers[::-1] if order in ("newest", "longest", "best") else numbers
+
+
+def _ranked_fields(recording: Recording, phase: str) -> Records:
+    """Return the fields of all episodes by which they are ranked."""
+    from numpy.lib.recfunctions import repack_fields  # loads much
+
+    table = recording.phase(phase).episodes
+    fields = ["episode", "success", "length", "returns", "last_step"]
+    blocks = (repack_fields(block[fields]) for block in table.blocks())
+    return np.concatenate([repack_fields(np.empty(0, table.row_dtype)[fields]), *blocks])
 
 
 def _by_rank(records: Records) -> Ints:

@@ -34,7 +34,7 @@ from runner.recording.turns import taken
 from runner.replay.steps import steps_of
 from runner.runs.listing import run_at
 from runner.runs.run import Run
-from runner.util.arrays import Array, leaves
+from runner.util.arrays import Array, Records, leaves
 from runner.util.extras import require
 from runner.util.values import flatten
 
@@ -169,7 +169,11 @@ def episode_columns(
     recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
 ) -> dict[str, Array]:
     """Return the columns of `episodes`, an array each."""
-    records = recording.phase(phase).episodes.array(start, stop)
+    return columns_of_episodes(recording, recording.phase(phase).episodes.array(start, stop))
+
+
+def columns_of_episodes(recording: Recording, records: Records) -> dict[str, Array]:
+    """Return the columns of episodes, an array each."""
     names = records.dtype.names or ()
     plain = [name for name in schema.EPISODE_COLUMNS if name in names and name not in ("returns", "events")]
     columns: dict[str, Array] = {name: records[name].copy() for name in plain}

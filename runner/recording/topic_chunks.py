@@ -122,6 +122,15 @@ class TopicChunks:
         blocks = list(self.blocks(start, stop))
         return np.concatenate(blocks) if blocks else np.empty(0, self.row_dtype)
 
+    def chosen(self, numbers: Ints) -> Records:
+        """Return the messages of these numbers, in their order; they must be there, and have one size."""
+        ascending, order = np.unique(numbers, return_inverse=True)
+        firsts, ends = self.chunk_numbers
+        chunks = np.unique(np.searchsorted(ends, ascending, side="right")).tolist()
+        blocks = (block for k in chunks for block in self.blocks(int(firsts[k]), int(ends[k])))
+        kept = [block[np.isin(block[self._number], ascending)] for block in blocks]
+        return np.concatenate([np.empty(0, self.row_dtype), *kept])[order]
+
     def numbered(self, numbers: range) -> Iterator[Records]:
         """Yield the messages of these numbers in blocks, as `rows` does."""
         if not numbers:

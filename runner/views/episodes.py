@@ -119,15 +119,15 @@ def episodes(
       dualtaxi episodes k3v9m2xq --order longest --stop 10
     """
     from runner.analysis.episodes import in_order, references
-    from runner.analysis.frames import episode_columns
+    from runner.analysis.frames import columns_of_episodes, episode_columns
     from runner.environments.naming import event_in_words
 
     total, rows = recording.phase(phase).episodes.count(), rows_in(start, stop)
     if order == "number":
         columns = episode_columns(recording, phase, min(rows.start, total), min(rows.stop, total))
     else:
-        places = in_order(recording.phase(phase).episodes.array(), order)[rows.start : rows.stop]
-        columns = {name: column[places] for name, column in episode_columns(recording, phase).items()}
+        numbers = in_order(recording, phase, order)[rows.start : rows.stop]
+        columns = columns_of_episodes(recording, recording.phase(phase).episodes.chosen(numbers))
     shown = [name for name in columns if name not in _HIDDEN]
     if recording.environment["penalty_below"] is None:
         shown.remove("penalties")
@@ -136,8 +136,8 @@ def episodes(
         name = f"return.{agent}"
         headings[name] = "return" if len(recording.agents) == 1 else event_in_words(name)
     values = {name: column.tolist() for name, column in columns.items()}
-    numbers = references(recording, phase, values["episode"])
-    return EpisodeRows(recording.run_id, phase, order, rows.start, total, values, numbers, headings)
+    at = references(recording, phase, values["episode"])
+    return EpisodeRows(recording.run_id, phase, order, rows.start, total, values, at, headings)
 
 
 VIEW: Final = View(
