@@ -12,8 +12,7 @@ from typing import BinaryIO, NotRequired, TypedDict
 
 import numpy as np
 
-from runner.analysis.episodes import EpisodeRef
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Answer, Grid, Section
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
 from runner.errors import ConfigError, NotInRecording
@@ -72,14 +71,12 @@ class TablesDescription(TypedDict):
 
 
 @dataclass(frozen=True, eq=False)
-class QTables:
+class QTables(Answer):
     """The Q-tables at a step."""
 
     description: TablesDescription
     array: Floats
     """As `one_array` returns them."""
-
-    step_to_look_at: EpisodeRef | None = None
 
     def as_json(self) -> Json:
         """Return the description of the tables."""

@@ -1,4 +1,4 @@
-"""Sections of sentences and tables, from which text, Markdown and pages are rendered."""
+"""Answers, and the sections of sentences and tables from which their text and pages are rendered."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
+
+from runner.errors import ExitCode
+
+if TYPE_CHECKING:
+    from runner.util.values import Json
 
 _NUMBERS: Final = re.compile(
     r"(?<![\w.])[-+]?[\d,]*\.?\d+(e[-+]?\d+)?(?![\w.])|\b(to|never|inf|nan)\b|[][() %,/:;–]"
@@ -198,6 +203,36 @@ class Section:
     def said(self) -> list[str]:
         """The sentences of the text form."""
         return [*self.sentences, *([NOT_DRAWN] if self.figures and not self.layout else [])]
+
+
+class Answer:
+    """The answer to a question about recorded runs; what it is derived from declares the rest."""
+
+    exit_code: int = ExitCode.OK
+    limits: Sequence[str] = ()
+    """What limits the answer, in sentences that are said where a page stands for the text."""
+    contents: str = ""
+    """What the page has, in a few words."""
+
+    @property
+    def step_to_look_at(self) -> object:
+        """The reference of the step to look at next; None if there is none."""
+        return None
+
+    def as_json(self) -> Json:
+        """Return the answer as JSON can hold it."""
+        raise NotImplementedError
+
+    def sections(self) -> Iterable[Section]:
+        """Return what people see of the answer."""
+        raise NotImplementedError
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the answer as the file that its view offers."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return html([*self.sections()])
 
 
 def markdown(sections: Sequence[Section]) -> Iterator[str]:

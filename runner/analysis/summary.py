@@ -19,7 +19,7 @@ from runner.analysis.evaluations import (
     loop_summary,
     training_records,
 )
-from runner.analysis.sections import Grid, Section, html
+from runner.analysis.sections import Answer, Grid, Section
 from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -83,7 +83,7 @@ class RecordedExtras:
 
 
 @dataclass(frozen=True)
-class RunDetails:
+class RunDetails(Answer):
     """All about a run; if its recording is missing or unreadable, only the contents of `run.json`."""
 
     run: Run
@@ -193,9 +193,6 @@ class RunDetails:
             rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in self.run.marks]
             results.append(Section("Marks", grids=[Grid(("step", "text", "tags"), rows)]))
         return [each for each in results if each.facts or each.grids or each.sentences]
-
-    def _repr_html_(self) -> str:
-        return html(self.sections())
 
     def origin_sections(self) -> list[Section]:
         """Return what identifies the run, its configuration and its provenance."""

@@ -4,83 +4,93 @@ from __future__ import annotations
 
 import io
 import sys
-from collections.abc import Iterator
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from runner.analysis.sections import Answer
 from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import force_option, html_option
-from runner.cli.output import Part, Reply, files_written, path_and_size, require_page
+from runner.cli.output import Part, Reply, files_written, path_and_size, require_page, say
 from runner.cli.parameter_types import FILE, INDEX, PATH, ExpressionText, Parsed
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import all_recorded_runs, compilation_notice, recorded_run, two_recorded_runs
 from runner.export.places import new_file, require_new
 from runner.runs.run import Run, command_for
 from runner.util.humanize import size
-from runner.views.view import Answer, Input, View
+from runner.views.view import PAGE, Input, Progress, View
+
+if TYPE_CHECKING:
+    from runner.recording.reader import Recording
 
 _STDOUT: Final = Path("-")
-_SUBJECTS: Final = {"pair": two_recorded_runs, "runs": all_recorded_runs}
-"""What several runs are named by."""
+_PROGRESS: Final = Progress(stage_line, steps_line)
+
+
+@contextmanager
+def _recording(run: Run) -> Iterator[Recording]:
+    """Open the recording of a run, and name its damage in the end."""
+    from runner.analysis.contents import damage_of
+    from runner.recording.reader import open_recording
+
+    with open_recording(run.recording) as recording:
+        yield recording
+        if damage := damage_of(run, recording):
+            say(damage)
+
+
+_SUBJECTS: Final[dict[str, tuple[Declared, Callable[..., AbstractContextManager[Any]]]]] = {
+    "recording": (recorded_run, _recording),
+    "run": (recorded_run, nullcontext),
+    "pair": (two_recorded_runs, nullcontext),
+    "runs": (all_recorded_runs, nullcontext),
+}
+"""The subject of a view -> what its command names, and how that is opened."""
 
 
 def command_of(view: View) -> Command:
     """Return the command of a view."""
+    named, opened = _SUBJECTS[view.subject]
+    is_page = view.file_ending == PAGE
 
     def call(
-        subject: Any,
-        output: Path | None = None,
-        force: bool = False,
-        **values: object,
-    ) -> Reply:
+        subject: Any, output: Path | None = None, force: bool = False, **values: object
+    ) -> Iterator[Reply]:
         if output not in (None, _STDOUT):
-            (require_page if view.is_of_runs else require_new)(output, force)
-        from runner.analysis.contents import damage_of
-        from runner.recording.reader import Recording, open_recording
-
-        line = steps_line if view.counts_steps else stage_line
-        is_recording = view.subject == "recording"
-        opened = open_recording(subject.recording) if is_recording else nullcontext(subject)
-        notes: list[str] = []
-        with compilation_notice(), line(view.stage) as report, opened as content:
-            reported = {"report": report} if view.counts_steps or view.is_of_runs else {}
-            answer = view.compute(content, **values, **reported)
-            if isinstance(content, Recording) and (damage := damage_of(subject, content)):
-                notes.append(damage)
-            if output not in (None, _STDOUT):
-                with new_file(output, force) as temporary, temporary.open("wb") as stream:
+            (require_page if is_page else require_new)(output, force)
+        if view.shows_progress:
+            values["progress"] = _PROGRESS
+        with compilation_notice(), opened(subject) as content:
+            with nullcontext() if view.shows_progress else stage_line("reading"):
+                answer = view.compute(content, **values)
+            if output == _STDOUT:
+                file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
+                answer.write(file)
+                text = [file.getvalue().decode(errors="replace")] if sys.stdout.isatty() else ()
+                if not text:
+                    sys.stdout.buffer.write(file.getvalue())
+                yield Reply((), text, exit_code=answer.exit_code)
+                return
+            data, page, notes = answer.as_json(), "", []
+            if output is not None:
+                with stage_line("writing"), new_file(output, force) as path, path.open("wb") as stream:
                     answer.write(stream)
-        exit_code = answer.exit_code if view.is_of_runs else 0
-        if output == _STDOUT:
-            file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
-            answer.write(file)
-            if sys.stdout.isatty():
-                return Reply((), [file.getvalue().decode(errors="replace")], exit_code=exit_code)
-            sys.stdout.buffer.write(file.getvalue())
-            return Reply((), exit_code=exit_code)
-        data, page = answer.as_json(), ""
-        if output is not None:
-            data |= {"files": files_written(output)}
-            if view.is_of_runs:
-                page = f"{output}: {answer.contents or size(output.stat().st_size)}"
-                notes = [f"Note: {note}." for note in answer.notes]
-            else:
-                notes.append(path_and_size(output))
-        return Reply(data, _text(subject, answer), page=page, notes=notes, exit_code=exit_code)
+                data |= {"files": files_written(output)}
+                if is_page:
+                    page = f"{output}: {answer.contents or size(output.stat().st_size)}"
+                    notes = [f"Note: {limit}." for limit in answer.limits]
+                else:
+                    notes = [path_and_size(output)]
+            yield Reply(data, _text(subject, answer), page=page, notes=notes, exit_code=answer.exit_code)
 
-    declared = {
-        "subject": _SUBJECTS.get(view.subject, recorded_run),
-        **{name: _declared(each, view) for name, each in view.inputs.items()},
-    }
+    declared = {"subject": named, **{name: _declared(each, view) for name, each in view.inputs.items()}}
     if view.file_ending:
-        help_text = f"{view.file_help} FILE `-` is stdout."
-        output = option("-o", "--output", type=FILE, metavar=f"FILE{view.file_ending}", help=help_text)
-        declared |= {"output": output, "force": force_option}
-    if view.is_of_runs:
-        declared |= {"output": html_option, "force": force_option}
+        help_text, metavar = f"{view.file_help} FILE `-` is stdout.", f"FILE{view.file_ending}"
+        output = option("-o", "--output", type=FILE, metavar=metavar, help=help_text)
+        declared |= {"output": html_option if is_page else output, "force": force_option}
     return Command(view.name, call, declared, help=view.help)
 
 

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.contents import END_WORDS
-from runner.analysis.sections import Figure, Grid, Section, html
+from runner.analysis.sections import Answer, Figure, Grid, Section
 from runner.drawing import svg, svg_maps
 from runner.drawing.palette import ink_on, ramp_colour
 from runner.environments.mdp import Mdp
@@ -63,7 +63,7 @@ class ActionOutcome(Outcome):
 
 
 @dataclass(frozen=True, eq=False)
-class WhatIf:
+class WhatIf(Answer):
     """The actions at a step of an episode, and where each leads."""
 
     run_id: str
@@ -215,9 +215,6 @@ class WhatIf:
             Section("", list(map(sentence, self.notes)), figures=figures, layout="split matrix"),
             Section("Where each action leads", [_OF_TABLE], [grid]),
         ]
-
-    def _repr_html_(self) -> str:
-        return html(self.sections())
 
 
 def _short(value: float) -> str:

@@ -7,7 +7,7 @@ from html import escape
 from typing import Final
 
 from runner.analysis.episodes import EpisodeRef
-from runner.analysis.sections import Figure, Grid, Section
+from runner.analysis.sections import Answer, Figure, Grid, Section
 from runner.drawing.svg_moves import Move
 from runner.environments.naming import spoken
 from runner.errors import MissingExtra
@@ -82,7 +82,7 @@ class StepPart(ValuePart):
 
 
 @dataclass(frozen=True)
-class Why:
+class Why(Answer):
     """A Q-value as a sum."""
 
     run_id: str

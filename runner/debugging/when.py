@@ -19,7 +19,7 @@ import numpy as np
 
 from runner.analysis.contents import require_steps
 from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, StepLike, training_step
-from runner.analysis.sections import Grid, Link, Section, html
+from runner.analysis.sections import Answer, Grid, Link, Section
 from runner.archive.places import opened
 from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
 from runner.debugging.quantities import JobColumns, check_lost
@@ -77,7 +77,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class When:
+class When(Answer):
     """When an expression held."""
 
     run_id: str
@@ -147,9 +147,6 @@ class When:
                 sentences.append(f"The first {len(self.intervals):,} intervals are listed.")
         links = [Link("Replay this step", moment.at.replay)]
         return [Section(self.expression, sentences, grids, links=links)]
-
-    def _repr_html_(self) -> str:
-        return html(self.sections())
 
 
 def when(

@@ -19,6 +19,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import histograms
+from runner.analysis.sections import Answer
 from runner.archive.places import default_target
 from runner.errors import RunnerError
 from runner.export.encoder import FORMATS
@@ -35,7 +36,7 @@ from runner.runs.run import Run
 from runner.service.errors import Refused
 from runner.util.extras import require
 from runner.util.values import finite
-from runner.views.view import Answer, FileAnswer, Given
+from runner.views.view import Given
 
 MAX_ROWS: Final = 1000
 """The most rows of a query, and the most episodes of a search."""
@@ -80,7 +81,7 @@ def answer(subject: Path | Sequence[Run], question: Callable[..., Answer], value
         return as_json(question(content, **dict(values)).as_json())
 
 
-def answer_file(path: Path, question: Callable[..., FileAnswer], values: Given) -> bytes:
+def answer_file(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
     """Return the file of the answer to a question about a recording."""
     with open_recording(path) as recording, io.BytesIO() as stream:
         question(recording, **dict(values)).write(stream)

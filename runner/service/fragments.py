@@ -20,7 +20,7 @@ from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.sections import made_sections, summary
 from runner.analysis.episodes import TYPICAL, EpisodeRef, StepLike
 from runner.analysis.histograms import histograms
-from runner.analysis.sections import Figure, Link, Section
+from runner.analysis.sections import Answer, Figure, Link, Section
 from runner.analysis.series import series_of
 from runner.analysis.summary import random_policy_sentence
 from runner.debugging.what_if import branch_playback, what_if
@@ -45,7 +45,7 @@ from runner.runs.run import Run
 from runner.service.addresses import link, places_in
 from runner.service.computed import as_json
 from runner.util.values import Json
-from runner.views.view import Answer, Given
+from runner.views.view import Given
 
 MAX_PICTURES: Final = 48
 """Logged pictures that a page shows, of `MAX_PICTURE_BYTES` together."""

@@ -27,11 +27,21 @@ from runner.views.view import View
 
 VIEWS: Final = {
     module.VIEW.name: module.VIEW
-    for module in (episodes, evaluations, qtable, when, why, checkpoints, system, console, code)
+    for module in (
+        episodes,
+        evaluations,
+        qtable,
+        when,
+        why,
+        checkpoints,
+        system,
+        console,
+        code,
+        diff,
+        compare,
+    )
 }
-"""Name of a view of one run -> the view, in the order of tabs."""
-OF_RUNS: Final = {module.VIEW.name: module.VIEW for module in (diff, compare)}
-"""Name of a view of several runs -> the view."""
+"""Name of a view -> the view; those of one run in the order of their tabs."""
 
 
 @cache  # reading the metadata of all packages takes 0.1 s
@@ -41,5 +51,4 @@ def view_named(name: str) -> View:
     Raises:
         RunnerError: it cannot be imported.
     """
-    shipped = VIEWS | OF_RUNS
-    return shipped[name] if name in shipped else plugins.load_plugin(plugins.VIEWS, name, View)
+    return VIEWS[name] if name in VIEWS else plugins.load_plugin(plugins.VIEWS, name, View)

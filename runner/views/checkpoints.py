@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Answer, Grid, Section
 from runner.util.humanize import counted, size
 from runner.views.view import View
 
@@ -19,12 +19,11 @@ _HEADINGS: Final = ("checkpoint", "phase", "last episode", "format", "size", "di
 
 
 @dataclass(frozen=True)
-class CheckpointRows:
+class CheckpointRows(Answer):
     """The checkpoints of a run, in order."""
 
     run_id: str
     checkpoints: Sequence[Checkpoint]
-    step_to_look_at = None
 
     def as_json(self) -> Json:
         """Return the checkpoints."""
@@ -68,7 +67,6 @@ VIEW: Final = View(
     "checkpoints",
     "Checkpoints",
     checkpoints,
-    counts_steps=False,
     has_default=True,
     needs="checkpoints",
     subject="run",

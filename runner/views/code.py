@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, BinaryIO, Final
 
-from runner.analysis.sections import Section, SourceFile
+from runner.analysis.sections import Answer, Section, SourceFile
 from runner.errors import RecordingError
 from runner.util.humanize import counted
 from runner.views.view import View
@@ -35,7 +35,7 @@ _NOTHING: Final = "The code of this run was not recorded."
 
 
 @dataclass(frozen=True)
-class RunCode:
+class RunCode(Answer):
     """The code of a run, and the facts of its provenance that are about code."""
 
     facts: Mapping[str, str]
@@ -44,7 +44,6 @@ class RunCode:
     code: Code
     problem: str
     """Why the files cannot be read; empty if they can."""
-    step_to_look_at = None
 
     def as_json(self) -> Json:
         """Return the facts, the text of each file, those that the commit does not have, and the changes."""
@@ -122,7 +121,6 @@ VIEW: Final = View(
     "code",
     "Code",
     code,
-    counts_steps=False,
     has_default=True,
     file_ending=".patch",
     file_help="Write a patch for `git apply` that makes this code of the commit.",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import ConfigError
 from runner.util.humanize import counted
-from runner.views.view import AnswerOfRuns, View, view_input
+from runner.views.view import NO_PROGRESS, PAGE, AnswerOfRuns, Progress, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -74,7 +74,7 @@ def compare(
         check=check_target,
     ),
     normalise: str | Path | None = NORMALISE,
-    report: Callable[[str], None] = lambda _: None,
+    progress: Progress = NO_PROGRESS,
 ) -> AnswerOfRuns:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 
@@ -122,21 +122,21 @@ def compare(
     require_scipy()
     over = axis_of(axis)
     read_at, chosen = moment_of(moment, parse_target(target) if target else None, metrics, over)
-    report("reading runs")
-    series = series_of((run.recording for run in runs), over, chosen)
-    report("computing intervals")
-    if normalise is not None:
-        tasks = compare_algorithms(series, scores_of(normalise), by, chosen, read_at)
-        contents = f"{len(tasks.algorithms)} groups in {len(tasks.tasks)} environments"
-        page = partial(render_tasks, tasks)
-        return AnswerOfRuns(asdict(tasks), task_sections(tasks), page, contents, tasks.notes)
-    groups, notes = grouped(series, by)
-    require_two(groups, by)
-    compared = compare(groups, metrics_of(groups, chosen), read_at, notes)
+    with progress.stage("reading runs") as report:
+        series = series_of((run.recording for run in runs), over, chosen)
+        report("computing intervals")
+        if normalise is not None:
+            tasks = compare_algorithms(series, scores_of(normalise), by, chosen, read_at)
+            contents = f"{len(tasks.algorithms)} groups in {len(tasks.tasks)} environments"
+            page = partial(render_tasks, tasks)
+            return AnswerOfRuns(asdict(tasks), task_sections(tasks), page, contents, tasks.notes)
+        groups, notes = grouped(series, by)
+        require_two(groups, by)
+        compared = compare(groups, metrics_of(groups, chosen), read_at, notes)
     count = sum(len(group.runs) for group in groups)
     contents = f"{counted(len(compared.metrics), 'metric')} of {count} runs in {len(groups)} groups"
     page = partial(render_comparison, compared, groups)
     return AnswerOfRuns(asdict(compared), sections(compared), page, contents, compared.notes)
 
 
-VIEW: Final = View("compare", "Compare", compare, subject="runs", stage="reading runs", counts_steps=False)
+VIEW: Final = View("compare", "Compare", compare, subject="runs", file_ending=PAGE)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Final
 
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Answer, Grid, Section
 from runner.util.humanize import counted, duration
 from runner.views.view import View, view_input
 
@@ -23,13 +23,12 @@ _NONE: Final = (
 
 
 @dataclass(frozen=True)
-class Output:
+class Output(Answer):
     """The last lines of output, of those found."""
 
     lines: list[ConsoleLine]
     found: int
     total: int
-    step_to_look_at = None
 
     def as_json(self) -> Json:
         """Return the lines and their numbers."""
@@ -99,7 +98,6 @@ VIEW: Final = View(
     "Console",
     console,
     button="Search",
-    counts_steps=False,
     has_default=True,
     is_live=True,
 )

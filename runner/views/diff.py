@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import ExitCode
 from runner.views.compare import check_target
-from runner.views.view import AnswerOfRuns, View, view_input
+from runner.views.view import NO_PROGRESS, PAGE, AnswerOfRuns, Progress, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -39,7 +39,7 @@ def diff(
         max_length=20,
         check=check_target,
     ),
-    report: Callable[[str], None] = lambda _: None,
+    progress: Progress = NO_PROGRESS,
 ) -> AnswerOfRuns:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
@@ -59,11 +59,14 @@ def diff(
     a, b = runs
 
     def page() -> str:
-        report("drawing the page")
         with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
             return render_diff(difference, ours, theirs)
 
-    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+    with (
+        progress.stage("comparing"),
+        open_recording(a.recording) as ours,
+        open_recording(b.recording) as theirs,
+    ):
         difference = differences.diff(ours, theirs, dict(map(parse_target, targets)), first)
     difference = difference if first else differences.with_seconds(difference, a, b)
     difference = differences.without_ignored(difference, ignore, everything)
@@ -75,4 +78,4 @@ def diff(
     )
 
 
-VIEW: Final = View("diff", "Difference", diff, subject="pair", stage="comparing", counts_steps=False)
+VIEW: Final = View("diff", "Difference", diff, subject="pair", file_ending=PAGE)

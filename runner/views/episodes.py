@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.analysis.sections import Grid, Paging, Section
+from runner.analysis.sections import Answer, Grid, Paging, Section
 from runner.util.humanize import counted, number_column
 from runner.views.view import START, STOP, View, rows_in, view_input
 
@@ -42,7 +42,7 @@ _ORDER: Final = view_input(
 
 
 @dataclass(frozen=True)
-class EpisodeRows:
+class EpisodeRows(Answer):
     """Some episodes of a phase."""
 
     run_id: str
@@ -55,7 +55,6 @@ class EpisodeRows:
     references: Sequence[EpisodeRef]
     headings: dict[str, str]
     """Heading of each column of the table."""
-    step_to_look_at = None
 
     def as_json(self) -> Json:
         """Return a list for each column."""
@@ -145,7 +144,6 @@ VIEW: Final = View(
     "Episodes",
     episodes,
     button="Show",
-    counts_steps=False,
     has_default=True,
     is_live=True,
     needs="episodes",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.analysis.sections import Paging, Section
+from runner.analysis.sections import Answer, Paging, Section
 from runner.views.view import START, STOP, View, rows_in
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ _ROWS: Final = 500
 
 
 @dataclass(frozen=True)
-class EvaluationRows:
+class EvaluationRows(Answer):
     """Some evaluations of a run."""
 
     run_id: str
@@ -27,7 +27,6 @@ class EvaluationRows:
     """Number of all evaluations."""
     records: Sequence[EvaluationRecord]
     table: Section
-    step_to_look_at = None
 
     def as_json(self) -> Json:
         """Return the evaluations, and how many there are."""
@@ -71,7 +70,6 @@ VIEW: Final = View(
     "Evaluations",
     evaluations,
     page_values=(("newest_first", True),),
-    counts_steps=False,
     has_default=True,
     is_live=True,
     needs="episodes",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import View, view_input
+from runner.views.view import NO_PROGRESS, Progress, View, view_input
 
 if TYPE_CHECKING:
     from runner.analysis.qtable import QTables
@@ -40,6 +40,7 @@ def qtable(
         label="State",
         placeholder="number or name",
     ),
+    progress: Progress = NO_PROGRESS,
 ) -> QTables:
     """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 
@@ -57,7 +58,8 @@ def qtable(
     """
     from runner.analysis.qtable import tables_of
 
-    return tables_of(recording, step, episode, state)
+    with progress.stage("replaying recorded steps"):
+        return tables_of(recording, step, episode, state)
 
 
 VIEW: Final = View(
@@ -65,9 +67,7 @@ VIEW: Final = View(
     "Q-table",
     qtable,
     button="Show the table",
-    stage="replaying recorded steps",
     needs="tables",
-    counts_steps=False,
     has_default=True,
     file_ending=".npy",
     file_help="Write the whole table: float64 [states, actions], of several agents [agents, states, "

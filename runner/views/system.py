@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from runner.analysis.sections import Section
+from runner.analysis.sections import Answer, Section
 from runner.views.view import View
 
 if TYPE_CHECKING:
@@ -16,12 +16,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class MachineUse:
+class MachineUse(Answer):
     """The clock of a run, and samples of what it used of its machine; None where they were not recorded."""
 
     clock: Clock | None
     host: HostMetrics | None
-    step_to_look_at = None
 
     def as_json(self) -> Json:
         """Return seconds, steps a second, and the largest use of memory in bytes, if known."""
@@ -63,4 +62,4 @@ def system(recording: Recording) -> MachineUse:
     return MachineUse(clock, read_host(recording, clock))
 
 
-VIEW: Final = View("system", "System", system, counts_steps=False, has_default=True, is_live=True)
+VIEW: Final = View("system", "System", system, has_default=True, is_live=True)

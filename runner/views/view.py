@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal
 
+from runner.analysis.sections import Answer, Section
 from runner.errors import ConfigError, ExitCode
 
 if TYPE_CHECKING:
-    from runner.analysis.episodes import EpisodeRef
-    from runner.analysis.sections import Section
     from runner.recording.reader import Recording
     from runner.util.values import Json
 
@@ -22,48 +22,48 @@ Given = tuple[tuple[str, object], ...]
 """Inputs of a view by the name of their parameter."""
 
 
-class Answer(Protocol):
-    """What the function of a view returns."""
-
-    @property
-    def step_to_look_at(self) -> EpisodeRef | None:
-        """The step to look at next; None if the answer has none."""
-
-    def as_json(self) -> Json:
-        """Return the answer as JSON can hold it."""
-
-    def sections(self) -> list[Section]:
-        """Return what people see of the answer."""
+PAGE: Final = ".html"
+"""Ending of a file that has all that the text has."""
+Lines = Callable[..., AbstractContextManager[Callable[..., None]]]
+"""Takes what is being done; shows until it is left how far that is, and yields a function to report it."""
 
 
-class FileAnswer(Answer, Protocol):
-    """An answer that can be written as a file, too."""
-
-    def write(self, stream: BinaryIO) -> None:
-        """Write the file."""
+@contextmanager
+def _nothing(_: str) -> Iterator[Callable[..., None]]:
+    yield lambda _: None
 
 
 @dataclass(frozen=True)
-class AnswerOfRuns:
-    """The answer to a question about several runs."""
+class Progress:
+    """What shows the progress of a computation: a command, else nothing."""
+
+    stage: Lines = _nothing
+    """The function takes the next stage."""
+    steps: Lines = _nothing
+    """The function takes the number of steps done."""
+
+
+NO_PROGRESS: Final = Progress()
+
+
+@dataclass(frozen=True)
+class AnswerOfRuns(Answer):
+    """The answer to a question about several runs, with a page."""
 
     data: Json
     text: list[Section]
     page: Callable[[], str]
     """Returns the answer with pictures, as an HTML page of its own."""
     contents: str = ""
-    """What the command says of the page; its size if empty."""
-    notes: Sequence[str] = ()
-    """What limits the answer: the command says it where the page stands for the text."""
+    limits: Sequence[str] = ()
     exit_code: int = ExitCode.OK
-    step_to_look_at = None
 
     def as_json(self) -> Json:
-        """Return the answer as JSON can hold it."""
+        """Return the data."""
         return self.data
 
     def sections(self) -> list[Section]:
-        """Return what people see of the answer."""
+        """Return the text."""
         return self.text
 
     def write(self, stream: BinaryIO) -> None:
@@ -138,11 +138,10 @@ class View:
     """Name of the command, and last part of the addresses of route and page."""
     title: str
     compute: Callable[..., Any]
-    """Takes the subject, the inputs and `report`, called with the steps done; returns an `Answer`."""
+    """Takes the subject, the inputs and, if it is slow, `progress`; returns an `Answer`."""
     subject: Literal["recording", "run", "pair", "runs"] = "recording"
     """What the function takes first: a recording; or the run, to read files stored next to it, with answers
-    that are not cached and have no API route, as they hold paths; or a list of two or more runs, with an
-    `AnswerOfRuns` and no page."""
+    that are not cached and have no API route, as they hold paths; or a list of two or more runs."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
@@ -151,10 +150,6 @@ class View:
     """Title of the list of the help that the page shows; empty if it shows none."""
     page_values: Given = ()
     """Arguments of the function that a page gives instead of a person."""
-    stage: str = "reading"
-    """What the command says that it does."""
-    counts_steps: bool = True
-    """Whether `report` is called with steps; with several runs, it is called with the next stage."""
     needs: Literal["", "checkpoints", "episodes", "tables", "training"] = ""
     """What a run needs for a tab of this page: checkpoints, an environment, Q-tables, or a training that
     the runner can repeat."""
@@ -165,8 +160,9 @@ class View:
     has_default: bool = False
     """Whether the page has an answer before anything is asked."""
     file_ending: str = ""
-    """Ending of the file that the answer, a `FileAnswer`, is written as; `file_help` says what is in it."""
+    """Ending of the file that the answer can be written as, such as `PAGE`; empty if there is none."""
     file_help: str = ""
+    """What is in the file, unless it is a page."""
     exclusive_spool: bool = False
     """Whether the function writes large temporary files, so that one computation runs at a time."""
     refusal: Callable[[Recording], str] | None = None
@@ -175,13 +171,21 @@ class View:
     @cached_property
     def inputs(self) -> Mapping[str, Input]:
         """The inputs, by the name of their parameter."""
-        declared = inspect.signature(self.compute).parameters.values()
-        return {each.name: each.default for each in declared if isinstance(each.default, Input)}
+        return {name: each for name, each in self._defaults.items() if isinstance(each, Input)}
 
     @property
-    def is_of_runs(self) -> bool:
-        """Whether it is about several runs."""
-        return self.subject in ("pair", "runs")
+    def shows_progress(self) -> bool:
+        """Whether the function shows its progress."""
+        return "progress" in self._defaults
+
+    @property
+    def has_tab(self) -> bool:
+        """Whether it is a tab on the pages of a run."""
+        return self.subject in ("recording", "run")
+
+    @cached_property
+    def _defaults(self) -> dict[str, object]:
+        return {each.name: each.default for each in inspect.signature(self.compute).parameters.values()}
 
     @property
     def help(self) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import View, view_input
+from runner.views.view import NO_PROGRESS, Progress, View, view_input
 
 if TYPE_CHECKING:
     from runner.debugging.when import When
@@ -47,7 +46,7 @@ def when(
         label="To step",
         placeholder="the last",
     ),
-    report: Callable[[int], None] = lambda _: None,
+    progress: Progress = NO_PROGRESS,
     **limits: int,
 ) -> When:
     """Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.
@@ -76,7 +75,8 @@ def when(
     """
     from runner.debugging.when import when
 
-    return when(recording, expression, every=every, first=first, last=last, report=report, **limits)
+    with progress.steps("searched") as report:
+        return when(recording, expression, every=every, first=first, last=last, report=report, **limits)
 
 
 VIEW: Final = View(
@@ -86,7 +86,6 @@ VIEW: Final = View(
     button="Find the first step",
     lead="The expression is evaluated after every training step. S and A are a state and an action, by "
     "number or by name; a step is EPISODE:T, or step:N by its number in training.",
-    stage="searched",
     needs="training",
     list_title="What an expression may contain",
     page_values=(("limit", _INTERVALS),),

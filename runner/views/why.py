@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import View, view_input
+from runner.views.view import NO_PROGRESS, Progress, View, view_input
 
 if TYPE_CHECKING:
     from runner.debugging.q_value import Why
@@ -56,7 +55,7 @@ def why(
         metavar="N",
         maximum=100_000,
     ),
-    report: Callable[[int], None] = lambda _: None,
+    progress: Progress = NO_PROGRESS,
 ) -> Why:
     """Show where a Q-value of RUN comes from: the recorded rewards and initial values that it is the sum of.
 
@@ -72,7 +71,8 @@ def why(
     """
     from runner.debugging.why import why
 
-    return why(recording, state=state, action=action, agent=agent, at=at, limit=limit, report=report)
+    with progress.steps("reading") as report:
+        return why(recording, state=state, action=action, agent=agent, at=at, limit=limit, report=report)
 
 
 def _refusal(recording: Recording) -> str:

@@ -28,7 +28,7 @@ TABS: Final = (
     ("", "Overview"),
     ("replay", "Replay"),
     ("learned", "What was learned"),
-    *((view.name, view.title) for view in VIEWS.values()),
+    *((view.name, view.title) for view in VIEWS.values() if view.has_tab),
     ("config", "Configuration"),
     ("pictures", "Pictures"),
     ("rerun", "Rerun"),
@@ -97,7 +97,7 @@ def head_of(run: Run) -> RunHead:
         note=run.note,
         tabs=(
             *(tab for tab in TABS if has_tab.get(tab[0], True)),
-            *((view.name, view.title) for view in map(view_named, installed_names()) if not view.is_of_runs),
+            *((view.name, view.title) for view in map(view_named, installed_names()) if view.has_tab),
         ),
         lacking={
             name: "Q-tables" if not has_tables else "training that the runner can repeat"

@@ -104,7 +104,7 @@ def test_a_cached_kernel_is_not_announced(command, tiny):
 @pytest.mark.parametrize(
     ("words", "stages"),
     [
-        (["diff", "tiny", "tiny", "--html", "{folder}/diff.html"], ["comparing", "drawing the page"]),
+        (["diff", "tiny", "tiny", "--html", "{folder}/diff.html"], ["comparing", "writing"]),
         (["compare", "tiny", "tiny2"], ["reading runs", "computing intervals"]),
         (["export", "tensorboard", "tiny", "-o", "{folder}/events"], ["writing events"]),
         (["qtable", "tiny", "--episode", 5], ["replaying recorded steps"]),
