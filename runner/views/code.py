@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, BinaryIO, Final
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Final
 
-from runner.analysis.sections import Answer, Section, SourceFile
+from runner.analysis.sections import Section, SourceFile
 from runner.errors import RecordingError
 from runner.util.humanize import counted
-from runner.views.view import View
+from runner.views.view import ReadyAnswer, View
 
 if TYPE_CHECKING:
     from runner.recording.code import Code
     from runner.recording.reader import Recording
-    from runner.util.values import Json
 
 _MAX_LINES: Final = 5000
 """Lines of the changes that people see; the file has all."""
@@ -34,62 +32,7 @@ _ABOUT_CODE: Final = ("git", "code.")
 _NOTHING: Final = "The code of this run was not recorded."
 
 
-@dataclass(frozen=True)
-class RunCode(Answer):
-    """The code of a run, and the facts of its provenance that are about code."""
-
-    facts: Mapping[str, str]
-    packages: Mapping[str, str]
-    """Version of each installed package."""
-    code: Code
-    problem: str
-    """Why the files cannot be read; empty if they can."""
-
-    def as_json(self) -> Json:
-        """Return the facts, the text of each file, those that the commit does not have, and the changes."""
-        files = {"files": dict(self.code.files), "new": self.code.new, "patch": self.code.patch}
-        return {**self.facts, **files, "packages": dict(self.packages)}
-
-    def sections(self) -> list[Section]:
-        """Return facts, packages, the changes since the commit, and the files."""
-        facts = {_NAMES.get(key, key): text for key, text in self.facts.items()}
-        sections = [Section("Commit and command", facts=facts)] if facts else []
-        if self.packages:
-            sentence = f"{counted(len(self.packages), 'package')}."
-            sections.append(Section("Installed packages", [sentence], facts=self.packages, is_folded=True))
-        if lines := self.code.patch.splitlines():
-            more = f"{len(lines) - _MAX_LINES:,} more lines: `dualtaxi code RUN -o FILE.patch` writes all."
-            left_out = [more] * (len(lines) > _MAX_LINES)
-            sections.append(Section("Changes since the commit", left_out, diffs=[lines[:_MAX_LINES]]))
-        script = self.facts.get("code.script")
-        names = sorted(self.code.files, key=lambda path: path != script)
-        new = self.code.new if "git" in self.facts else ()
-        sources = [
-            SourceFile(path, "not in the commit" if path in new else "", self.code.files[path])
-            for path in names[:_MAX_FILES]
-        ]
-        if sources:
-            more = f"{len(names) - _MAX_FILES:,} more files: `dualtaxi code RUN --json` has all."
-            left_out = [more] * (len(names) > _MAX_FILES)
-            sections.append(Section("Files", left_out, sources=sources))
-        elif self.problem or not any(key.startswith(_ABOUT_CODE) for key in self.facts):
-            sections.append(Section("Files", [self.problem or _NOTHING]))
-        return sections
-
-    def write(self, stream: BinaryIO) -> None:
-        """Write the facts as comments, which `git apply` ignores, and a patch.
-
-        Raises:
-            RecordingError: the files cannot be read.
-        """
-        if self.problem:
-            raise RecordingError(self.problem)
-        for key, text in (self.facts or {"code.not_recorded": _NOTHING}).items():
-            stream.write(f"# {key}: {' '.join(text.split())}\n".encode(errors="replace"))
-        stream.write(self.code.to_patch().encode(errors="replace"))
-
-
-def code(recording: Recording) -> RunCode:
+def code(recording: Recording) -> ReadyAnswer:
     """Show the code that ran RUN: commit, script, changes since the commit, and files.
 
     `git checkout COMMIT && dualtaxi code RUN -o - | git apply` restores it; without a commit the patch has
@@ -109,12 +52,57 @@ def code(recording: Recording) -> RunCode:
         recorded = recording.code
     except RecordingError as error:
         problem = str(error).removeprefix(f"{recording.path}: ")
-    return RunCode(
-        {key: text for key, text in provenance.items() if key.startswith(_ABOUT_CODE) or key == "command"},
-        {key.removeprefix(_PACKAGE): text for key, text in provenance.items() if key.startswith(_PACKAGE)},
-        recorded,
-        problem,
+    facts = {key: text for key, text in provenance.items() if key.startswith(_ABOUT_CODE) or key == "command"}
+    packages = {
+        key.removeprefix(_PACKAGE): text for key, text in provenance.items() if key.startswith(_PACKAGE)
+    }
+    files = {"files": dict(recorded.files), "new": recorded.new, "patch": recorded.patch}
+    data = {**facts, **files, "packages": packages}
+    return ReadyAnswer(
+        data, _text(facts, packages, recorded, problem), lambda: _patch(facts, recorded, problem)
     )
+
+
+def _text(
+    facts: Mapping[str, str], packages: Mapping[str, str], recorded: Code, problem: str
+) -> Iterator[Section]:
+    """Yield facts, packages, the changes since the commit, and the files."""
+    if facts:
+        named = {_NAMES.get(key, key): text for key, text in facts.items()}
+        yield Section("Commit and command", facts=named)
+    if packages:
+        sentence = f"{counted(len(packages), 'package')}."
+        yield Section("Installed packages", [sentence], facts=packages, is_folded=True)
+    if lines := recorded.patch.splitlines():
+        more = f"{len(lines) - _MAX_LINES:,} more lines: `dualtaxi code RUN -o FILE.patch` writes all."
+        left_out = [more] * (len(lines) > _MAX_LINES)
+        yield Section("Changes since the commit", left_out, diffs=[lines[:_MAX_LINES]])
+    script = facts.get("code.script")
+    names = sorted(recorded.files, key=lambda path: path != script)
+    new = recorded.new if "git" in facts else ()
+    sources = [
+        SourceFile(path, "not in the commit" if path in new else "", recorded.files[path])
+        for path in names[:_MAX_FILES]
+    ]
+    if sources:
+        more = f"{len(names) - _MAX_FILES:,} more files: `dualtaxi code RUN --json` has all."
+        left_out = [more] * (len(names) > _MAX_FILES)
+        yield Section("Files", left_out, sources=sources)
+    elif problem or not any(key.startswith(_ABOUT_CODE) for key in facts):
+        yield Section("Files", [problem or _NOTHING])
+
+
+def _patch(facts: Mapping[str, str], recorded: Code, problem: str) -> str:
+    """Return the facts as comments, which `git apply` ignores, and a patch.
+
+    Raises:
+        RecordingError: the files cannot be read.
+    """
+    if problem:
+        raise RecordingError(problem)
+    about = (facts or {"code.not_recorded": _NOTHING}).items()
+    comments = [f"# {key}: {' '.join(text.split())}\n" for key, text in about]
+    return "".join(comments) + recorded.to_patch()
 
 
 VIEW: Final = View(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import ConfigError
 from runner.util.humanize import counted
-from runner.views.view import NO_PROGRESS, PAGE, AnswerOfRuns, Progress, View, view_input
+from runner.views.view import NO_PROGRESS, PAGE, Progress, ReadyAnswer, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -75,7 +75,7 @@ def compare(
     ),
     normalise: str | Path | None = NORMALISE,
     progress: Progress = NO_PROGRESS,
-) -> AnswerOfRuns:
+) -> ReadyAnswer:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 
     Runs that differ in nothing but the seed are one group; the name of several runs stands for all of them,
@@ -129,14 +129,14 @@ def compare(
             tasks = compare_algorithms(series, scores_of(normalise), by, chosen, read_at)
             contents = f"{len(tasks.algorithms)} groups in {len(tasks.tasks)} environments"
             page = partial(render_tasks, tasks)
-            return AnswerOfRuns(asdict(tasks), task_sections(tasks), page, contents, tasks.notes)
+            return ReadyAnswer(asdict(tasks), task_sections(tasks), page, contents, tasks.notes)
         groups, notes = grouped(series, by)
         require_two(groups, by)
         compared = compare(groups, metrics_of(groups, chosen), read_at, notes)
     count = sum(len(group.runs) for group in groups)
     contents = f"{counted(len(compared.metrics), 'metric')} of {count} runs in {len(groups)} groups"
     page = partial(render_comparison, compared, groups)
-    return AnswerOfRuns(asdict(compared), sections(compared), page, contents, compared.notes)
+    return ReadyAnswer(asdict(compared), sections(compared), page, contents, compared.notes)
 
 
 VIEW: Final = View("compare", "Compare", compare, subject="runs", file_ending=PAGE)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Final
 
-from runner.analysis.sections import Answer, Grid, Section
+from runner.analysis.sections import Grid, Section
 from runner.util.humanize import counted, duration
-from runner.views.view import View, view_input
+from runner.views.view import ReadyAnswer, View, view_input
 
 if TYPE_CHECKING:
     from runner.recording.console import ConsoleLine
     from runner.recording.reader import Recording
-    from runner.util.values import Json
 
 _BOTH: Final = "both"
 _STREAMS: Final = (_BOTH, "stdout", "stderr")
@@ -20,36 +19,6 @@ _NONE: Final = (
     "No output was recorded. What the runner itself prints is never recorded, and nothing is if `console` "
     "is off."
 )
-
-
-@dataclass(frozen=True)
-class Output(Answer):
-    """The last lines of output, of those found."""
-
-    lines: list[ConsoleLine]
-    found: int
-    total: int
-
-    def as_json(self) -> Json:
-        """Return the lines and their numbers."""
-        return {"lines": [asdict(line) for line in self.lines], "found": self.found, "total": self.total}
-
-    def sections(self) -> list[Section]:
-        """Return a table of the lines."""
-        if not self.lines:
-            return [Section("Output", ["No line was found." if self.total else _NONE])]
-        sentence = counted(self.found, "line")
-        if self.found > len(self.lines):
-            sentence = f"The last {len(self.lines):,} of {sentence}"
-        if self.found < self.total:
-            sentence += f" found, of {self.total:,}"
-        streams = [line.stream or "note" for line in self.lines]
-        rows = [
-            (duration(line.seconds), f"{line.position:,}", stream, line.text)
-            for line, stream in zip(self.lines, streams, strict=True)
-        ]
-        grid = Grid(("time", "about step", "stream", "output"), rows, streams=streams)
-        return [Section("Output", [f"{sentence}."], [grid])]
 
 
 def console(
@@ -72,7 +41,7 @@ def console(
         metavar="N",
         maximum=10**9,
     ),
-) -> Output:
+) -> ReadyAnswer:
     """Show what the process that recorded RUN printed: the last lines of its output, or of those with a text.
 
     Each line has the time at which it began and about the number of steps taken until then, interpolated
@@ -90,7 +59,27 @@ def console(
     matching = [
         line for line in lines if search.casefold() in line.text.casefold() and stream in (_BOTH, line.stream)
     ]
-    return Output(matching[-limit:], len(matching), len(lines))
+    shown = matching[-limit:]
+    data = {"lines": [asdict(line) for line in shown], "found": len(matching), "total": len(lines)}
+    return ReadyAnswer(data, [_table(shown, len(matching), len(lines))])
+
+
+def _table(lines: list[ConsoleLine], found: int, total: int) -> Section:
+    """Return a table of the last lines of those found."""
+    if not lines:
+        return Section("Output", ["No line was found." if total else _NONE])
+    sentence = counted(found, "line")
+    if found > len(lines):
+        sentence = f"The last {len(lines):,} of {sentence}"
+    if found < total:
+        sentence += f" found, of {total:,}"
+    streams = [line.stream or "note" for line in lines]
+    rows = [
+        (duration(line.seconds), f"{line.position:,}", stream, line.text)
+        for line, stream in zip(lines, streams, strict=True)
+    ]
+    grid = Grid(("time", "about step", "stream", "output"), rows, streams=streams)
+    return Section("Output", [f"{sentence}."], [grid])
 
 
 VIEW: Final = View(

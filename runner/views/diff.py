@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import ExitCode
 from runner.views.compare import check_target
-from runner.views.view import NO_PROGRESS, PAGE, AnswerOfRuns, Progress, View, view_input
+from runner.views.view import NO_PROGRESS, PAGE, Progress, ReadyAnswer, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -40,7 +40,7 @@ def diff(
         check=check_target,
     ),
     progress: Progress = NO_PROGRESS,
-) -> AnswerOfRuns:
+) -> ReadyAnswer:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 
     --all also shows what is equal. Exit code 0 if both have the same content, 1 if not.
@@ -70,7 +70,7 @@ def diff(
         difference = differences.diff(ours, theirs, dict(map(parse_target, targets)), first)
     difference = difference if first else differences.with_seconds(difference, a, b)
     difference = differences.without_ignored(difference, ignore, everything)
-    return AnswerOfRuns(
+    return ReadyAnswer(
         differences.as_json(difference),
         sections(difference, everything),
         page,

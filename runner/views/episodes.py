@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.analysis.sections import Answer, Grid, Paging, Section
+from runner.analysis.sections import Grid, Paging, Section
 from runner.util.humanize import counted, number_column
-from runner.views.view import START, STOP, View, rows_in, view_input
+from runner.views.view import START, STOP, ReadyAnswer, View, rows_in, view_input
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
     from runner.analysis.frames import Phase
     from runner.recording.reader import Recording
-    from runner.util.values import Json
 
 _ROWS: Final = 100
 _HIDDEN: Final = ("success", "terminated", "truncated", "episode", "last_step")
@@ -41,73 +39,13 @@ _ORDER: Final = view_input(
 )
 
 
-@dataclass(frozen=True)
-class EpisodeRows(Answer):
-    """Some episodes of a phase."""
-
-    run_id: str
-    phase: str
-    order: str
-    start: int
-    total: int
-    """Number of all episodes of the phase."""
-    columns: Mapping[str, list[Any]]
-    references: Sequence[EpisodeRef]
-    headings: dict[str, str]
-    """Heading of each column of the table."""
-
-    def as_json(self) -> Json:
-        """Return a list for each column."""
-        return {
-            "run_id": self.run_id,
-            "start": self.start,
-            "total": self.total,
-            "columns": dict(self.columns),
-        }
-
-    def sections(self) -> list[Section]:
-        """Return a table with a row for each episode."""
-        from runner.analysis.contents import END_WORDS
-        from runner.analysis.episodes import UNKNOWN_EVALUATION
-
-        is_training = self.phase == "train"
-        title = "Training episodes" if is_training else "Trials of evaluations"
-        if not self.references:
-            text = f"There are {self.total:,}, from 0." if self.total else "None was recorded."
-            return [Section(title, [text])]
-        cells = [number_column(self.columns[name]) for name in self.headings]
-        rows = [
-            (
-                str(at.episode)
-                if at.after in (None, UNKNOWN_EVALUATION)
-                else f"{at.after}, trial {at.episode}",
-                next((END_WORDS[end] for end in _HIDDEN[:3] if self.columns[end][i] > 0), END_WORDS["reset"]),
-                *(column[i] for column in cells),
-            )
-            for i, at in enumerate(self.references)
-        ]
-        links = [
-            "" if at.after == UNKNOWN_EVALUATION else f"replay/{at.episode_path}" for at in self.references
-        ]
-        paging = Paging(
-            self.start // _ROWS + 1, self.total, _ROWS, f"{VIEW.name}?phase={self.phase}&order={self.order}"
-        )
-        headings = ("episode" if is_training else "trial", "end", *self.headings.values())
-        spare = [text for name, text in reversed(self.headings.items()) if "return" not in name]
-        grid = Grid(headings, rows, links=links, paging=paging, cut=(), spare=tuple(spare))
-        sentence = counted(self.total, "episode" if is_training else "trial")
-        if len(rows) < self.total:
-            sentence = f"Rows {self.start:,} to {self.start + len(rows) - 1:,} of {sentence}"
-        return [Section(title, [f"{sentence}."], [grid])]
-
-
 def episodes(
     recording: Recording,
     phase: Phase = _PHASE,
     order: str = _ORDER,
     start: Any = START,
     stop: Any = STOP,
-) -> EpisodeRows:
+) -> ReadyAnswer:
     """Show the episodes of RUN: how each ended, its length, returns and events.
 
     In Python, runner.frames.episodes() has all of them.
@@ -135,8 +73,48 @@ def episodes(
         name = f"return.{agent}"
         headings[name] = "return" if len(recording.agents) == 1 else event_in_words(name)
     values = {name: column.tolist() for name, column in columns.items()}
-    at = references(recording, phase, values["episode"])
-    return EpisodeRows(recording.run_id, phase, order, rows.start, total, values, at, headings)
+    episodes_shown = references(recording, phase, values["episode"])
+    is_training = phase == "train"
+    sentence = counted(total, "episode" if is_training else "trial")
+    if not episodes_shown:
+        sentence = f"There are {total:,}, from 0" if total else "None was recorded"
+    elif len(episodes_shown) < total:
+        sentence = f"Rows {rows.start:,} to {rows.start + len(episodes_shown) - 1:,} of {sentence}"
+    address = f"{VIEW.name}?phase={phase}&order={order}"
+    paging = Paging(rows.start // _ROWS + 1, total, _ROWS, address)
+    table = Section(
+        "Training episodes" if is_training else "Trials of evaluations",
+        [f"{sentence}."],
+        [_grid(is_training, values, episodes_shown, headings, paging)] if episodes_shown else [],
+    )
+    data = {"run_id": recording.run_id, "start": rows.start, "total": total, "columns": values}
+    return ReadyAnswer(data, [table])
+
+
+def _grid(
+    is_training: bool,
+    columns: Mapping[str, list[Any]],
+    numbers: Sequence[EpisodeRef],
+    headings: dict[str, str],
+    paging: Paging,
+) -> Grid:
+    """Return a table with a row for each episode, and a column for each heading."""
+    from runner.analysis.contents import END_WORDS
+    from runner.analysis.episodes import UNKNOWN_EVALUATION
+
+    cells = [number_column(columns[name]) for name in headings]
+    rows = [
+        (
+            str(at.episode) if at.after in (None, UNKNOWN_EVALUATION) else f"{at.after}, trial {at.episode}",
+            next((END_WORDS[end] for end in _HIDDEN[:3] if columns[end][i] > 0), END_WORDS["reset"]),
+            *(column[i] for column in cells),
+        )
+        for i, at in enumerate(numbers)
+    ]
+    links = ["" if at.after == UNKNOWN_EVALUATION else f"replay/{at.episode_path}" for at in numbers]
+    names = ("episode" if is_training else "trial", "end", *headings.values())
+    spare = [text for name, text in reversed(headings.items()) if "return" not in name]
+    return Grid(names, rows, links=links, paging=paging, cut=(), spare=tuple(spare))
 
 
 VIEW: Final = View(

@@ -2,45 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from runner.analysis.sections import Answer, Paging, Section
-from runner.views.view import START, STOP, View, rows_in
+from runner.analysis.sections import Paging, Section
+from runner.views.view import START, STOP, ReadyAnswer, View, rows_in
 
 if TYPE_CHECKING:
-    from runner.analysis.evaluations import EvaluationRecord
     from runner.recording.reader import Recording
-    from runner.util.values import Json
 
 _ROWS: Final = 500
 
 
-@dataclass(frozen=True)
-class EvaluationRows(Answer):
-    """Some evaluations of a run."""
-
-    run_id: str
-    start: int
-    total: int
-    """Number of all evaluations."""
-    records: Sequence[EvaluationRecord]
-    table: Section
-
-    def as_json(self) -> Json:
-        """Return the evaluations, and how many there are."""
-        records = [record.as_json() for record in self.records]
-        return {"run_id": self.run_id, "start": self.start, "total": self.total, "records": records}
-
-    def sections(self) -> list[Section]:
-        """Return a table with a row for each evaluation."""
-        return [self.table]
-
-
 def evaluations(
     recording: Recording, start: Any = START, stop: Any = STOP, *, newest_first: bool = False
-) -> EvaluationRows:
+) -> ReadyAnswer:
     """Show the evaluations of RUN: returns, lengths, successes, and every event counted.
 
     The evaluations of a loop are its evaluation episodes between two training episodes.
@@ -62,7 +37,8 @@ def evaluations(
         table.sentences.extend(["The newest come first."] * newest_first)
     elif every:
         table = Section("Evaluations", [f"There are {len(every):,} evaluations, from 0."])
-    return EvaluationRows(recording.run_id, rows.start, len(every), records, table)
+    data = {"run_id": recording.run_id, "start": rows.start, "total": len(every)}
+    return ReadyAnswer(data | {"records": [record.as_json() for record in records]}, [table])
 
 
 VIEW: Final = View(

@@ -2,51 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
 
-from runner.analysis.sections import Answer, Section
-from runner.views.view import View
+from runner.analysis.sections import Section
+from runner.views.view import ReadyAnswer, View
 
 if TYPE_CHECKING:
     from runner.recording.clock import Clock
     from runner.recording.host import HostMetrics
     from runner.recording.reader import Recording
-    from runner.util.values import Json
 
 
-@dataclass(frozen=True)
-class MachineUse(Answer):
-    """The clock of a run, and samples of what it used of its machine; None where they were not recorded."""
-
-    clock: Clock | None
-    host: HostMetrics | None
-
-    def as_json(self) -> Json:
-        """Return seconds, steps a second, and the largest use of memory in bytes, if known."""
-        return {
-            "seconds": self.clock and self.clock.duration,
-            "sessions": self.clock and len(self.clock.earlier),
-            "steps_a_second": self.clock and self.clock.steps_a_second,
-            **({} if self.host is None else self.host.largest),
-        }
-
-    def sections(self) -> list[Section]:
-        """Return facts, and charts over time."""
-        from runner.export.plots.machine import machine_facts, machine_plots
-
-        if self.clock is None:
-            return [Section("Time and machine", ["Its recording has no clock."])]
-        text = "No use of the machine was recorded: it is measured once a second, unless `system` is off."
-        return [
-            Section("Time and machine", facts=machine_facts(self.clock, self.host)),
-            Section(
-                "Over time", [text] if self.host is None else [], figures=machine_plots(self.clock, self.host)
-            ),
-        ]
-
-
-def system(recording: Recording) -> MachineUse:
+def system(recording: Recording) -> ReadyAnswer:
     """Show how fast RUN went, and what it used of its machine: memory, GPU memory and disk.
 
     The page of the run has charts of processor, memory, GPUs, disk and network over time.
@@ -59,7 +27,26 @@ def system(recording: Recording) -> MachineUse:
     from runner.recording.host import read_host
 
     clock = read_clock(recording)
-    return MachineUse(clock, read_host(recording, clock))
+    host = read_host(recording, clock)
+    data = {
+        "seconds": clock and clock.duration,
+        "sessions": clock and len(clock.earlier),
+        "steps_a_second": clock and clock.steps_a_second,
+        **({} if host is None else host.largest),
+    }
+    return ReadyAnswer(data, _text(clock, host))
+
+
+def _text(clock: Clock | None, host: HostMetrics | None) -> Iterator[Section]:
+    """Yield facts, and charts over time."""
+    from runner.export.plots.machine import machine_facts, machine_plots
+
+    if clock is None:
+        yield Section("Time and machine", ["Its recording has no clock."])
+        return
+    yield Section("Time and machine", facts=machine_facts(clock, host))
+    text = "No use of the machine was recorded: it is measured once a second, unless `system` is off."
+    yield Section("Over time", [text] if host is None else [], figures=machine_plots(clock, host))
 
 
 VIEW: Final = View("system", "System", system, has_default=True, is_live=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -47,13 +47,13 @@ NO_PROGRESS: Final = Progress()
 
 
 @dataclass(frozen=True)
-class AnswerOfRuns(Answer):
-    """The answer to a question about several runs, with a page."""
+class ReadyAnswer(Answer):
+    """An answer of parts that were made together."""
 
     data: Json
-    text: list[Section]
-    page: Callable[[], str]
-    """Returns the answer with pictures, as an HTML page of its own."""
+    text: Iterable[Section]
+    file: Callable[[], str] = str
+    """Returns the text of the file."""
     contents: str = ""
     limits: Sequence[str] = ()
     exit_code: int = ExitCode.OK
@@ -62,13 +62,13 @@ class AnswerOfRuns(Answer):
         """Return the data."""
         return self.data
 
-    def sections(self) -> list[Section]:
+    def sections(self) -> Iterable[Section]:
         """Return the text."""
         return self.text
 
     def write(self, stream: BinaryIO) -> None:
-        """Write the page."""
-        stream.write(self.page().encode())
+        """Write the file."""
+        stream.write(self.file().encode(errors="replace"))
 
 
 @dataclass(frozen=True)
