@@ -6,7 +6,6 @@ hold control characters of terminals, which are shown escaped.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import sys
@@ -99,40 +98,6 @@ def print_replies(replies: Reply | Iterable[Reply], form: str = "text") -> int:
             say(note)
         code = max(code, reply.exit_code)
     return code
-
-
-def json_lines(rows: Iterable[object]) -> Iterator[str]:
-    """Yield values as JSON, a line each. NaN and infinity become null."""
-    return (json.dumps(finite(row), allow_nan=False) + "\n" for row in rows)
-
-
-def json_list(name: str, rows: Iterable[Mapping[str, object]]) -> Iterator[str]:
-    """Yield the text of a JSON object with one named list in parts, so that it is never in memory as a whole.
-
-    Each value stands on a line of its own.
-    """
-    encode = json.JSONEncoder(allow_nan=False, separators=(",\n   ", ": ")).encode  # indent= is far slower
-    yield f'{{\n "{name}": ['
-    separator = ""
-    for row in rows:
-        yield separator + "\n  {\n   " + encode(finite(row))[1:-1] + "\n  }"
-        separator = ","
-    yield "\n ]\n}\n" if separator else "]\n}\n"
-
-
-class _Passed:
-    """A file for `csv.writer` whose `write` returns the line."""
-
-    @staticmethod
-    def write(line: str) -> str:
-        return line
-
-
-def csv_lines(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Iterator[str]:
-    """Yield the lines of a table as CSV, the headings first."""
-    write = csv.writer(_Passed(), lineterminator="\n").writerow
-    yield write(columns)
-    yield from map(write, rows)
 
 
 def written(text: str, *paths: Path, **more: object) -> Reply:

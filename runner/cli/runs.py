@@ -9,7 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from runner.cli.command import argument, record
-from runner.cli.options import compared_argument, recordings_option, run_argument
+from runner.cli.options import (
+    compared_argument,
+    recordings_option,
+    run_argument,
+)
 from runner.cli.output import Reply, path_and_size, say
 from runner.cli.parameter_types import RunName
 from runner.cli.progress import progress_line, steps_line
@@ -119,16 +123,6 @@ def recording_and_run(
         raise
 
 
-def require_over(run: Run | None) -> None:
-    """Refuse a run that is still running.
-
-    Raises:
-        RunnerError: it is.
-    """
-    if run is not None and run.status == "running":
-        raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
-
-
 @contextlib.contextmanager
 def open_for_export(run: Run, needs_steps: bool = False) -> Iterator[Recording]:
     """Open the recording of a run to export it, and print what it lacks when that is done."""
@@ -153,6 +147,12 @@ def found_run(run_name: str = run_argument, recordings: Path | None = recordings
 def recorded_run(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Run:
     """Return the newest run of the name that the command gives, with its recording."""
     return find_recorded(run_name, recordings)
+
+
+@record
+def any_run(run_name: str = run_argument, recordings: Path | None = recordings_option) -> Run:
+    """Return the newest run of the name that the command gives, whether it has its recording or not."""
+    return restored(find(run_name, recordings, newest=True))
 
 
 @record

@@ -13,21 +13,36 @@ import click
 
 from runner.analysis.sections import Answer
 from runner.cli.command import Command, Declared, argument, option
-from runner.cli.options import force_option, html_option
+from runner.cli.options import (
+    checkpoint_option,
+    episode_option,
+    force_option,
+    html_option,
+    policy_option,
+    trial_option,
+    trust_option,
+)
 from runner.cli.output import Part, Reply, files_written, path_and_size, require_page, say
-from runner.cli.parameter_types import FILE, INDEX, PATH, ExpressionText, Parsed
-from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import all_recorded_runs, compilation_notice, recorded_run, two_recorded_runs
+from runner.cli.parameter_types import FILE, PATH, ExpressionText, Number, Parsed
+from runner.cli.progress import bytes_line, count_line, progress_line, stage_line, steps_line
+from runner.cli.runs import (
+    all_recorded_runs,
+    any_run,
+    compilation_notice,
+    recorded_run,
+    recording_and_run,
+    two_recorded_runs,
+)
 from runner.export.places import new_file, require_new
 from runner.runs.run import Run, command_for
 from runner.util.humanize import size
-from runner.views.view import PAGE, Input, Progress, View
+from runner.views.view import ONLY_HERE, PAGE, Input, Progress, View
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 _STDOUT: Final = Path("-")
-_PROGRESS: Final = Progress(stage_line, steps_line)
+_PROGRESS: Final = Progress(say, stage_line, steps_line, bytes_line, count_line, progress_line)
 
 
 @contextmanager
@@ -45,10 +60,19 @@ def _recording(run: Run) -> Iterator[Recording]:
 _SUBJECTS: Final[dict[str, tuple[Declared, Callable[..., AbstractContextManager[Any]]]]] = {
     "recording": (recorded_run, _recording),
     "run": (recorded_run, nullcontext),
+    "any run": (any_run, nullcontext),
     "pair": (two_recorded_runs, nullcontext),
     "runs": (all_recorded_runs, nullcontext),
+    "file": (recording_and_run, nullcontext),
 }
 """The subject of a view -> what its command names, and how that is opened."""
+_ONLY_HERE: Final = {
+    "episode": episode_option,
+    "trial": trial_option,
+    "checkpoint": checkpoint_option,
+    "policy": policy_option,
+    "trust": trust_option,
+}
 
 
 def command_of(view: View) -> Command:
@@ -86,7 +110,7 @@ def command_of(view: View) -> Command:
                     notes = [path_and_size(output)]
             yield Reply(data, _text(subject, answer), page=page, notes=notes, exit_code=answer.exit_code)
 
-    declared = {"subject": named, **{name: _declared(each, view) for name, each in view.inputs.items()}}
+    declared = {"subject": named, **{name: _declared(name, each, view) for name, each in view.inputs.items()}}
     if view.file_ending:
         help_text, metavar = f"{view.file_help} FILE `-` is stdout.", f"FILE{view.file_ending}"
         output = option("-o", "--output", type=FILE, metavar=metavar, help=help_text)
@@ -100,8 +124,10 @@ def _text(run: Run, answer: Answer) -> Iterator[Part]:
         yield {"next": command_for(run, "view", "--at", str(answer.step_to_look_at))}
 
 
-def _declared(given: Input, view: View) -> Declared:
+def _declared(name: str, given: Input, view: View) -> Declared:
     """Return the argument or option of an input; an argument completes the words that the view lists."""
+    if given is ONLY_HERE:
+        return _ONLY_HERE[name]
     if given.required:
         return argument(metavar=given.name.upper(), type=ExpressionText(given.name, view.words))
     return option_of(given)
@@ -111,8 +137,11 @@ def option_of(given: Input) -> Declared:
     """Return the option of an input."""
     flag = f"--{given.name}"
     if given.kind is bool:
-        return option(flag, is_flag=True, help=given.help)
-    kind: Any = INDEX if given.kind is int else PATH if given.is_file else None
+        flags = flag if given.default is False else f"{flag}/--no-{given.name}"
+        return option(flags, is_flag=True, default=given.default, help=given.help)
+    kind: Any = PATH if given.is_file else None
+    if given.kind in (int, float):
+        kind = Number(given.minimum, given.maximum if given.kind is float else None, given.kind)
     if given.values:
         kind = click.Choice(given.values)
     if (check := given.check) is not None:

@@ -153,6 +153,15 @@ class Run:
         if self.stands_alone:
             raise RunnerError(f"{self.recording}: stands alone; expected a run in a folder of its own.")
 
+    def require_over(self) -> None:
+        """Refuse a run that is still running.
+
+        Raises:
+            RunnerError: it is.
+        """
+        if self.status == "running":
+            raise RunnerError(f"run {self.run_id} is running; wait until it has finished, or interrupt it.")
+
     @property
     def stands_alone(self) -> bool:
         """Whether it is a recording by itself, not one in a folder of its own."""

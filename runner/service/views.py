@@ -167,7 +167,7 @@ def _type_of(view: View) -> type[BaseModel]:
             {} if given.kind is bool or given.values else {"max_length": given.max_length}
         )
         if given.kind is int:
-            limits = {"ge": 0, "le": given.maximum}
+            limits = {"ge": given.minimum, "le": given.maximum}
         default: Any = ... if given.required else given.default
         if given.multiple:
             kind, default = tuple[kind, ...], ()
@@ -201,4 +201,5 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
 
 
 for _view in (*VIEWS.values(), *map(view_named, installed_names())):
-    (_add_routes if _view.has_tab else _add_route_of_runs)(_view)
+    if _view.is_served:
+        (_add_routes if _view.has_tab else _add_route_of_runs)(_view)

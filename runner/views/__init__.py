@@ -19,7 +19,10 @@ from runner.views import (
     episodes,
     evaluations,
     qtable,
+    show,
     system,
+    values,
+    verify,
     when,
     why,
 )
@@ -39,6 +42,9 @@ VIEWS: Final = {
         code,
         diff,
         compare,
+        show,
+        verify,
+        values,
     )
 }
 """Name of a view -> the view; those of one run in the order of their tabs."""

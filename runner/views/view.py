@@ -29,18 +29,25 @@ Lines = Callable[..., AbstractContextManager[Callable[..., None]]]
 
 
 @contextmanager
-def _nothing(_: str) -> Iterator[Callable[..., None]]:
-    yield lambda _: None
+def _nothing(*_: object) -> Iterator[Callable[..., None]]:
+    yield lambda *_: None
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What shows the progress of a computation: a command, else nothing."""
+    """What shows the progress of a computation, and prints notices: a command, else nothing."""
 
+    say: Callable[[str], None] = lambda _: None
     stage: Lines = _nothing
     """The function takes the next stage."""
     steps: Lines = _nothing
     """The function takes the number of steps done."""
+    bytes: Lines = _nothing
+    """The function takes the bytes done, and all."""
+    count: Lines = _nothing
+    """Takes the number of all, too; the function takes the number done."""
+    episodes: Lines = _nothing
+    """Takes the number of all, too; the function takes the progress of a job."""
 
 
 NO_PROGRESS: Final = Progress()
@@ -79,7 +86,7 @@ class Input:
     """As people write it: `from` is the option `--from` and the parameter `from`."""
     help: str
     kind: type = str
-    default: str | int | bool | None = None
+    default: str | float | bool | None = None
     required: bool = False
     metavar: str = ""
     max_length: int = 1000
@@ -90,6 +97,7 @@ class Input:
     """Whether the command takes the path of a file instead of its text."""
     check: Callable[[str], object] | None = None
     """Raises a `RunnerError` if a text is no value of it, so that the command can name its option."""
+    minimum: int = 0
     maximum: int | None = None
     label: str = ""
     """Label of the field; empty if the page has none."""
@@ -119,6 +127,10 @@ STOP: Final = Input(
 )
 
 
+ONLY_HERE: Final = view_input("", "")
+"""An input that only a command has, with the option that all commands share: a path, code, or trust in it."""
+
+
 def rows_in(start: int, stop: int | None) -> range:
     """Return the numbers of the rows from `START` to `STOP`.
 
@@ -139,9 +151,10 @@ class View:
     title: str
     compute: Callable[..., Any]
     """Takes the subject, the inputs and, if it is slow, `progress`; returns an `Answer`."""
-    subject: Literal["recording", "run", "pair", "runs"] = "recording"
+    subject: Literal["recording", "run", "pair", "runs", "any run", "file"] = "recording"
     """What the function takes first: a recording; or the run, to read files stored next to it, with answers
-    that are not cached and have no API route, as they hold paths; or a list of two or more runs."""
+    that are not cached and have no API route, as they hold paths; or a list of two or more runs.
+    Only a command names any run, which may lack its recording, or a file by its path, with its run if any."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
@@ -179,9 +192,15 @@ class View:
         return "progress" in self._defaults
 
     @property
+    def is_served(self) -> bool:
+        """Whether it has a route or a page."""
+        subjects = ("recording", "run", "pair", "runs")
+        return self.subject in subjects and ONLY_HERE not in self.inputs.values()
+
+    @property
     def has_tab(self) -> bool:
         """Whether it is a tab on the pages of a run."""
-        return self.subject in ("recording", "run")
+        return self.is_served and self.subject in ("recording", "run")
 
     @cached_property
     def _defaults(self) -> dict[str, object]:

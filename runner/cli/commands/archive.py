@@ -11,13 +11,14 @@ import click
 from runner.archive.places import default_target
 from runner.cli.command import Command, argument, option
 from runner.cli.options import recordings_option, runs_argument
-from runner.cli.output import Remark, Reply, json_lines, say
+from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import PATH, RunName
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import compilation_notice, find, received, run_reply
 from runner.errors import RunnerError
 from runner.runs.run import recordings_folder
 from runner.util.humanize import size
+from runner.util.row_text import json_lines
 
 if TYPE_CHECKING:
     from runner.archive.runs import Archived

@@ -15,7 +15,7 @@ import click
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, option
 from runner.cli.options import filter_argument, folders_option, limit_option, require_one
-from runner.cli.output import Reply, csv_lines, json_list, say
+from runner.cli.output import Reply, say
 from runner.cli.parameter_types import INDEX
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
@@ -29,6 +29,7 @@ from runner.runs.catalogue.columns import (
     with_same_as,
 )
 from runner.util.humanize import capitalised
+from runner.util.row_text import csv_lines, json_list
 from runner.util.values import Json
 
 if TYPE_CHECKING:

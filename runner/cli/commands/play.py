@@ -16,10 +16,11 @@ from runner.cli.command import Command, option
 from runner.cli.options import (
     episode_options,
 )
-from runner.cli.output import Remark, Reply, console, json_lines
+from runner.cli.output import Remark, Reply, console
 from runner.cli.parameter_types import Number
 from runner.cli.runs import recorded_run
 from runner.runs.run import Run
+from runner.util.row_text import json_lines
 
 if TYPE_CHECKING:
     from rich.text import Text

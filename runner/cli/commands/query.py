@@ -15,12 +15,13 @@ from runner.analysis.sections import Grid
 from runner.cli.command import Command, argument, option
 from runner.cli.commands.ls import MAX_PROBLEMS
 from runner.cli.options import folders_option, force_option, limit_option, require_one, tags_option
-from runner.cli.output import Remark, Reply, csv_lines, json_list, path_and_size
+from runner.cli.output import Remark, Reply, path_and_size
 from runner.cli.parameter_types import COUNT, FILE
 from runner.cli.progress import stage_line
 from runner.query.text import cell_of, csv_value
 from runner.util.extras import require
 from runner.util.humanize import counted
+from runner.util.row_text import csv_lines, json_list
 
 if TYPE_CHECKING:
     from runner.cli.output import Part

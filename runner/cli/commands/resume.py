@@ -24,7 +24,6 @@ from runner.cli.runs import (
     found_run,
     job_progress,
     recorded_run,
-    require_over,
     run_as_json,
     run_facts,
     run_reply,
@@ -98,7 +97,7 @@ def rerecord_command(
     """
     from runner.execution.rerecord import holds_steps, is_rerun, rerecord
 
-    require_over(run)
+    run.require_over()
     is_loop = is_rerun(run)
     had_steps = (is_loop or run.status == "finished") and holds_steps(run)
     if is_loop:

@@ -13,13 +13,14 @@ import click
 from runner.cli.command import Command, option
 from runner.cli.jobs import job_option
 from runner.cli.options import config_argument, recordings_option, set_option, workers_option
-from runner.cli.output import Reply, json_lines, say
+from runner.cli.output import Reply, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line
 from runner.cli.runs import compilation_notice, run_as_json, run_facts
 from runner.errors import ExitCode
 from runner.runs.run import Run, command_for, create_run, recordings_folder, unless_empty
 from runner.util.humanize import amount, size
+from runner.util.row_text import json_lines
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported

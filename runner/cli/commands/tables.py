@@ -8,7 +8,8 @@ import click
 
 from runner.cli.command import Command, option
 from runner.cli.options import set_option
-from runner.cli.output import Reply, csv_lines, json_lines
+from runner.cli.output import Reply
+from runner.util.row_text import csv_lines, json_lines
 
 ROWS_AT_ONCE = 50_000
 

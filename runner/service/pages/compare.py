@@ -136,9 +136,9 @@ def overview(runs: ChosenRuns, scores: Scores = "") -> Response:
         "results": Grid(headings, [row for row in results if {*row[1:]} != {UNKNOWN}], left=headings),
         "same": len(digests) == 1 and None not in digests,
         # The latest episodes of these replay by themselves.
-        "running": [
-            run for run in compared.runs if run.head.status == "running" and run.head.steps == "all"
-        ][:MAX_LATEST],
+        "running": [run for run in compared.runs if run.head.status == "running" and run.head.steps == "all"][
+            :MAX_LATEST
+        ],
         "scores": scores,
         "tasks": tasks_address if len(environments) > 1 else "",
     }

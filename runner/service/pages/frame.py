@@ -37,7 +37,7 @@ TABS: Final = (
 
 def installed_names() -> list[str]:
     """Return the names of the views that installed packages add, except names of shipped pages."""
-    return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in dict(TABS)]
+    return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in {**dict(TABS), **VIEWS}]
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from runner.config import from_mapping
 from runner.drawing.text import TextDrawing, signs
 from runner.execution.estimate import estimate, step_limit
 from runner.util import humanize
+from runner.util.row_text import json_lines
 
 
 @pytest.mark.parametrize(
@@ -69,7 +70,7 @@ def test_unknown_numbers_are_a_dash():
 
 def test_json_has_no_nan(capsys):
     value = {"a": float("nan"), "b": [1.5, float("inf")], 3: (True, None, "x")}
-    (line,) = output.json_lines([value])
+    (line,) = json_lines([value])
     assert line == '{"a": null, "b": [1.5, null], "3": [true, null, "x"]}\n'
     output.print_replies(output.Reply(value), "json")
     assert json.loads(capsys.readouterr().out) == json.loads(line)

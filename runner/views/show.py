@@ -1,31 +1,20 @@
-"""`dualtaxi show`: all about one run."""
+"""`show`: all about one run."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-import click
+from typing import TYPE_CHECKING, Final
 
 from runner.analysis.sections import Section
-from runner.cli.command import Command
-from runner.cli.options import recordings_option, run_argument
-from runner.cli.output import Reply, say
-from runner.cli.progress import stage_line
-from runner.cli.runs import find, restored
+from runner.views.view import NO_PROGRESS, Progress, ReadyAnswer, View
 
 if TYPE_CHECKING:
     from runner.analysis.summary import RunDetails
-    from runner.cli.output import Part
+    from runner.runs.run import Run
 
 
-@click.command("show", cls=Command)
-def show_command(
-    run_name: str = run_argument,
-    recordings: Path | None = recordings_option,
-) -> Reply:
+def show(run: Run, progress: Progress = NO_PROGRESS) -> ReadyAnswer:
     """Show a run: its evaluations, tables, configuration and provenance.
 
     --json also prints the whole series: `eval` has an object for each evaluation, with the training episodes
@@ -44,14 +33,13 @@ def show_command(
     from runner.analysis.summary import describe_run
     from runner.runs.catalogue.index import look
 
-    run = restored(find(run_name, recordings, newest=True))
     folders = [] if run.stands_alone else [run.folder.parent]
-    branches = look(folders, lambda index: index.branches(run.run_id), say)
-    details = replace(describe_run(run, say), branches=branches)
-    return Reply(details.as_json(), _text(details))
+    branches = look(folders, lambda index: index.branches(run.run_id), progress.say)
+    details = replace(describe_run(run, progress.say), branches=branches)
+    return ReadyAnswer(details.as_json(), _text(details, progress))
 
 
-def _text(details: RunDetails) -> Iterator[Part]:
+def _text(details: RunDetails, progress: Progress) -> Iterator[Section]:
     from runner.analysis.summary import random_policy_sentence
     from runner.recording.reader import open_recording
 
@@ -60,7 +48,13 @@ def _text(details: RunDetails) -> Iterator[Part]:
     yield replace(first, facts={**first.facts, **file})
     yield from others
     if details.evaluations:  # after all else: it may take seconds to compute
-        with stage_line("evaluating a random policy"), open_recording(details.run.recording) as recording:
+        with (
+            progress.stage("evaluating a random policy"),
+            open_recording(details.run.recording) as recording,
+        ):
             sentence = random_policy_sentence(recording)
         if sentence:
             yield Section("Baseline", [sentence])
+
+
+VIEW: Final = View("show", "Overview", show, subject="any run")
