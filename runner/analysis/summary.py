@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -414,8 +413,8 @@ def results_in_words(loop: Summary) -> dict[str, str]:
     return {name: text for name, text in means.items() if UNKNOWN not in text} | logged
 
 
-def usage_sections(largest: Sequence[Usage], sums: Sums, recordings: Sequence[Path]) -> Iterator[Section]:
-    """Yield the disk usage of the largest runs and of all, and what could be freed in the folders."""
+def usage_sections(largest: Sequence[Usage], sums: Sums, freeable: Mapping[str, int]) -> Iterator[Section]:
+    """Yield the disk usage of the largest runs and of all, and what could be freed."""
     total = sums.bytes
     kinds = [kind for kind, count in total.items() if count or kind == "total"]
 
@@ -439,7 +438,7 @@ def usage_sections(largest: Sequence[Usage], sums: Sums, recordings: Sequence[Pa
     yield Section("", grids=[Grid(headings, rows, links=[*links, ""], left=left, cut=("name",))])
     reasons = {
         FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
-        for kind, count in sums.freeable(recordings).items()
+        for kind, count in freeable.items()
         if count
     }
     if reasons:

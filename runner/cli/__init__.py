@@ -73,7 +73,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "mark": ("catalogue", "Mark steps of a run, and list its marks."),
         "rm": ("remove", "Remove runs."),
         "prune": ("remove", "Remove old, unfinished or unwanted runs."),
-        "du": ("catalogue", "Show what uses disk space, and what could be freed."),
+        "du": (_VIEW, "Show what uses disk space, and what could be freed."),
         "repair": ("repair", "Repair a damaged recording, and report what was lost."),
         "index": ("catalogue", "Rebuild the index of runs."),
         "init": ("setup", "Create a folder to start in, with the shipped experiments."),

@@ -16,6 +16,8 @@ from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     checkpoint_option,
     episode_option,
+    filter_argument,
+    folders_option,
     force_option,
     html_option,
     policy_option,
@@ -64,9 +66,11 @@ _SUBJECTS: Final[dict[str, tuple[Declared, Callable[..., AbstractContextManager[
     "pair": (two_recorded_runs, nullcontext),
     "runs": (all_recorded_runs, nullcontext),
     "file": (recording_and_run, nullcontext),
+    "folders": (folders_option, nullcontext),
 }
 """The subject of a view -> what its command names, and how that is opened."""
 _ONLY_HERE: Final = {
+    "words": filter_argument,
     "episode": episode_option,
     "trial": trial_option,
     "checkpoint": checkpoint_option,

@@ -16,6 +16,7 @@ from runner.views import (
     compare,
     console,
     diff,
+    du,
     episodes,
     evaluations,
     qtable,
@@ -45,6 +46,7 @@ VIEWS: Final = {
         show,
         verify,
         values,
+        du,
     )
 }
 """Name of a view -> the view; those of one run in the order of their tabs."""

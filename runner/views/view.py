@@ -128,7 +128,7 @@ STOP: Final = Input(
 
 
 ONLY_HERE: Final = view_input("", "")
-"""An input that only a command has, with the option that all commands share: a path, code, or trust in it."""
+"""An input of a command alone, the option that commands share by its name: code, trust in it, or a filter."""
 
 
 def rows_in(start: int, stop: int | None) -> range:
@@ -151,10 +151,11 @@ class View:
     title: str
     compute: Callable[..., Any]
     """Takes the subject, the inputs and, if it is slow, `progress`; returns an `Answer`."""
-    subject: Literal["recording", "run", "pair", "runs", "any run", "file"] = "recording"
+    subject: Literal["recording", "run", "pair", "runs", "any run", "file", "folders"] = "recording"
     """What the function takes first: a recording; or the run, to read files stored next to it, with answers
     that are not cached and have no API route, as they hold paths; or a list of two or more runs.
-    Only a command names any run, which may lack its recording, or a file by its path, with its run if any."""
+    Only a command names any run, which may lack its recording; a file by its path, with its run if any; or
+    the folders of runs."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""

@@ -1,22 +1,19 @@
-"""`dualtaxi label`, `du` and `index`: labels, disk usage and the index of runs."""
+"""`dualtaxi label`, `mark` and `index`: labels, marks and the index of runs."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
 from runner.analysis.sections import Grid
 from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
-    filter_argument,
     folders_option,
-    limit_option,
     tags_option,
 )
 from runner.cli.output import Remark, Reply, say
@@ -27,12 +24,7 @@ from runner.runs.run import Run, label
 from runner.util.humanize import UNKNOWN, duration
 
 if TYPE_CHECKING:
-    from runner.cli.output import Part
     from runner.runs.catalogue.index import CatalogueIndex
-    from runner.runs.catalogue.usage import Sums, Usage
-
-_LARGEST: Final = 20
-"""Runs in the text of `du` by default."""
 
 
 @click.command("label", cls=Command)
@@ -113,56 +105,6 @@ def _from_stdin() -> str:
         return sys.stdin.read()
     except UnicodeDecodeError as error:
         raise RunnerError(f"stdin: found bytes that are not UTF-8 ({error}), expected text.") from error
-
-
-@click.command("du", cls=Command)
-def du_command(
-    words: tuple[str, ...] = filter_argument,
-    recordings: tuple[Path, ...] = folders_option,
-    limit: int | None = limit_option(f"{_LARGEST}, with --json all"),
-) -> Reply:
-    """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
-
-    It counts recordings; exports made by `view` and recordings restored from archives, both kept in the
-    user's cache and made again when needed; and other files in the folders of runs. The totals and what could
-    be freed come last.
-
-    Examples:
-      dualtaxi du
-      dualtaxi du 'status == "finished" and age > "30d"' --limit 5
-    """
-    from runner.analysis.summary import usage_sections
-    from runner.runs.catalogue.filters import parse
-    from runner.runs.catalogue.index import look
-    from runner.runs.catalogue.usage import usage_of
-
-    chosen = parse(" ".join(words))
-
-    def measured(count: int | None) -> tuple[list[Usage], Sums]:
-        return usage_of(lambda work: look(recordings, work, say), chosen, count or None)
-
-    def data() -> dict[str, object]:
-        largest, sums = measured(limit)
-        runs = [
-            {
-                "run_id": usage.row["id"],
-                **{key: usage.row[key] for key in ("name", "status", "same_as")},
-                "path": str(Path(usage.row["root"], usage.row["entry"])),
-                **usage.bytes,
-            }
-            for usage in largest
-        ]
-        return {"runs": runs, "total": sums.bytes, "freeable": sums.freeable(recordings)}
-
-    def text() -> Iterator[Part]:
-        largest, sums = measured(_LARGEST if limit is None else limit)
-        if sums.runs:
-            yield from usage_sections(largest, sums, recordings)
-        else:
-            folders = ", ".join(map(str, recordings))
-            yield Remark(f"No run in {folders} matches." if words else "No runs yet.")
-
-    return Reply(data, text())
 
 
 @click.group("index", cls=CommandGroup)

@@ -130,7 +130,7 @@ async def runs(
 def disk(catalogue: CatalogueOf, settings: SettingsOf, jobs: JobsOf) -> Response:
     """Show the use of the disk, and what could be freed."""
     largest, sums = usage_of(catalogue.read, Filter(None), ROWS)
-    usage = list(usage_sections(largest, sums, settings.recordings)) if largest else []
+    usage = list(usage_sections(largest, sums, sums.freeable(settings.recordings))) if largest else []
     return Page("disk.html", {"total": sums.bytes, "free": jobs.status().free_bytes, "usage": usage})
 
 
