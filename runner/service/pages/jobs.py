@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import RedirectResponse
 
-from runner.analysis.sections import Grid, Paging
+from runner.analysis.sections import Paging
 from runner.client.jobs import JobStatus
 from runner.debugging.explanation_files import explanations_in
 from runner.service.api.jobs import Number
@@ -18,7 +18,6 @@ from runner.service.dependencies import JobsOf, OwnerOf, UploadsOf
 from runner.service.jobs.queue import JobQueue
 from runner.service.pages.frame import StatusName
 from runner.service.pages.rendering import Page, to_job
-from runner.util.humanize import ago, size
 
 router = APIRouter(prefix="/queue", include_in_schema=False)
 
@@ -32,21 +31,8 @@ PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**6)]
 @router.get("")
 def queue(jobs: JobsOf, uploads: UploadsOf, owner: OwnerOf, number: PageNumber = 1) -> Response:
     """Show the jobs, the newest first, and the uploads that are not yet runs."""
-    rows = [
-        (
-            upload.run_id,
-            upload.name,
-            upload.state,
-            size(upload.offset),
-            "" if upload.size is None else size(upload.size),
-            f"{ago(datetime.fromisoformat(upload.created))} ago",
-            upload.problem,
-        )
-        for upload in list_uploads(uploads, owner).uploads
-        if upload.state != "stored"
-    ]
-    listed = Grid(("run", "name", "state", "received", "of", "started", "problem"), rows[:ROWS])
-    return Page("queue.html", {**_rows(jobs, number), "uploads": listed if rows else None})
+    pending = [upload for upload in list_uploads(uploads, owner).uploads if upload.state != "stored"]
+    return Page("queue.html", {**_rows(jobs, number), "uploads": pending[:ROWS]})
 
 
 @router.get("/status")

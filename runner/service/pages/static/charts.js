@@ -142,17 +142,15 @@ const known = (value) => value !== null && value !== undefined;
 const exact = (value) => value.toLocaleString("en", { maximumSignificantDigits: 6 });
 const axisLabel = () => last.axes.find(({ name }) => name === last.axis).label;
 
-function groupName(number) {
-  const { label, runs: own } = last.groups[number];
-  if (own.length === 1) return named(own[0]);
-  const letters = own.map((id) => named(id).split(": ")[0]).join(", ");
-  return own.length <= 5 ? `${letters}: ${label}` : `${label}, ${own.length} runs`;
+function groupName({ label, runs: own }) {
+  const letters = own.map((id) => named(id).split(": ")[0]);
+  return own.length > 5 ? `${label}, ${own.length} runs` : `${letters.join(", ")}: ${label}`;
 }
 
 function labelOf({ line, group, title }, curves) {
   const several = last.groups.length > 1 || runs.length > 1,
     part = linesOf(curves).length > 1 && spoken(line);
-  return [several && groupName(group), part].filter(Boolean).join(", ") || title;
+  return [several && groupName(last.groups[group]), part].filter(Boolean).join(", ") || title;
 }
 
 function tick(value) {
