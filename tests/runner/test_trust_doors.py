@@ -36,6 +36,8 @@ from runner.runs.run import Run
 from runner.runs.trust_marks import MARK_FILE
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
+from runner.views import VIEWS
+from runner.views.view import ONLY_HERE, View
 from tests.doors import commands, routes
 
 pytestmark = pytest.mark.long
@@ -469,3 +471,14 @@ def test_no_job_of_a_client_makes_what_is_not_listed(env, service, trap):
     assert untouched(trap)
     with contextlib.suppress(ModuleNotFoundError):
         assert "trap" not in sys.modules
+
+
+def test_a_view_that_takes_code_or_a_path_is_a_command_only(service):
+    def made(recording, policy=ONLY_HERE):
+        """Make what the policy says."""
+
+    here = {name for name, view in VIEWS.items() if not view.is_served}
+    assert here == {"du", "show", "values", "verify"}
+    assert not View("made", "Made", made).is_served
+    paths = {path for _, path in routes(service.app.routes)}
+    assert {path for path in paths if path.rpartition("/")[2].partition(".")[0] in here} == set()
