@@ -153,15 +153,6 @@ class Run:
         if self.stands_alone:
             raise RunnerError(f"{self.recording}: stands alone; expected a run in a folder of its own.")
 
-    def require_over(self) -> None:
-        """Refuse a run that is still running.
-
-        Raises:
-            RunnerError: it is.
-        """
-        if self.status == "running":
-            raise RunnerError(f"run {self.run_id} is running; wait until it has finished, or interrupt it.")
-
     @property
     def stands_alone(self) -> bool:
         """Whether it is a recording by itself, not one in a folder of its own."""
@@ -363,6 +354,16 @@ def unless_empty(run: Run) -> Iterator[None]:
             shutil.rmtree(run.folder, ignore_errors=True)
             error.add_note(f"Nothing was recorded; the empty run {run.run_id} was removed.")
         raise
+
+
+def require_over(run: Run) -> None:
+    """Refuse a run that is still running.
+
+    Raises:
+        RunnerError: it is.
+    """
+    if run.status == "running":
+        raise RunnerError(f"run {run.run_id} is running; wait until it has finished, or interrupt it.")
 
 
 def require_trained(run: Run, is_trained: bool, refusal: str) -> None:

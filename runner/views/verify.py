@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.analysis.sections import Section
 from runner.errors import ExitCode, RunnerError
-from runner.runs.run import Run, command_for
+from runner.runs.run import Run, command_for, require_over
 from runner.util.humanize import UNKNOWN, counted
 from runner.views.view import NO_PROGRESS, ONLY_HERE, Progress, ReadyAnswer, View, view_input
 
@@ -67,7 +67,7 @@ def verify(
 
     path, run = file
     if run is not None:
-        run.require_over()
+        require_over(run)
         if shards := shards_in_words(run):
             raise RunnerError(f"run {run.run_id} is not complete: {shards} of it could not be added.")
     with progress.bytes("reading") as report:

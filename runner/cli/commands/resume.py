@@ -29,7 +29,7 @@ from runner.cli.runs import (
     run_reply,
 )
 from runner.errors import ExitCode, RecordingError
-from runner.runs.run import Run, command_for, recordings_folder
+from runner.runs.run import Run, command_for, recordings_folder, require_over
 from runner.util.humanize import counted, number
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def rerecord_command(
     """
     from runner.execution.rerecord import holds_steps, is_rerun, rerecord
 
-    run.require_over()
+    require_over(run)
     is_loop = is_rerun(run)
     had_steps = (is_loop or run.status == "finished") and holds_steps(run)
     if is_loop:
