@@ -6,6 +6,13 @@ const place = document.body.dataset,
 const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
 const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
+// The viewer sends usage data to its makers, which the policy of this page forbids; this avoids the attempt.
+const own = window.fetch.bind(window);
+window.fetch = (what, how) =>
+  new URL(what.url ?? what, location.href).origin === location.origin
+    ? own(what, how)
+    : Promise.resolve(new Response(null, { status: 204 }));
+
 async function open() {
   console.debug = () => {};
   await request(place.recording, { headers: { range: "bytes=0-0" } });
