@@ -34,6 +34,7 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service.errors import Refused
+from runner.service.settings import ServiceSettings
 from runner.util.extras import require
 from runner.util.values import finite
 from runner.views.view import Given
@@ -96,9 +97,9 @@ def installed_file(path: Path, name: str) -> bytes:
         return file.read_bytes()
 
 
-def report(path: Path) -> bytes:
+def report(path: Path, settings: ServiceSettings) -> bytes:
     """Return the report of a run, a page without links to others."""
-    return render_report([path])[0].encode()
+    return settings.without_folders(render_report([path])[0]).encode()
 
 
 def film(path: Path, title: str, step: EpisodeRef, ending: str) -> bytes:
@@ -158,31 +159,37 @@ def replay(runs: Sequence[Run], request: Request) -> bytes:
     return os.fsencode(cached_export(runs, request)[0])
 
 
-def query(roots: tuple[Path, ...], text: str, runs: str) -> bytes:
+def query(settings: ServiceSettings, text: str, runs: str) -> bytes:
     """Return the first rows of a query in SQL, as JSON."""
     require("pyarrow", extra="sql", purpose="SQL")
     from runner.query.sql import sql
 
-    result = sql(text, recordings=roots, runs=runs)
+    result = sql(text, recordings=settings.recordings, runs=runs)
     with contextlib.closing(result.rows()) as rows:
         first = list(islice(rows, MAX_ROWS + 1))
-    return as_json(
-        {
-            "columns": result.columns.names,
-            "rows": first[:MAX_ROWS],
-            "more": len(first) > MAX_ROWS,
-            "left_out": result.left_out,
-        }
-    )
+    found = {
+        "columns": result.columns.names,
+        "rows": first[:MAX_ROWS],
+        "more": len(first) > MAX_ROWS,
+        "left_out": result.left_out,
+    }
+    return settings.without_folders(as_json(found).decode()).encode()
 
 
-def find(roots: tuple[Path, ...], expression: str, runs: str, phase: str, sort: str, limit: int) -> bytes:
+def find(settings: ServiceSettings, expression: str, runs: str, phase: str, sort: str, limit: int) -> bytes:
     """Return the episodes that match an expression, as `dualtaxi find --json` prints them."""
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query import find
 
-    found = find.find(expression, roots, runs=runs, phase=phase or None, sort=sort, limit=limit or MAX_ROWS)
-    return as_json(found.as_json())
+    found = find.find(
+        expression,
+        settings.recordings,
+        runs=runs,
+        phase=phase or None,
+        sort=sort,
+        limit=limit or MAX_ROWS,
+    )
+    return settings.without_folders(as_json(found.as_json()).decode()).encode()
 
 
 def as_json(value: object) -> bytes:

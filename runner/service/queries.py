@@ -107,6 +107,6 @@ async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Respon
 async def _answer(request: Request, function: Callable[..., bytes], *asked: Hashable) -> bytes:
     """Return the answer to a question about all runs: computed in a process with limits, or seconds old."""
     state = request.app.state
-    make = partial(state.processes, function, state.settings.recordings, *asked)
+    make = partial(state.processes, function, state.settings, *asked)
     answer: bytes = await state.cache.get_or_await((function, *asked, state.catalogue.state()), make)
-    return bytes(state.settings.without_folders(answer.decode()).encode())
+    return answer

@@ -158,8 +158,8 @@ async def replay(
 @router.get("/report.html", response_class=Response, responses=FILE, summary="The report of the run.")
 async def report(run: RecordedRun, compute: ComputationOf, settings: SettingsOf) -> Response:
     """Return what `dualtaxi report` writes, as a download."""
-    page = (await compute(computed.report, run.recording)).decode()
-    return attachment(settings.without_folders(page).encode(), f"{run.file_stem}.html")
+    body = await compute(computed.report, run.recording, settings)
+    return attachment(body, f"{run.file_stem}.html")
 
 
 @router.post("/film", response_class=Response, responses=FILE, summary="A film of an episode of the run.")

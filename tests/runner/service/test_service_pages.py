@@ -26,6 +26,7 @@ from runner.recording.schema import LOG_TOPIC
 from runner.runs.resolve import find_run
 from runner.runs.run import RUN_FILE, Run
 from runner.service.processes import ProcessPool
+from runner.service.settings import ServiceSettings
 from tests.runner.loops.making import make, play
 from tests.waiting import until
 
@@ -224,6 +225,20 @@ def test_the_event_loop_reads_no_files_of_compared_runs_and_of_the_viewer(client
     for tab in ("divergence", "tables", "code"):
         page_of(client, f"/compare/{tab}?run=first&run=second")
     page_of(client, "/runs/first/rerun/frame?at=3")
+    assert on_loop == []
+
+
+def test_the_event_loop_searches_no_answer_for_folders(client, monkeypatch):
+    on_loop, search = [], ServiceSettings.without_folders
+
+    def without_folders(settings, text):
+        with contextlib.suppress(RuntimeError):
+            on_loop.append(asyncio.get_running_loop())
+        return search(settings, text)
+
+    monkeypatch.setattr(ServiceSettings, "without_folders", without_folders)
+    for address in ("/runs/first/report.html", "/sql?query=SELECT 1", "/find?expression=length > 0"):
+        assert client.get(f"/api/v1{address}").status_code == 200
     assert on_loop == []
 
 
