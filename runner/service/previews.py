@@ -29,47 +29,42 @@ _DESCRIPTION_BYTES: Final = 64 << 20
 """A description of a run that takes more is not waited for."""
 
 
-class Previews:
-    """The runs of uploads that are being received into a recordings folder."""
+def preview_of(recordings: Path, upload_id: str, run_id: str) -> Run | None:
+    """Return the run that shows an upload; None without one, or if the id is another run's."""
+    run = run_in(recordings / run_id) if re.fullmatch(NAME_PATTERN, run_id) else None
+    return run if run is not None and run.facts.get(PREVIEW) == upload_id else None
 
-    def __init__(self, recordings: Path) -> None:
-        self._recordings = recordings
 
-    def update(self, upload_id: str, run_id: str, body: Path) -> Run | None:
-        """Note that the sender of an upload goes on; return the run that shows it, if its bytes describe it.
+def update_preview(recordings: Path, upload_id: str, run_id: str, body: Path) -> Run | None:
+    """Note that the sender of an upload goes on; return the run that shows it, if its bytes describe it.
 
-        A run of another upload, or one that is stored, stays as it is.
-        """
-        if not re.fullmatch(NAME_PATTERN, run_id):
+    A run of another upload, or one that is stored, stays as it is.
+    """
+    if (run := preview_of(recordings, upload_id, run_id)) is not None:
+        run.beat()
+        return run
+    target = recordings / run_id
+    if not re.fullmatch(NAME_PATTERN, run_id) or os.path.lexists(target):
+        return None
+    with contextlib.suppress(RunnerError, OSError):  # its description is not complete, or no run's
+        if body.stat().st_size > _DESCRIPTION_BYTES:
             return None
-        if (run := self._run(upload_id, run_id)) is not None:
-            run.beat()
-            return run
-        target = self._recordings / run_id
-        if os.path.lexists(target):
+        with open_recording(body) as recording:
+            facts = checked_facts(recording, {})
+        if facts["run_id"] != run_id:
             return None
-        with contextlib.suppress(RunnerError, OSError):  # its description is not complete, or no run's
-            if body.stat().st_size > _DESCRIPTION_BYTES:
-                return None
-            with open_recording(body) as recording:
-                facts = checked_facts(recording, {})
-            if facts["run_id"] != run_id:
-                return None
-            # The owner is no process of this machine, so the run counts as running by its heartbeat.
-            facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload_id}
-            hidden = body.with_name("preview")
-            shutil.rmtree(hidden, ignore_errors=True)
-            hidden.mkdir()
-            os.link(body, hidden / RECORDING_FILE)
-            write_object(hidden / RUN_FILE, facts)
-            hidden.rename(target)
-        return self._run(upload_id, run_id)
+        # The owner is no process of this machine, so the run counts as running by its heartbeat.
+        facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload_id}
+        hidden = body.with_name("preview")
+        shutil.rmtree(hidden, ignore_errors=True)
+        hidden.mkdir()
+        os.link(body, hidden / RECORDING_FILE)
+        write_object(hidden / RUN_FILE, facts)
+        hidden.rename(target)
+    return preview_of(recordings, upload_id, run_id)
 
-    def remove(self, upload_id: str, run_id: str) -> None:
-        """Remove the run that shows an upload, if there is one."""
-        if (run := self._run(upload_id, run_id)) is not None:
-            shutil.rmtree(run.folder, ignore_errors=True)
 
-    def _run(self, upload_id: str, run_id: str) -> Run | None:
-        run = run_in(self._recordings / run_id) if re.fullmatch(NAME_PATTERN, run_id) else None
-        return run if run is not None and run.facts.get(PREVIEW) == upload_id else None
+def remove_preview(recordings: Path, upload_id: str, run_id: str) -> None:
+    """Remove the run that shows an upload, if it exists."""
+    if (run := preview_of(recordings, upload_id, run_id)) is not None:
+        shutil.rmtree(run.folder, ignore_errors=True)

@@ -37,7 +37,7 @@ from runner.runs.store import Store
 from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge, expecting
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
-from runner.service.previews import Previews
+from runner.service.previews import remove_preview, update_preview
 from runner.service.processes import ProcessPool, lower_priority
 from runner.service.settings import ServiceLimits, without_folders
 from runner.service.tokens import Digest
@@ -100,7 +100,7 @@ class Uploads:
         self, recordings: Path, limits: ServiceLimits, on_verified: Callable[[Upload], object]
     ) -> None:
         self._recordings, self._limits, self._on_verified = recordings, limits, on_verified
-        self._folder, self._previews = recordings / FOLDER, Previews(recordings)
+        self._folder = recordings / FOLDER
         self._lock = threading.RLock()
         """Held while uploads change, not while they are read: the server's event loop must not wait."""
         self._file_lock = lock_folder(recordings, f"{FOLDER}/lock")
@@ -170,7 +170,7 @@ class Uploads:
                 self._drop_idle()
                 self._require_place(owner)
             if upload.run_id != source.run_id:
-                self._previews.remove(upload.id, upload.run_id)
+                remove_preview(self._recordings, upload.id, upload.run_id)
             upload = replace(upload, source=source, **announced)
             self._require_room(upload, (upload.size or 0) - upload.offset)
             self._store(upload)
@@ -210,7 +210,7 @@ class Uploads:
             if upload.state == "verifying":
                 raise UploadConflict("the upload is being verified; wait for its end.")
             del self._uploads[owner, upload_id]
-        self._previews.remove(upload.id, upload.run_id)
+        remove_preview(self._recordings, upload.id, upload.run_id)
         shutil.rmtree(self._body(upload).parent, ignore_errors=True)
 
     def _body(self, upload: Upload) -> Path:
@@ -254,7 +254,7 @@ class Uploads:
                 body.touch()
                 write_object(body.with_name(STATE_FILE), _STORED.dump_python(upload, mode="json"))
                 if upload.is_over:
-                    self._previews.remove(upload.id, upload.run_id)
+                    remove_preview(self._recordings, upload.id, upload.run_id)
                     body.unlink()
         finally:  # clients see it when it is on disk
             self._uploads[upload.owner, upload.id] = upload
@@ -271,7 +271,7 @@ class Uploads:
     def _proceed(self, upload: Upload) -> Upload:
         """Verify an upload that is complete, or list the run that is still being recorded."""
         if upload.source.digest is None and upload.state == "receiving":
-            run = self._previews.update(upload.id, upload.run_id, self._body(upload))
+            run = update_preview(self._recordings, upload.id, upload.run_id, self._body(upload))
             return replace(upload, stop_requested=run is not None and run.is_stop_requested)
         if upload.offset != upload.size or upload.state != "receiving":
             return upload
