@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,13 +13,14 @@ from fastapi.responses import HTMLResponse
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.episodes import EpisodeRef
+from runner.analysis.evaluations import loop_summary
 from runner.analysis.groups import flat_config
 from runner.analysis.sections import Grid
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError
 from runner.export.plots.comparisons import letter
 from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics
+from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link, places_in, step_in
@@ -26,7 +28,7 @@ from runner.service.api.comparing import found_runs
 from runner.service.api.reading import AxisOf
 from runner.service.dependencies import At, CatalogueOf, ComputationOf
 from runner.service.fragments import ShownDifference
-from runner.service.pages.frame import RunHead, head_of, last_results, result_of
+from runner.service.pages.frame import RunHead, head_of, result_of
 from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
 from runner.util import humanize
@@ -220,7 +222,12 @@ def _settings(run: Run) -> dict[str, str]:
 
 
 def _results(run: Run) -> dict[str, str]:
-    evaluation = last_results(run).last_evaluation or EvaluationMetrics()
+    last = run.summary
+    if not run.can_train_again:
+        last = Summary()  # of a loop whose recording cannot be read
+        with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+            last = loop_summary(recording)
+    evaluation = last.last_evaluation or EvaluationMetrics()
     return {
         "Status": run.status,
         **dict(result_of(metric, evaluation) for metric in METRICS),

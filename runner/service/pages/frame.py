@@ -1,4 +1,4 @@
-"""The head of every page of a run, and the last results of loops."""
+"""The head of every page of a run, and how a metric is shown."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from typing import Annotated, Final
 
 from fastapi import Query
 
-from runner.analysis.evaluations import loop_summary
 from runner.analysis.qtable import recorded_tables
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.metrics import EvaluationMetric
 from runner.recording.reader import open_recording
-from runner.recording.run_file import EvaluationMetrics, Summary, has_environment
+from runner.recording.run_file import EvaluationMetrics, has_environment
 from runner.runs.run import Run
 from runner.service.pages.rendering import Page, Values, made
 from runner.util import humanize, plugins
@@ -25,19 +24,21 @@ from runner.views import VIEWS, view_named
 StatusName = Annotated[str, Query(max_length=20, description="The status that the page shows.")]
 
 TABS: Final = (
-    ("", "Overview"),
-    ("replay", "Replay"),
-    ("learned", "What was learned"),
-    *((view.name, view.title) for view in VIEWS.values() if view.has_tab),
-    ("config", "Configuration"),
-    ("pictures", "Pictures"),
-    ("rerun", "Rerun"),
+    ("", "Overview", ""),
+    ("replay", "Replay", "episodes"),
+    ("learned", "What was learned", "tables"),
+    *((view.name, view.title, view.needs) for view in VIEWS.values() if view.has_tab),
+    ("config", "Configuration", ""),
+    ("pictures", "Pictures", "pictures"),
+    ("rerun", "Rerun", "episodes"),
 )
+"""Paths and titles of the pages of a run, and what a run needs for each."""
 
 
 def installed_names() -> list[str]:
     """Return the names of the views that installed packages add, except names of shipped pages."""
-    return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in {**dict(TABS), **VIEWS}]
+    shipped = {*VIEWS, *(path for path, *_ in TABS)}
+    return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in shipped]
 
 
 @dataclass(frozen=True)
@@ -73,20 +74,15 @@ def head_of(run: Run) -> RunHead:
     has_tables = run.can_train_again or _has_recorded_tables(run)
     is_running_loop = run.status == "running" and not run.can_train_again
     messages, packing = run.summary.messages, run.file.config.get("recording")
-    met = {
+    has = {
         "": True,
         "checkpoints": bool(messages.get(schema.CHECKPOINT_TOPIC.name)) or is_running_loop,
         "episodes": has_episodes,
+        "pictures": bool(messages.get(schema.IMAGE_TOPIC.name)) or is_running_loop,
         "tables": has_tables,
         "training": run.can_train_again,
     }
-    needs = {"learned": "tables"} | {view.name: view.needs for view in VIEWS.values()}
-    has_tab = {
-        **{name: met[need] for name, need in needs.items()},
-        "replay": has_episodes,
-        "rerun": has_episodes,
-        "pictures": bool(messages.get(schema.IMAGE_TOPIC.name)) or is_running_loop,
-    }
+    installed = [view for view in map(view_named, installed_names()) if view.has_tab]
     return RunHead(
         id=run.run_id,
         name=run.name,
@@ -96,13 +92,13 @@ def head_of(run: Run) -> RunHead:
         tags=run.tags,
         note=run.note,
         tabs=(
-            *(tab for tab in TABS if has_tab.get(tab[0], True)),
-            *((view.name, view.title) for view in map(view_named, installed_names()) if view.has_tab),
+            *((path, title) for path, title, need in TABS if has[need]),
+            *((view.name, view.title) for view in installed),
         ),
         lacking={
-            name: "Q-tables" if not has_tables else "training that the runner can repeat"
-            for name, need in needs.items()
-            if not met[need] and need in ("tables", "training")
+            path: "training that the runner can repeat" if has_tables else "Q-tables"
+            for path, _, need in TABS
+            if need in ("tables", "training") and not has[need]
         },
         steps=str(packing.get("steps", "all")) if isinstance(packing, Mapping) else "all",
     )
@@ -115,15 +111,6 @@ def _has_recorded_tables(run: Run) -> bool:
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         return recording.tabular and next(recorded_tables(recording), None) is not None
     return False
-
-
-def last_results(run: Run) -> Summary:
-    """Return the last results of a run; a loop's are empty if its recording cannot be read."""
-    if run.can_train_again:
-        return run.summary
-    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
-        return loop_summary(recording)
-    return Summary()
 
 
 def result_of(metric: EvaluationMetric, evaluation: EvaluationMetrics) -> tuple[str, str]:
