@@ -201,7 +201,7 @@ class ProcessPool:
         except CallFailed:
             is_reusable = False
             if self._closed.is_set():
-                raise Busy("the service is stopping.") from None
+                raise Busy("the service is stopping; try again when it was started again.") from None
             raise
         finally:
             if is_reusable:
@@ -211,7 +211,7 @@ class ProcessPool:
 
     def _start(self) -> ChildProcess:
         if self._closed.is_set():
-            raise Busy("the service is stopping.")
+            raise Busy("the service is stopping; try again when it was started again.")
         try:
             child = ChildProcess(self._memory_bytes, self._context)
         except OSError as error:

@@ -140,7 +140,9 @@ class Tokens:
         digest = _digest(secret)
         matching = [token for token in self.all() if hmac.compare_digest(token.sha256, digest)]
         if not matching:
-            raise Unauthorized("token: found one that is unknown, or was revoked.")
+            raise Unauthorized(
+                "token: found one that is unknown, or was revoked; make one by `dualtaxi token create NAME`."
+            )
         return matching[-1]
 
     def create(self, name: str, scopes: tuple[str, ...]) -> tuple[Token, str]:
@@ -157,7 +159,9 @@ class Tokens:
 
         def add(tokens: tuple[Token, ...]) -> tuple[Token, ...]:
             if len(tokens) >= MAX_TOKENS:
-                raise RunnerError(f"token: there are {MAX_TOKENS} tokens; revoke some.")
+                raise RunnerError(
+                    f"token: there are {MAX_TOKENS} tokens; revoke some by `dualtaxi token revoke NAME`."
+                )
             for other in tokens:
                 if other.name == name:
                     raise RunnerError(

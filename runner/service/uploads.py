@@ -132,7 +132,9 @@ class Uploads:
         """Return an upload of this owner."""
         if upload := self._uploads.get((owner, upload_id)):
             return upload
-        raise RunNotFound("no such upload: it was deleted, is stored, or belongs to another token.")
+        raise RunNotFound(
+            "no such upload: it was deleted, is stored, or belongs to another token; begin it again."
+        )
 
     def put(self, owner: str, upload_id: str, source: UploadSource) -> Upload:
         """Begin an upload, or continue it with new facts from its sender; return it.
@@ -327,7 +329,9 @@ def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
         if source.checkpoint_of:
             run = run_of_id(source.checkpoint_of, recordings)
             if run is None:
-                raise RunNotFound("the run of this checkpoint was removed.")
+                raise RunNotFound(
+                    "the run of this checkpoint was removed; push the run, then the checkpoint again."
+                )
             Store(recordings).put(run.folder.name, body, expected=source.digest)
             return replace(upload, state="stored", run_id=run.run_id)
         imported = import_recording(body, recordings, source.run or None)

@@ -112,7 +112,9 @@ def checkpoint(
     for kept in run.checkpoints():
         if kept.digest == digest and kept.is_here:
             return _file(kept.path, f"{run.file_stem}-{kept.step}.{kept.format}", digest, if_none_match)
-    raise RunNotFound(f"run {run.run_id} has no checkpoint of the digest {digest[:16]}… here.")
+    raise RunNotFound(
+        f"run {run.run_id} has no checkpoint of the digest {digest[:16]}… here; /checkpoints lists them."
+    )
 
 
 @router.get(

@@ -167,5 +167,7 @@ def parent_in(spec: JobSpec, run_id: str) -> Run:
     """
     parent = run_of_id(run_id, spec.recordings)
     if parent is None:
-        raise RunnerError(f"run {run_id}, the parent of this branch, is no longer there.")
+        raise RunnerError(
+            f"run {run_id}, the parent of this branch, is no longer there; import it, and resume the job."
+        )
     return at_hand(parent)

@@ -124,4 +124,6 @@ class JobQueue:
     def _refuse_running_sweep(self, name: str) -> None:
         for job in self.store.jobs():
             if job.kind == "sweep" and job.name == name and not job.is_over:
-                raise JobStateConflict(f"job {job.number} does the sweep {name!r} already.")
+                raise JobStateConflict(
+                    f"job {job.number} does the sweep {name!r} already; wait for its end, or cancel it."
+                )

@@ -43,7 +43,9 @@ def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
     if status.stopped:
         raise RunnerError(f"stopped: {status.stopped}")
     if status.failed:
-        raise RunnerError(f"{status.failed:,} of {status.runs:,} runs failed; the sweep says why.")
+        raise RunnerError(
+            f"{status.failed:,} of {status.runs:,} runs failed; `dualtaxi sweep show {sweep.name}` says why."
+        )
 
 
 def _reporter(channel: JobChannel) -> Callable[[SweepStatus], None]:
