@@ -21,10 +21,11 @@ from typing import Final
 
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_readable
+from runner.recording.run_file import EvaluationMetrics
 from runner.runs.catalogue.columns import IndexRow, moment
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
-from runner.runs.catalogue.rows import Sql, row_of
+from runner.runs.catalogue.rows import Sql
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.listing import listed_run
 from runner.runs.locking import locked
@@ -93,17 +94,44 @@ def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     Args:
         foreign: also remove foreign files in its folder.
     """
-    row = row_of(run, None)
-    return _removal(row, root, run.folder, _why_not_in(run, root) or _protected(run), foreign)
+    refusal, contents = _judged(run.folder, _why_not_in(run, root) or _protected(run), foreign)
+    evaluation = run.summary.last_evaluation or EvaluationMetrics()
+    return Removal(
+        run_id=run.run_id,
+        name=run.name,
+        seed=run.file.seed if run.has_seed else None,
+        status=run.status,
+        success_percent=evaluation.values.get("success_percent"),
+        created=run.created,
+        folder=run.folder,
+        is_archived=bool(run.archive),
+        root=root,
+        contents=contents,
+        refusal=refusal,
+    )
 
 
 def plan_row(row: IndexRow, foreign: bool) -> Removal:
     """Return the removal of a run by its row in the index, which is quicker for very many runs."""
     folder = Path(row["root"], row["entry"])
-    return _removal(row, folder.parent, folder, _linked(folder) or _unreadable(folder), foreign)
+    refusal, contents = _judged(folder, _linked(folder) or _unreadable(folder), foreign)
+    return Removal(
+        run_id=row["id"],
+        name=row["name"],
+        seed=row["seed"],
+        status=row["status"],
+        success_percent=row["success_percent"],
+        created=moment(row),
+        folder=folder,
+        is_archived=bool(row["archive"]),
+        root=folder.parent,
+        contents=contents,
+        refusal=refusal,
+    )
 
 
-def _removal(row: IndexRow, root: Path, folder: Path, refusal: str, foreign: bool) -> Removal:
+def _judged(folder: Path, refusal: str, foreign: bool) -> tuple[str, Contents]:
+    """Return why a run stays, `refusal` or what its folder holds, and the contents of the folder."""
     contents = Contents()
     if not refusal:
         try:
@@ -115,19 +143,7 @@ def _removal(row: IndexRow, root: Path, folder: Path, refusal: str, foreign: boo
             f"its folder also has {listed(contents.foreign)}, which no run writes; "
             "move that away, or remove it as well with --foreign-files"
         )
-    return Removal(
-        run_id=row["id"],
-        name=row["name"],
-        seed=row["seed"],
-        status=row["status"],
-        success_percent=row["success_percent"],
-        created=moment(row),
-        folder=folder,
-        is_archived=bool(row["archive"]),
-        root=root,
-        contents=contents,
-        refusal=refusal,
-    )
+    return refusal, contents
 
 
 def remove(removal: Removal, foreign: bool = False) -> None:

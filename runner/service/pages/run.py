@@ -290,6 +290,7 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
     if run.status == "running" and planned is not None and episodes is not None:
         share = min(1.0, episodes / planned)
         progress = f"{episodes:,} of {planned:,} training episodes"
+    error = run.problem or damage or run.summary.error
     stop: Literal["", "possible", "requested"] = ""
     if run.status == "running" and not run.can_train_again:
         stop = "requested" if run.is_stop_requested else "possible"
@@ -297,7 +298,7 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
         facts=facts,
         share=share,
         progress=progress,
-        error=settings.without_folders(run.problem or damage or run.summary.error or ""),
+        error=settings.without_folders(error) if error else "",
         job=number,
         is_live=run.status == "running" or (number is not None and run.status != "finished"),
         run_id=run.run_id,

@@ -9,6 +9,7 @@ import json
 import re
 import shutil
 import sys
+import threading
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from runner.environments.naming import agent_actions_in_words, states_in_words
 from runner.execution.branching import branch_training
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import reader
-from runner.recording.reader import open_recording
+from runner.recording.reader import Recording, open_recording
 from runner.recording.record_store import RecordStore
 from runner.recording.schema import LOG_TOPIC
 from runner.runs.resolve import find_run
@@ -240,6 +241,25 @@ def test_the_event_loop_searches_no_answer_for_folders(client, monkeypatch):
     for address in ("/runs/first/report.html", "/sql?query=SELECT 1", "/find?expression=length > 0"):
         assert client.get(f"/api/v1{address}").status_code == 200
     assert on_loop == []
+
+
+def test_the_page_of_a_run_opens_its_recording_once(client, recordings, monkeypatch):
+    opened, init = [], Recording.__init__
+
+    def count(recording, path):
+        if not threading.current_thread().name.startswith("catalogue"):
+            opened.append(path)
+        init(recording, path)
+
+    with runner.record(make("CartPole-v1"), recordings, name="going") as env:
+        for _ in play(env, 20):
+            pass
+        until(lambda answer: answer.is_success, lambda: client.get("/api/v1/runs/going"))
+        monkeypatch.setattr(Recording, "__init__", count)
+        for name in ("going", "first"):
+            page_of(client, f"/runs/{name}")
+            assert len(opened) == 1
+            opened.clear()
 
 
 def test_only_differences_in_settings_can_be_explained(client, recordings):
