@@ -72,8 +72,9 @@ def head_of(run: Run) -> RunHead:
     """Return the facts of a run that all of its pages show."""
     has_episodes = has_environment(run.file.config)
     has_tables = run.can_train_again or _has_recorded_tables(run)
-    is_running_loop = run.status == "running" and not run.can_train_again
-    messages, packing = run.summary.messages, run.file.config.get("recording")
+    status, messages = run.status, run.summary.messages
+    packing = run.file.config.get("recording")
+    is_running_loop = status == "running" and not run.can_train_again
     has = {
         "": True,
         "checkpoints": bool(messages.get(schema.CHECKPOINT_TOPIC.name)) or is_running_loop,
@@ -87,7 +88,7 @@ def head_of(run: Run) -> RunHead:
         id=run.run_id,
         name=run.name,
         seed=run.seed if run.has_seed else None,
-        status=run.status,
+        status=status,
         created=run.created.isoformat(),
         tags=run.tags,
         note=run.note,

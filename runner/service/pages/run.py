@@ -267,6 +267,7 @@ def _overview(
 
 
 def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
+    status = run.status
     number, live = _job_of(run, jobs)
     done, results, environment, damage = _recorded(run)
     summary = live or done
@@ -287,12 +288,12 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
         "Recording": humanize.size(summary["bytes"]) if summary.get("bytes") else humanize.UNKNOWN,
     }
     planned, share, progress = run.episodes_to_do, None, ""
-    if run.status == "running" and planned is not None and episodes is not None:
+    if status == "running" and planned is not None and episodes is not None:
         share = min(1.0, episodes / planned)
         progress = f"{episodes:,} of {planned:,} training episodes"
     error = run.problem or damage or run.summary.error
     stop: Literal["", "possible", "requested"] = ""
-    if run.status == "running" and not run.can_train_again:
+    if status == "running" and not run.can_train_again:
         stop = "requested" if run.is_stop_requested else "possible"
     return Status(
         facts=facts,
@@ -300,7 +301,7 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
         progress=progress,
         error=settings.without_folders(error) if error else "",
         job=number,
-        is_live=run.status == "running" or (number is not None and run.status != "finished"),
+        is_live=status == "running" or (number is not None and status != "finished"),
         run_id=run.run_id,
         stop=stop,
     )
