@@ -311,11 +311,14 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Me
 
 
 def evaluation_brief(metrics: Message) -> Message:
-    """Return the metrics of an evaluation for a summary; unknown values are None."""
-    values = {metric.name: metrics[metric.field] for metric in METRICS if not metric.per_agent}
+    """Return the metrics of an evaluation for a summary, summed over the agents; unknown values are None."""
+    values = {
+        metric.name: sum(metrics[metric.field]) if metric.per_agent else metrics[metric.field]
+        for metric in METRICS
+    }
     return {
         "episode": metrics["episode"],
-        **{name: None if math.isnan(value) else value for name, value in values.items()},
+        **{name: value if math.isfinite(value) else None for name, value in values.items()},
     }
 
 

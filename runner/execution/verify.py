@@ -715,6 +715,9 @@ def _compare_values(path: str, found: object, expected: object) -> None:
 def _compare_result(found: Verification, recording: Recording, expected: Json) -> Verification:
     """Compare the result in a recording with the computed one."""
     for key, value in expected.items():
-        if recording.result.get(key) != value:
+        stated = recording.result.get(key)
+        if key == "last_evaluation" and stated and "mean_return" not in stated:  # of an older version
+            stated = {**stated, "mean_return": value["mean_return"]} if value else stated
+        if stated != value:
             return _with_difference(found, Diverged("metadata result", key, recording.result.get(key), value))
     return replace(found, content_digest=expected["content_digest"])

@@ -49,7 +49,7 @@ class EvaluationMetrics:
     """Training episodes before it."""
     trials: int | None = None
     values: Mapping[str, float | None] = field(default_factory=dict)
-    """Value by name of a metric; the sum over agents of one that each agent has, known of loops."""
+    """Value by name of a metric; the sum over agents of one that each agent has."""
 
     @classmethod
     def of(cls, record: JsonView) -> EvaluationMetrics:

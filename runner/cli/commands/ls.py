@@ -108,10 +108,10 @@ def ls_command(
       configuration
 
     The table shows the training episodes done (and to do, if some are missing), the percentage of the last
-    evaluation's trials that succeeded, the size of the recording, how long ago the run began, which run
-    recorded the same content before, which run it is a branch of, and what was changed. For a loop it also
-    shows the mean return in its last evaluation (in its last 100 training episodes, if it has none) and the
-    last values that it logged. A narrow terminal has fewer columns.
+    evaluation's trials that succeeded, their mean return (of a loop without evaluations that of its last 100
+    training episodes), the size of the recording, how long ago the run began, which run recorded the same
+    content before, which run it is a branch of, and what was changed. For a loop it also shows the last
+    values that it logged. A narrow terminal has fewer columns.
 
     Examples:
       dualtaxi ls

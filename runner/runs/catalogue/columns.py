@@ -148,7 +148,7 @@ COLUMNS: Final = {
                 metric.name,
                 ColumnKind.NUMBER,
                 f"{metric.heading} of the last evaluation"
-                + (" of a loop; of its last 100 training episodes without one" if metric.per_agent else ""),
+                + ("; of a loop without one of its last 100 training episodes" if metric.per_agent else ""),
                 float,
                 heading=_METRIC_HEADINGS.get(metric.name, ""),
                 show=number,

@@ -37,6 +37,7 @@ def test_json_is_a_line_for_each_run(command, tiny):
             "success_percent",
             "mean_length",
             "mean_penalties",
+            "mean_return",
         }
         assert line["status"] == "finished"
         assert line["bytes"] > 1000

@@ -147,6 +147,7 @@ def test_run_json_says_what_was_done(tmp_path):
         "success_percent": last["success_percent"],
         "mean_length": last["eval_mean_length"],
         "mean_penalties": last["mean_penalties"],
+        "mean_return": pytest.approx(sum(last["mean_returns"])),
     }
     assert summary["bytes"] == run.recording.stat().st_size
     assert 0 < summary["seconds"] < 300

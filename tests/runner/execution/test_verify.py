@@ -176,6 +176,15 @@ def test_a_changed_result(run, tmp_path):
         assert (found.difference.topic, found.difference.field) == ("metadata result", key)
 
 
+def test_a_result_of_an_older_version_has_no_mean_return(run, tmp_path):
+    def change(entries):
+        result = json.loads(entries["json"])
+        del result["last_evaluation"]["mean_return"]
+        return {"json": json.dumps(result)}
+
+    assert verify(altered(run.recording, tmp_path / "older.mcap", None, id, result=change)).difference is None
+
+
 def test_cut_off(run, tmp_path):
     path = tmp_path / "x.mcap"
     path.write_bytes(run.recording.read_bytes())
