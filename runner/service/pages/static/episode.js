@@ -1,5 +1,5 @@
 // The replay of an episode: the address names the step, and so do the links to other pages.
-import { json } from "./page.js";
+import { isTaken, json } from "./page.js";
 import { listen, open } from "./player.js";
 
 const root = document.querySelector("[data-source]"),
@@ -38,8 +38,7 @@ bar.slider.after(ticks);
 bar.slider.setAttribute("list", ticks.id);
 const mark = root.querySelector("[data-step=now]")?.form.elements.text;
 document.addEventListener("keydown", (event) => {
-  if (event.key.toLowerCase() !== "m" || event.ctrlKey || event.metaKey || event.altKey || !mark) return;
-  if (event.target.matches("input:not([type=range]), textarea, select")) return;
+  if (event.key.toLowerCase() !== "m" || isTaken(event) || !mark) return;
   event.preventDefault();
   bar.pause();
   mark.focus();

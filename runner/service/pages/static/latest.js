@@ -1,8 +1,6 @@
 // The latest whole episode of each run that is running, which replays by itself; when it is over, the next latest one.
-import { request } from "./page.js";
+import { request, wait } from "./page.js";
 import { open } from "./player.js";
-
-const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 async function follow(place) {
   let replay = null,

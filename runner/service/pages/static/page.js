@@ -11,6 +11,15 @@ export async function request(address, options = {}) {
 
 export const json = async (address) => (await request(address)).json();
 
+export const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+
+// Whether a key is part of a shortcut of the browser, or typed into a field.
+export const isTaken = (event) =>
+  event.ctrlKey ||
+  event.metaKey ||
+  event.altKey ||
+  event.target.matches("input:not([type=checkbox], [type=range]), textarea, select");
+
 // A part that takes long replaces its placeholder; one over the axis of charts reads every step, so only when it is seen.
 async function load(place) {
   const address = new URL(place.dataset.later, location.href),

@@ -1,10 +1,9 @@
 // Opens a recording in the Rerun viewer at a step; the viewer's files come from this service.
-import { request } from "./page.js";
+import { request, wait } from "./page.js";
 
 const place = document.body.dataset,
   message = document.getElementById("message");
 const theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
-const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 // The viewer sends usage data to its makers, which the policy of this page forbids; this avoids the attempt.
 const own = window.fetch.bind(window);

@@ -1,4 +1,6 @@
 // The table of runs: selecting runs to compare, and keys to move in it.
+import { isTaken } from "./page.js";
+
 const form = document.querySelector("[data-rows]");
 const search = document.querySelector("[data-focus]");
 
@@ -21,13 +23,7 @@ function step(by) {
 }
 
 document.addEventListener("keydown", (event) => {
-  if (
-    event.ctrlKey ||
-    event.metaKey ||
-    event.altKey ||
-    event.target.matches("input:not([type=checkbox]), textarea, select")
-  )
-    return;
+  if (isTaken(event)) return;
   if (event.key === "/") {
     event.preventDefault();
     search.focus();
