@@ -139,7 +139,7 @@ const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
 const spoken = (name) => name.replaceAll("_", " ");
 const linesOf = (curves) => [...new Set(curves.map(({ line }) => line))];
 const known = (value) => value !== null && value !== undefined;
-const exact = (value) => value.toLocaleString("en", { maximumSignificantDigits: 6 });
+const exact = (value) => value?.toLocaleString("en", { maximumSignificantDigits: 6 }) ?? "";
 const axisLabel = () => last.axes.find(({ name }) => name === last.axis).label;
 
 function groupName({ label, runs: own }) {
@@ -172,7 +172,7 @@ function summary(curve, label) {
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 // The series of curves: of each its band, its single runs, its values (faint if they are smoothed), and the smoothed
-// line.
+// line. All have names; those with labels are in the key.
 function seriesOf(curves) {
   const lines = linesOf(curves);
   return curves.flatMap((curve) => {
@@ -184,22 +184,26 @@ function seriesOf(curves) {
       runName = (i) => [named(last.groups[curve.group].runs[i]), lines.length > 1 && spoken(curve.line)];
     const values = curve.smoothed ? { stroke: `${stroke}55`, width: 1 } : { label, points: { show: size > 0, size } };
     const drawn = [
-      [curve.high, { width: 0, fill: `${stroke}33` }],
-      [curve.low, { width: 0 }],
+      [curve.high, { name: `${label}, high`, width: 0, fill: `${stroke}33` }],
+      [curve.low, { name: `${label}, low`, width: 0 }],
       ...curve.runs.map((run, i) => [run, { width: 0.7, stroke: `${stroke}aa`, label: runName(i).filter(Boolean).join(", ") }]),
       [curve.values, values],
       [curve.smoothed, { label }],
     ];
-    return drawn.filter(([values]) => values).map(([values, look]) => ({ ...base, positions: curve.positions, values, ...look }));
+    return drawn
+      .filter(([values]) => values)
+      .map(([values, look]) => ({ ...base, name: look.label ?? label, positions: curve.positions, values, ...look }));
   });
 }
+
+const joined = (series) => uPlot.join(series.map(({ positions, values }) => [positions, values]));
 
 function plot(metric, curves, isPinned) {
   const { log_x, log_y } = chosen(),
     { title, unit } = curves[0],
     series = seriesOf(curves),
     looks = series.map(({ positions, values, ...look }) => look),
-    points = uPlot.join(series.map(({ positions, values }) => [positions, values])),
+    points = joined(series),
     logY = log_y && points.slice(1).some((values) => values.some((value) => value > 0));
   const one = shown.get(metric) ?? figureOf(metric, title);
   const { caption, place, key, picture, pin } = one,
@@ -238,16 +242,11 @@ function figureOf(metric, title) {
 // Save every recorded point of a metric, as CSV.
 async function download(metric) {
   const { axis, curves } = await json(`/api/v1/curves?${queryOf({ metric, lines: chosen().lines })}`);
-  const heads = curves.flatMap((curve) => {
-    const label = labelOf(curve, curves),
-      band = curve.low ? [`${label}, low`, `${label}, high`] : [];
-    return [label, ...band, ...curve.runs.map((_, i) => named(last.groups[curve.group].runs[i]))];
-  });
-  const columns = ({ positions, values, low, high, runs }) => [positions, values, ...(low ? [low, high] : []), ...runs],
-    data = uPlot.join(curves.map(columns)),
-    quoted = (name) => `"${name.replaceAll('"', '""')}"`,
+  const series = seriesOf(curves),
+    data = joined(series),
+    heads = [axis, ...series.map(({ name }) => name)].map((name) => `"${name.replaceAll('"', '""')}"`),
     rows = data[0].map((_, i) => data.map((values) => values[i] ?? ""));
-  const text = [[axis, ...heads].map(quoted), ...rows].map((row) => `${row.join(",")}\n`);
+  const text = [heads, ...rows].map((row) => `${row.join(",")}\n`);
   const link = document.createElement("a");
   link.href = URL.createObjectURL(new Blob(text, { type: "text/csv" }));
   link.download = `${metric}.csv`;
@@ -281,7 +280,7 @@ function legend(chart, key, looks) {
 function readOut(chart, key) {
   const at = chart.cursor.left >= 0 ? chart.cursor.idx : null,
     [position, ...outputs] = [...key.querySelectorAll("output")].reverse();
-  const value = ({ dataset }) => (known(at) && known(chart.data[dataset.series][at]) ? exact(chart.data[dataset.series][at]) : "");
+  const value = ({ dataset }) => exact(chart.data[dataset.series][at]);
   for (const output of outputs) output.textContent = value(output);
   const alone = outputs.length === 1 && value(outputs[0]);
   if (position)
