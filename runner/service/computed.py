@@ -9,7 +9,6 @@ import os
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from http import HTTPStatus
 from itertools import islice
 from pathlib import Path
 from typing import Final, Literal
@@ -21,7 +20,7 @@ from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import histograms
 from runner.analysis.sections import Answer
 from runner.archive.places import default_target
-from runner.errors import RunnerError
+from runner.errors import ConfigError, RunnerError
 from runner.export.encoder import FORMATS
 from runner.export.film import Shot, usual_speed, write_film
 from runner.export.pictures import Pictures
@@ -33,7 +32,6 @@ from runner.export.rerun.viewer import require_rerun
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.service.errors import Refused
 from runner.service.settings import ServiceSettings
 from runner.util.extras import require
 from runner.util.values import finite
@@ -70,8 +68,7 @@ def records(path: Path, kind: RecordKind, rows: range, limit: int) -> bytes:
 def require_few(found: int, limit: int) -> None:
     """Refuse a range of more records than a response may have."""
     if found > limit:
-        raise Refused(
-            HTTPStatus.UNPROCESSABLE_ENTITY,
+        raise ConfigError(
             f"query: found a range of {found:,} records, expected at most {limit:,}; request them in parts.",
         )
 

@@ -16,7 +16,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef
-from runner.errors import RunNotFound
+from runner.errors import ConfigError, RunNotFound
 from runner.export.encoder import FORMATS
 from runner.export.plugin import installed_export
 from runner.export.rerun.selection import Request
@@ -31,7 +31,6 @@ from runner.service.dependencies import (
     SettingsOf,
     recording_state,
 )
-from runner.service.errors import Refused
 from runner.service.tokens import Digest
 from runner.util.plugins import EXPORTS, plugin_names
 from runner.util.processes import CallFailed
@@ -246,7 +245,6 @@ def _ranges(text: str) -> Ranges:
     try:
         return ranges_in(text) if text else ()
     except ValueError as error:
-        raise Refused(
-            HTTPStatus.UNPROCESSABLE_ENTITY,
+        raise ConfigError(
             f"query.episodes: found {text!r}, expected START..STOP or N, such as 0..20,49980..",
         ) from error

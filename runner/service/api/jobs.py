@@ -14,6 +14,7 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import Field
 
 from runner.client.jobs import JobEvent, JobsPage, JobState, JobStatus
+from runner.errors import ConfigError
 from runner.service.dependencies import JobsOf
 from runner.service.errors import JobNotFound, Refused, expecting
 from runner.service.jobs.checking import DEFAULT_SOURCE
@@ -53,15 +54,14 @@ async def text_of(request: Request) -> str:
     """Return the text in the body of a request, whatever its media type.
 
     Raises:
-        Refused: it is not UTF-8.
+        ConfigError: it is not UTF-8.
     """
     content = await request.body()
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
-        raise Refused(
-            HTTPStatus.UNPROCESSABLE_ENTITY,
+        raise ConfigError(
             f"line {line}: found the byte 0x{content[error.start]:02x}, expected text in UTF-8",
         ) from error
 

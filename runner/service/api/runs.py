@@ -12,6 +12,7 @@ from pydantic import BaseModel, Field
 
 from runner.analysis.marking import mark, unmark
 from runner.analysis.summary import describe_run
+from runner.errors import ConfigError
 from runner.recording.labels import MAX_NOTE, MAX_TAGS
 from runner.recording.marks import MAX_MARK_TEXT, read_marks
 from runner.runs.catalogue.columns import DEFAULT_JSON, columns_of
@@ -31,7 +32,6 @@ from runner.service.dependencies import (
     json_response,
     require_written,
 )
-from runner.service.errors import Refused
 from runner.service.settings import ServiceSettings
 from runner.util.values import Json
 
@@ -67,8 +67,7 @@ async def list_runs(
 ) -> Response:
     """List runs as `dualtaxi ls` does."""
     if limit > settings.limits.page_runs:
-        raise Refused(
-            HTTPStatus.UNPROCESSABLE_ENTITY,
+        raise ConfigError(
             f"query.limit: found {limit}, expected at most {settings.limits.page_runs}; use offset.",
         )
 
