@@ -61,28 +61,10 @@ class Busy(RequestError):
         super().__init__(message)
 
 
-class QueueFull(RequestError):
-    """The maximum number of unfinished jobs is reached."""
-
-    status = HTTPStatus.TOO_MANY_REQUESTS
-
-
 class JobNotFound(RequestError):
     """No job has this number."""
 
     status = HTTPStatus.NOT_FOUND
-
-
-class JobStateConflict(RequestError):
-    """The job's state does not allow the operation."""
-
-    status = HTTPStatus.CONFLICT
-
-
-class UploadConflict(RequestError):
-    """The upload is not in the state that the request assumes; ask for its offset, and continue there."""
-
-    status = HTTPStatus.CONFLICT
 
 
 class UploadTooLarge(RequestError):
@@ -91,7 +73,13 @@ class UploadTooLarge(RequestError):
     status = HTTPStatus.REQUEST_ENTITY_TOO_LARGE
 
 
-class TooManyUploads(RequestError):
-    """The maximum number of open uploads is reached; try again later."""
+class StateConflict(RequestError):
+    """A job or an upload is in another state than the request assumes; look at it, and ask again."""
+
+    status = HTTPStatus.CONFLICT
+
+
+class LimitReached(RequestError):
+    """The maximum number of unfinished jobs, open uploads or event streams is reached; try again later."""
 
     status = HTTPStatus.TOO_MANY_REQUESTS

@@ -34,7 +34,7 @@ from runner.runs.importing import import_recording, merge_marks
 from runner.runs.resolve import run_of_id
 from runner.runs.run import Run
 from runner.runs.store import Store
-from runner.service.errors import Busy, TooManyUploads, UploadConflict, UploadTooLarge, expecting
+from runner.service.errors import Busy, LimitReached, StateConflict, UploadTooLarge, expecting
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
 from runner.service.previews import remove_preview, update_preview
@@ -143,8 +143,8 @@ class Uploads:
         counts as stored at once, and its bytes are dropped.
 
         Raises:
-            UploadConflict, RunNotFound: another digest was announced, or a run has no such checkpoint.
-            UploadTooLarge, TooManyUploads, StorageError: there is no room for it.
+            StateConflict, RunNotFound: another digest was announced, or a run has no such checkpoint.
+            UploadTooLarge, LimitReached, StorageError: there is no room for it.
             Busy: the server could not verify it, and will try again.
         """
         with self._lock:
@@ -152,7 +152,7 @@ class Uploads:
             fresh = Upload(id=upload_id, owner=owner, source=source, created=now(), **announced)
             upload = self._uploads.get((owner, upload_id), fresh)
             if upload.source.digest not in (None, source.digest):
-                raise UploadConflict("found another digest than the one announced; begin another upload.")
+                raise StateConflict("found another digest than the one announced; begin another upload.")
             if upload.state in ("verifying", "refused"):
                 return upload
             if upload.problem:
@@ -184,7 +184,7 @@ class Uploads:
         `more` bytes are announced to follow; they are refused now if there is no room for them.
 
         Raises:
-            UploadConflict: the bytes do not follow those that were received.
+            StateConflict: the bytes do not follow those that were received.
             UploadTooLarge: they are more than announced, or than the server accepts.
             StorageError: the disk fails, or has only its reserve left; what was written stays.
         """
@@ -192,7 +192,7 @@ class Uploads:
             upload = self.get(owner, upload_id)
             if upload.state != "receiving" or offset != upload.offset:
                 expected = f"expected {upload.offset:,} ({upload.state})"
-                raise UploadConflict(f"found bytes from {offset:,} on, {expected}.")
+                raise StateConflict(f"found bytes from {offset:,} on, {expected}.")
             self._require_room(upload, len(data) + more)
             with storage_errors(self._folder), self._body(upload).open("ab", buffering=0) as stream:
                 try:
@@ -205,12 +205,12 @@ class Uploads:
         """Forget an upload, and remove what was received.
 
         Raises:
-            UploadConflict: it is being verified.
+            StateConflict: it is being verified.
         """
         with self._lock:
             upload = self.get(owner, upload_id)
             if upload.state == "verifying":
-                raise UploadConflict("the upload is being verified; wait for its end.")
+                raise StateConflict("the upload is being verified; wait for its end.")
             del self._uploads[owner, upload_id]
         remove_preview(self._recordings, upload.id, upload.run_id)
         shutil.rmtree(self._body(upload).parent, ignore_errors=True)
@@ -228,16 +228,16 @@ class Uploads:
             raise RunNotFound("no such run: push it before the contents of its checkpoints.")
         checkpoints = [(each.digest, each.size) for each in run.checkpoints()]
         if (source.digest, source.size) not in checkpoints:
-            raise UploadConflict(f"run {run.run_id} has no checkpoint of this digest and size.")
+            raise StateConflict(f"run {run.run_id} has no checkpoint of this digest and size.")
         return run if Store(self._recordings).has(source.digest or "", source.size or 0) else None
 
     def _require_place(self, owner: str) -> None:
         """Refuse a new upload if too many are open."""
         owners = [upload.owner for upload in self.all() if not upload.is_over]
         if (own := owners.count(owner)) >= self._limits.uploads_each:
-            raise TooManyUploads(f"{own:,} of your uploads are open, the maximum; complete or delete some.")
+            raise LimitReached(f"{own:,} of your uploads are open, the maximum; complete or delete some.")
         if len(owners) >= self._limits.uploads:
-            raise TooManyUploads(f"{len(owners):,} uploads are open; try again when some are done.")
+            raise LimitReached(f"{len(owners):,} uploads are open; try again when some are done.")
 
     def _require_room(self, upload: Upload, more: int) -> None:
         """Refuse an upload if there is no room for more of its bytes."""

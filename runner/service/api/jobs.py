@@ -16,7 +16,7 @@ from pydantic import Field
 from runner.client.jobs import JobEvent, JobsPage, JobState, JobStatus
 from runner.errors import ConfigError
 from runner.service.dependencies import JobsOf
-from runner.service.errors import JobNotFound, Refused, expecting
+from runner.service.errors import JobNotFound, LimitReached, expecting
 from runner.service.jobs.checking import DEFAULT_SOURCE
 from runner.service.jobs.store import JobEstimate, QueuedJob
 from runner.service.problems import media_docs
@@ -170,15 +170,13 @@ async def last_event(
 
     Raises:
         HTTPException: 204, as the job is over and it has them all; this stops a browser from reconnecting.
-        Refused: too many watch.
+        LimitReached: too many watch.
     """
     last = int(last_event_id) if last_event_id.isdecimal() and len(last_event_id) < 16 else after
     if jobs.store.job(number).is_over and last == jobs.store.log_size(number):
         raise HTTPException(HTTPStatus.NO_CONTENT)
     if jobs.watchers >= MAX_WATCHERS:
-        raise Refused(
-            HTTPStatus.TOO_MANY_REQUESTS, f"the maximum of {MAX_WATCHERS} event streams is open; try again."
-        )
+        raise LimitReached(f"the maximum of {MAX_WATCHERS} event streams is open; try again.")
     return last
 
 

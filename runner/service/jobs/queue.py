@@ -8,7 +8,7 @@ from typing import Self
 from runner.client.jobs import LogEvent, QueueStatus
 from runner.errors import StorageError
 from runner.execution.estimate import free_bytes
-from runner.service.errors import JobStateConflict
+from runner.service.errors import StateConflict
 from runner.service.jobs.checking import JobChecker
 from runner.service.jobs.store import CheckedJob, JobStore, QueuedJob, now
 from runner.service.jobs.workers import WorkerPool
@@ -71,12 +71,12 @@ class JobQueue:
         """Cancel a job; its worker closes its recording, which stays.
 
         Raises:
-            JobStateConflict: it is over.
+            StateConflict: it is over.
         """
         with self.store.lock:
             job = self.store.job(number)
             if job.is_over:
-                raise JobStateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
+                raise StateConflict(f"job {number} is {job.state} already; there is nothing to cancel.")
             return self.store.update(number, state="cancelled", ended=now())
 
     def resume(self, number: int, accept_changes: bool = False) -> QueuedJob:
@@ -85,13 +85,13 @@ class JobQueue:
         Runs that other code started are resumed only if the changes are accepted.
 
         Raises:
-            JobStateConflict: it is finished, or not over yet.
+            StateConflict: it is finished, or not over yet.
         """
         with self.store.lock:
             job = self.store.job(number)
             if job.state not in ("failed", "cancelled"):
                 hint = "there is nothing to do" if job.state == "finished" else "wait for its end"
-                raise JobStateConflict(f"job {number} is {job.state}; {hint}.")
+                raise StateConflict(f"job {number} is {job.state}; {hint}.")
             if job.kind == "sweep":
                 self._refuse_running_sweep(job.name)
             return self.store.update(
@@ -124,6 +124,6 @@ class JobQueue:
     def _refuse_running_sweep(self, name: str) -> None:
         for job in self.store.jobs():
             if job.kind == "sweep" and job.name == name and not job.is_over:
-                raise JobStateConflict(
+                raise StateConflict(
                     f"job {job.number} does the sweep {name!r} already; wait for its end, or cancel it."
                 )

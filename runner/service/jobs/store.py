@@ -37,7 +37,7 @@ from runner.config.document import read_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.locking import acquired
 from runner.runs.run import new_run_id
-from runner.service.errors import JobNotFound, QueueFull
+from runner.service.errors import JobNotFound, LimitReached
 from runner.util.files import replacing, storage_errors
 from runner.util.yaml_text import write_yaml
 
@@ -168,13 +168,13 @@ class JobStore:
         """Append the job that a submitted text means to the queue, on disk, and return it.
 
         Raises:
-            QueueFull: there are too many unfinished jobs.
+            LimitReached: there are too many unfinished jobs.
             StorageError: it cannot be written.
         """
         with self.lock:
             unfinished = sum(not job.is_over for job in self._jobs.values())
             if unfinished >= self._max_unfinished:
-                raise QueueFull(
+                raise LimitReached(
                     f"{unfinished:,} jobs are unfinished, the maximum; wait until one of them is over."
                 )
             number = max(self._jobs, default=0) + 1

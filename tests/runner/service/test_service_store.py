@@ -10,7 +10,7 @@ import pytest
 
 from runner.client.jobs import LogEvent, RunEvent, RunProgress
 from runner.errors import RunnerError, StorageError
-from runner.service.errors import JobNotFound, QueueFull
+from runner.service.errors import JobNotFound, LimitReached
 from runner.service.jobs import store as stores
 from runner.service.jobs.store import CheckedJob, JobStore, read_values
 
@@ -66,7 +66,7 @@ def test_one_process_at_a_time_has_the_store(store):
 def test_more_unfinished_jobs_than_the_maximum_are_refused(tmp_path):
     with closing(JobStore(tmp_path, max_unfinished=2)) as store:
         first, _ = added(store), added(store)
-        with pytest.raises(QueueFull, match="2 jobs are unfinished"):
+        with pytest.raises(LimitReached, match="2 jobs are unfinished"):
             added(store)
         store.update(first.number, state="finished")
         added(store)

@@ -13,7 +13,7 @@ import pytest
 from uploading import ANNA, BEN, begin, grow, over, send, start, visible
 
 from runner.errors import StorageError
-from runner.service.errors import Busy, TooManyUploads, UploadTooLarge
+from runner.service.errors import Busy, LimitReached, UploadTooLarge
 from runner.service.settings import ServiceLimits
 from runner.service.uploads import FOLDER, Uploads
 from tests.waiting import until
@@ -27,7 +27,7 @@ def test_uploads_beyond_the_limits_are_refused(lake, tmp_path):
     with pytest.raises(UploadTooLarge):
         uploads.append(ANNA, first.id, 0, bytes(1_001))
     grow(uploads, ANNA)
-    with pytest.raises(TooManyUploads):
+    with pytest.raises(LimitReached):
         grow(uploads, BEN)
     uploads.delete(ANNA, first.id)
     grow(uploads, BEN)
@@ -140,9 +140,9 @@ def test_one_client_cannot_hold_all_uploads(tmp_path):
     uploads = start(tmp_path / "runs", uploads=3, uploads_each=2)
     for _ in range(2):
         grow(uploads, ANNA)
-    with pytest.raises(TooManyUploads, match="2 of your uploads are open"):
+    with pytest.raises(LimitReached, match="2 of your uploads are open"):
         grow(uploads, ANNA)
     grow(uploads, BEN)
-    with pytest.raises(TooManyUploads, match="3 uploads are open"):
+    with pytest.raises(LimitReached, match="3 uploads are open"):
         grow(uploads, BEN)
     uploads.close()

@@ -19,7 +19,7 @@ from runner.recording.labels import Labels, change_labels
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
-from runner.service.errors import UploadConflict, UploadTooLarge
+from runner.service.errors import StateConflict, UploadTooLarge
 from runner.service.uploads import FOLDER, UploadSource
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id
 
@@ -245,7 +245,7 @@ def test_wrong_requests_of_a_client_are_refused(uploads, lake):
         uploads.get(BEN, upload.id)
     with pytest.raises(RunNotFound):
         uploads.append(ANNA, "../" + upload.id, 0, b"1")
-    with pytest.raises(UploadConflict, match="expected 0"):
+    with pytest.raises(StateConflict, match="expected 0"):
         uploads.append(ANNA, upload.id, 7, b"1")
     with pytest.raises(UploadTooLarge):
         uploads.append(ANNA, upload.id, 0, b"", len(data) + 1)
@@ -253,10 +253,10 @@ def test_wrong_requests_of_a_client_are_refused(uploads, lake):
         uploads.append(ANNA, upload.id, 0, data + b"more")
     assert uploads.get(ANNA, upload.id).offset == 0
     assert begin(uploads, ANNA, data).state == "receiving", "it is not verified without its bytes"
-    with pytest.raises(UploadConflict, match="another digest"):
+    with pytest.raises(StateConflict, match="another digest"):
         uploads.put(ANNA, upload.id, source(altered(data)))
     assert uploads.append(ANNA, upload.id, 0, data).offset == len(data)
-    with pytest.raises(UploadConflict, match=f"expected {len(data):,}"):
+    with pytest.raises(StateConflict, match=f"expected {len(data):,}"):
         uploads.append(ANNA, upload.id, 0, data)
 
 
