@@ -24,9 +24,8 @@ from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
 from runner.service import fragments
 from runner.service.addresses import link, places_in, step_in
-from runner.service.api.comparing import found_runs
 from runner.service.api.reading import AxisOf
-from runner.service.dependencies import At, CatalogueOf, ComputationOf
+from runner.service.dependencies import At, CatalogueOf, ComputationOf, recorded_run
 from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, result_of
 from runner.service.pages.rendering import Page
@@ -98,13 +97,13 @@ def chosen_runs(
     Raises:
         RunnerError: there are fewer than two of them, or too many.
     """
-    ids = [named.run_id for text in name or () for named in catalogue.find_all(text)]
-    names = list(dict.fromkeys([*(run or ()), *ids]))
-    if not 2 <= len(names) <= MAX_RUNS:
+    named = [found for text in name or () for found in catalogue.find_all(text)]
+    runs = {found.folder: found for found in [*map(catalogue.find, run or ()), *named]}
+    if not 2 <= len(runs) <= MAX_RUNS:
         raise RunnerError(
-            f"found {counted(len(names), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."
+            f"found {counted(len(runs), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."
         )
-    return found_runs(catalogue, names)
+    return [recorded_run(found) for found in runs.values()]
 
 
 ChosenRuns = Annotated[list[Run], Depends(chosen_runs)]

@@ -262,6 +262,12 @@ def test_the_page_of_a_run_opens_its_recording_once(client, recordings, monkeypa
             opened.clear()
 
 
+def test_a_run_that_is_named_twice_is_not_compared_with_itself(client, recordings):
+    run = find_run("first", recordings)
+    page = page_of(client, f"/compare?run=first&run={run.run_id}&name=first", 400)
+    assert "Found 1 run, expected 2 to 60" in page
+
+
 def test_only_differences_in_settings_can_be_explained(client, recordings):
     pair = "/compare?run=first&run=second"
     assert "Explain the difference" not in page_of(client, pair), "only their seeds differ"
