@@ -17,12 +17,12 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import forkserver
-from typing import Final, ParamSpec, Self, TypeVar
+from typing import Final, Self, TypeVar, TypeVarTuple
 
 from runner.service.errors import Busy
 from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process_context, starting_processes
 
-Args = ParamSpec("Args")
+Args = TypeVarTuple("Args")
 Result = TypeVar("Result")
 
 PRELOADED: Final = (
@@ -143,14 +143,14 @@ class ProcessPool:
             self._end(child)
 
     async def __call__(
-        self, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
+        self, function: Callable[[*Args], Result], *args: *Args, seconds: float | None = None
     ) -> Result:
         """Return what a function returns in a child process, which ends if the caller is cancelled.
 
-        Arguments and errors are those of `submit`.
+        Arguments and errors are as for `submit`; by default it has the time of the pool.
         """
-        doing = _Doing()
-        future = self._submit(lambda child: doing.by(child).call(function, self._seconds, *args, **keywords))
+        doing, limit = _Doing(), seconds or self._seconds
+        future = self._submit(lambda child: doing.by(child).call(function, limit, *args))
         waiting = asyncio.wrap_future(future)
         try:
             return await asyncio.shield(waiting)
@@ -162,16 +162,14 @@ class ProcessPool:
             waiting.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody asks
             raise
 
-    def submit(
-        self, seconds: float, function: Callable[Args, Result], *args: Args.args, **keywords: Args.kwargs
-    ) -> Future[Result]:
+    def submit(self, seconds: float, function: Callable[[*Args], Result], *args: *Args) -> Future[Result]:
         """Return the future result of a function of a module, called in a child process within some seconds.
 
         Arguments and result are pickled, between our own processes. The future raises the function's own
         `RunnerError` or `OSError`, or `TimedOut`, `OutOfMemory`, `ProcessDied`, or `Busy` when the pool is
         closed; `Busy` is raised if too many calls are waiting.
         """
-        return self._submit(lambda child: child.call(function, seconds, *args, **keywords))
+        return self._submit(lambda child: child.call(function, seconds, *args))
 
     def _submit(self, call: Callable[[ChildProcess], Result]) -> Future[Result]:
         if not self._places.acquire(blocking=False):

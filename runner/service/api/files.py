@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import os
 import pathlib
@@ -213,8 +212,7 @@ async def replay_of(
     async def make() -> bytes:
         if request.frames:
             with contextlib.suppress(CallFailed):
-                drawing = processes.submit(DRAW_SECONDS, computed.replay, runs, request)
-                return await asyncio.wrap_future(drawing)
+                return await processes(computed.replay, runs, request, seconds=DRAW_SECONDS)
         return await processes(computed.replay, runs, replace(request, frames=False))
 
     key = ("replay", *map(recording_state, runs), request)

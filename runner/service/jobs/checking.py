@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Final, ParamSpec
+from typing import Final, TypeVarTuple
 
 from runner.config import ExperimentConfig, from_text
 from runner.config.document import Document, Problem, read_yaml
@@ -29,7 +29,7 @@ from runner.sweep.search import Search, require_optuna
 from runner.util.humanize import size
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
 
-Args = ParamSpec("Args")
+Args = TypeVarTuple("Args")
 PROCESSES: Final = 2
 """Checks that run at the same time."""
 CHECK_SECONDS: Final = 30.0
@@ -130,11 +130,9 @@ class JobChecker:
             )
         return await self.call(source, _check_as_config_errors, text, source, self._recordings)
 
-    async def call(
-        self, source: str, function: Callable[Args, CheckedJob], *args: Args.args, **keywords: Args.kwargs
-    ) -> CheckedJob:
+    async def call(self, source: str, function: Callable[[*Args], CheckedJob], *args: *Args) -> CheckedJob:
         """Return the job that a function returns in a child process; `source` begins the messages."""
-        future = self._pool.submit(CHECK_SECONDS, function, *args, **keywords)
+        future = self._pool.submit(CHECK_SECONDS, function, *args)
         waiting = asyncio.wrap_future(future)
         done, _ = await asyncio.wait({waiting}, timeout=QUEUE_SECONDS)
         if not done and future.cancel():
