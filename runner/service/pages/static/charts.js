@@ -157,7 +157,8 @@ function tick(value) {
   if (!known(value)) return "";
   const size = Math.abs(value);
   if (size >= 1e15 || (size > 0 && size < 1e-4)) return value.toExponential(0);
-  return value.toLocaleString("en", { notation: size < 1e4 ? "standard" : "compact", maximumSignificantDigits: 6 });
+  const notation = size < 1e4 ? "standard" : "compact";
+  return value.toLocaleString("en", { notation, maximumSignificantDigits: 6 }).replace("K", "k"); // as the server writes it
 }
 
 function summary(curve, label) {
@@ -310,7 +311,7 @@ function options(unit, series, log_x, logY, { place, key }) {
   const y = scale(logY, (low, high) => {
     if (unit.startsWith("percent") && high <= 100 && low >= 0) return [0, 100];
     if (low === null || (low === 0 && high === 0)) return [0, 1];
-    const from = low >= 0 ? 0 : low - 0.05 * (high - low || 1);
+    const from = low >= 0 ? 0 : low - 0.05 * (high - low || -low);
     return [from, high + 0.05 * (high - from || 1)];
   });
   const wide = (_, ticks) => 18 + 7.2 * Math.max(3, ...(ticks ?? []).map((text) => text.length));
