@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from runner.runs.checkpoints import Checkpoint
     from runner.runs.run import Run
 
+_TEXTS: Final = ("checkpoint", "phase", "format", "digest", "content")
 _HEADINGS: Final = ("checkpoint", "phase", "last episode", "format", "size", "digest", "content")
 
 
@@ -48,7 +49,7 @@ def _table(run: Run, found: Sequence[Checkpoint]) -> Section:
     sentence = f"{counted(len(rows), 'checkpoint')}. `{command}` writes the last."
     address = f"/api/v1/runs/{run.run_id}/checkpoints/"
     links = [f"{address}{checkpoint.digest}" if checkpoint.is_here else "" for checkpoint in found]
-    return Section("Checkpoints", [sentence], [Grid(_HEADINGS, rows, links=links)])
+    return Section("Checkpoints", [sentence], [Grid(_HEADINGS, rows, links=links, left=_TEXTS)])
 
 
 VIEW: Final = View(
