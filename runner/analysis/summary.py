@@ -437,7 +437,7 @@ def usage_sections(largest: Sequence[Usage], sums: Sums, freeable: Mapping[str, 
     headings = ("id", "name", "status", *kinds, *same_as)
     yield Section("", grids=[Grid(headings, rows, links=[*links, ""], left=left, cut=("name",))])
     reasons = {
-        FREED_BY[kind][0].lower(): f"{size(count)}  {FREED_BY[kind][1]}"
+        FREED_BY[kind][0].lower(): f"{size(count)}. {FREED_BY[kind][1]}"
         for kind, count in freeable.items()
         if count
     }
