@@ -38,13 +38,13 @@ from runner.cli.runs import (
 from runner.export.places import new_file, require_new
 from runner.runs.run import Run, command_for
 from runner.util.humanize import size
-from runner.views.view import ONLY_HERE, PAGE, Input, Progress, View
+from runner.views.view import ONLY_HERE, PAGE, Input, ShownProgress, View
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 _STDOUT: Final = Path("-")
-_PROGRESS: Final = Progress(say, stage_line, steps_line, bytes_line, count_line, progress_line)
+_PROGRESS: Final = ShownProgress(say, stage_line, steps_line, bytes_line, count_line, progress_line)
 
 
 @contextmanager
@@ -102,11 +102,12 @@ def command_of(view: View) -> Command:
                     sys.stdout.buffer.write(file.getvalue())
                 yield Reply((), text, exit_code=answer.exit_code)
                 return
-            data, page, notes = answer.as_json(), "", []
+            data: Any = answer.as_json
+            page, notes = "", []
             if output is not None:
                 with stage_line("writing"), new_file(output, force) as path, path.open("wb") as stream:
                     answer.write(stream)
-                data |= {"files": files_written(output)}
+                data = answer.as_json() | {"files": files_written(output)}
                 if is_page:
                     page = f"{output}: {answer.contents or size(output.stat().st_size)}"
                     notes = [f"Note: {limit}." for limit in answer.limits]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import ConfigError
 from runner.util.humanize import counted
-from runner.views.view import NO_PROGRESS, PAGE, Progress, ReadyAnswer, View, view_input
+from runner.views.view import NO_PROGRESS, PAGE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -74,7 +74,7 @@ def compare(
         check=check_target,
     ),
     normalise: str | Path | None = NORMALISE,
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
 ) -> ReadyAnswer:
     """Compare groups of runs: medians, interquartile means, intervals, probabilities of improvement.
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import ExitCode
 from runner.views.compare import check_target
-from runner.views.view import NO_PROGRESS, PAGE, Progress, ReadyAnswer, View, view_input
+from runner.views.view import NO_PROGRESS, PAGE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -39,7 +39,7 @@ def diff(
         max_length=20,
         check=check_target,
     ),
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
 ) -> ReadyAnswer:
     """Show what differs between the runs A and B, down to the first step at which they diverge, and why.
 

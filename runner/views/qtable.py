@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import NO_PROGRESS, Progress, View, view_input
+from runner.views.view import NO_PROGRESS, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.analysis.qtable import QTables
@@ -40,7 +40,7 @@ def qtable(
         label="State",
         placeholder="number or name",
     ),
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
 ) -> QTables:
     """Show the exact Q-table of RUN at any step: the nearest snapshot, with the recorded steps replayed.
 

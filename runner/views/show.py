@@ -7,14 +7,14 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from runner.analysis.sections import Section
-from runner.views.view import NO_PROGRESS, Progress, ReadyAnswer, View
+from runner.views.view import NO_PROGRESS, ReadyAnswer, ShownProgress, View
 
 if TYPE_CHECKING:
     from runner.analysis.summary import RunDetails
     from runner.runs.run import Run
 
 
-def show(run: Run, progress: Progress = NO_PROGRESS) -> ReadyAnswer:
+def show(run: Run, progress: ShownProgress = NO_PROGRESS) -> ReadyAnswer:
     """Show a run: its evaluations, tables, configuration and provenance.
 
     --json also prints the whole series: `eval` has an object for each evaluation, with the training episodes
@@ -39,7 +39,7 @@ def show(run: Run, progress: Progress = NO_PROGRESS) -> ReadyAnswer:
     return ReadyAnswer(details.as_json(), _text(details, progress))
 
 
-def _text(details: RunDetails, progress: Progress) -> Iterator[Section]:
+def _text(details: RunDetails, progress: ShownProgress) -> Iterator[Section]:
     from runner.analysis.summary import random_policy_sentence
     from runner.recording.reader import open_recording
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.analysis.sections import Grid, Section
 from runner.errors import ConfigError
 from runner.util.row_text import csv_lines
-from runner.views.view import NO_PROGRESS, ONLY_HERE, Progress, ReadyAnswer, View
+from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -22,7 +22,7 @@ def values(
     checkpoint: str | None = ONLY_HERE,
     policy: str | None = ONLY_HERE,
     trust: bool = ONLY_HERE,
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
 ) -> ReadyAnswer:
     """Compute what the agent of a checkpoint of RUN returns at each step of a recorded episode.
 

@@ -9,7 +9,7 @@ from runner.analysis.sections import Section
 from runner.errors import ExitCode, RunnerError
 from runner.runs.run import Run, command_for, require_over
 from runner.util.humanize import UNKNOWN, counted
-from runner.views.view import NO_PROGRESS, ONLY_HERE, Progress, ReadyAnswer, View, view_input
+from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.execution.verify import Verification
@@ -35,7 +35,7 @@ def verify(
         metavar="X",
     ),
     trust: bool = ONLY_HERE,
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
 ) -> ReadyAnswer:
     """Check RUN, or a recording by its path: every byte, step, episode, figure and table.
 

@@ -34,7 +34,7 @@ def _nothing(*_: object) -> Iterator[Callable[..., None]]:
 
 
 @dataclass(frozen=True)
-class Progress:
+class ShownProgress:
     """What shows the progress of a computation, and prints notices: a command, else nothing."""
 
     say: Callable[[str], None] = lambda _: None
@@ -50,7 +50,7 @@ class Progress:
     """Takes the number of all, too; the function takes the progress of a job."""
 
 
-NO_PROGRESS: Final = Progress()
+NO_PROGRESS: Final = ShownProgress()
 
 
 @dataclass(frozen=True)

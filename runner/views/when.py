@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import NO_PROGRESS, Progress, View, view_input
+from runner.views.view import NO_PROGRESS, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.debugging.when import When
@@ -46,7 +46,7 @@ def when(
         label="To step",
         placeholder="the last",
     ),
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
     **limits: int,
 ) -> When:
     """Find the first training step of RUN after which EXPRESSION holds, exactly: every step is replayed.

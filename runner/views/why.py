@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import NO_PROGRESS, Progress, View, view_input
+from runner.views.view import NO_PROGRESS, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.debugging.q_value import Why
@@ -55,7 +55,7 @@ def why(
         metavar="N",
         maximum=100_000,
     ),
-    progress: Progress = NO_PROGRESS,
+    progress: ShownProgress = NO_PROGRESS,
 ) -> Why:
     """Show where a Q-value of RUN comes from: the recorded rewards and initial values that it is the sum of.
 

@@ -279,7 +279,7 @@ def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue
     return {
         "at": at,
         "episodes": episodes,
-        "choices": [*EPISODE_WORDS, *(f"eval:{after}:0" for after in trials)],
+        "choices": list(EPISODE_WORDS) + [f"eval:{after}:0" for after in trials],
         "before": neighbour(at.episode - 1),
         "after": neighbour(at.episode + 1),
         "source": f"/api/v1{base}/replay/{at.episode_path}",
