@@ -6,6 +6,8 @@ import pytest
 
 from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef
 from runner.errors import RunnerError
+from runner.recording.reader import open_recording
+from runner.views.episodes import episodes
 
 
 @pytest.mark.parametrize(
@@ -63,3 +65,29 @@ def test_the_nearest_word_is_suggested_where_it_is_accepted():
             EpisodeRef.parse(text)
     with pytest.raises(RunnerError, match=r"step by its number\.$"):
         EpisodeRef.parse("bset", EXPECTED_OF_TRAINING)
+
+
+@pytest.mark.parametrize("phase", ["train", "eval"])
+def test_episodes_come_in_an_order(record, phase):
+    """A part of an order is the same as that part of all episodes."""
+    with open_recording(record("recording.chunk_steps=256", "episodes=600")) as recording:
+        table = recording.phase(phase).episodes
+        assert phase == "eval" or len(table) > 1  # chunks
+        everything = table.array()
+        for order, field, sign in (
+            ("longest", "length", -1),
+            ("shortest", "length", 1),
+            ("newest", "episode", -1),
+        ):
+            columns = episodes(recording, phase, order, 5, 25).as_json()["columns"]
+            lengths = sorted(everything[field].tolist(), key=lambda value: sign * value)
+            assert columns[field] == lengths[5:25]
+            for i, number in enumerate(columns["episode"]):
+                assert columns["length"][i] == everything["length"][number]
+                assert columns["last_step"][i] == everything["last_step"][number]
+        best, worst = (
+            episodes(recording, phase, order, 0, len(everything)).as_json()["columns"]
+            for order in ("best", "worst")
+        )
+        assert best["episode"] == worst["episode"][::-1]
+        assert best["success"] == sorted(everything["success"].tolist(), reverse=True)
