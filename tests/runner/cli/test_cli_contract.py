@@ -74,7 +74,7 @@ WORDS = {
     "episodes": "@latest --stop 5",
     "evaluations": "@latest",
     "code": "@latest",
-    "play": "@latest --speed 1000",
+    "play": "{run} --speed 1000",
     "console": "@latest --search x",
     "system": "@latest",
     "diff": "@latest @latest",
