@@ -40,11 +40,11 @@ BEST: Final = "best"
 UNKNOWN_EVALUATION: Final = -1
 """Stands for an evaluation that was cut off: its trials are counted over the phase."""
 
-EPISODE_WORDS: Final = (TYPICAL, BEST, "worst", "last")
+_EPISODE_WORDS: Final = (TYPICAL, BEST, "worst", "last")
 _NUMBER: Final = "([0-9]{1,15})"
 _TRAINING: Final = re.compile(f"(?:train:)?{_NUMBER}(?::{_NUMBER})?")
 _EVALUATION: Final = re.compile(f"eval:{_NUMBER}(?::{_NUMBER})?(?::{_NUMBER})?")
-_WORD: Final = re.compile(f"(?:(step)(?=:)|({'|'.join(EPISODE_WORDS)}))(?::{_NUMBER})?")
+_WORD: Final = re.compile(f"(?:(step)(?=:)|({'|'.join(_EPISODE_WORDS)}))(?::{_NUMBER})?")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class EpisodeRef:
             return cls(trial, t, after)
         if match := _WORD.fullmatch(text):
             return cls(t=int(match[3] or 0), word=match[1] or match[2])
-        near = nearest(text[:60].partition(":")[0], [word for word in EPISODE_WORDS if word in expected])
+        near = nearest(text[:60].partition(":")[0], [word for word in _EPISODE_WORDS if word in expected])
         raise RunnerError(f"found {text[:60]!r}, expected {expected}.{near}")
 
     def __str__(self) -> str:

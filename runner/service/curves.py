@@ -158,15 +158,18 @@ def curves_of(paths: Sequence[Path], options: CurveOptions, lines: bool = False)
                 shown += [_shown_curve(panel, curve, options, lines) for curve in panel.curves]
     most = max((curve.of for curve in shown if curve.thinned), default=0)
     notes = [footnote(groups, panels, options.style), *map(humanize.sentence, duplicates(groups))]
+    averaged = " ".join(dict.fromkeys(run.averaged for run in series if run.averaged))
     if most:
         drawn = "the lowest and highest of each stretch are drawn; zoom in for all of them."
         notes.insert(0, f"Thinned: of up to {most:,} points a curve {drawn}")
+    elif not averaged:
+        notes.insert(0, "Every recorded point is drawn.")
     result = Curves(
         over.name,
         [AxisInfo(axis.name, axis.title, axis.label) for axis in common],
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
         shown,
-        " ".join(dict.fromkeys(run.averaged for run in series if run.averaged)),
+        averaged,
         notes if shown else ["No metrics were recorded."],
         list(dict.fromkeys(name for run in series for name in run.names))[:MAX_NAMES],
     )

@@ -15,7 +15,7 @@ from fastapi.responses import RedirectResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.episodes import EPISODE_WORDS, TYPICAL, EpisodeRef, reference_to
+from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
 from runner.analysis.evaluations import evaluations_of
 from runner.analysis.marking import mark, unmark
 from runner.analysis.sections import Link
@@ -112,7 +112,7 @@ async def chosen_replay(
     trial: str = "",
     at: At = "",
 ) -> Response:
-    """Redirect to the step `at`, to the episode that an older address names, or to a typical one."""
+    """Redirect to the step `at`, to the episode that a form names, or to a typical one."""
     if phase == "train":
         step = EpisodeRef.parse(f"train:{episode or 0}")
     elif phase == "eval" and after:
@@ -268,8 +268,8 @@ async def what_if(
 def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue) -> dict[str, object]:
     """Return the values of the page of an episode but its stage."""
     episodes, is_job = recording.train.known_episodes(), recording.can_train_again
-    trials = {found.after: found.trials for found in evaluations_of(recording)}
-    count = episodes if at.after is None else trials.get(at.after, 0)
+    evaluations = {found.after: found.trials for found in evaluations_of(recording)}
+    count = episodes if at.after is None else evaluations.get(at.after, 0)
     base = f"/runs/{run.run_id}"
 
     def neighbour(other: int) -> str:
@@ -279,7 +279,7 @@ def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue
     return {
         "at": at,
         "episodes": episodes,
-        "choices": list(EPISODE_WORDS) + [f"eval:{after}:0" for after in trials],
+        "evaluations": list(evaluations),
         "before": neighbour(at.episode - 1),
         "after": neighbour(at.episode + 1),
         "source": f"/api/v1{base}/replay/{at.episode_path}",

@@ -422,12 +422,15 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     )
     assert [len(curve["positions"]) for curve in curves["curves"]] == [20] * 64
     assert (curves["averaged"], len(curves["names"])) == ("", 100)
-    assert "720 values. Choose others by their names" in curves["notes"][0]
+    assert "720 values. Choose others by their names" in curves["notes"][1]
     curves = client.get("/api/v1/curves?run=alone&axis=v/0&metric=training.logged.v/99").json()
     assert [(one["metric"], one["values"][:2]) for one in curves["curves"]] == [
         ("training.logged.v/99", [99.0, 100.0])
     ]
-    assert (curves["axis"], curves["notes"]) == ("v/0", ["Each line is one run, as reported."])
+    assert (curves["axis"], curves["notes"]) == (
+        "v/0",
+        ["Every recorded point is drawn.", "Each line is one run, as reported."],
+    )
 
 
 def test_variations_are_of_jobs(client, recordings):
