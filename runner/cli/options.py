@@ -228,7 +228,6 @@ def limit_option(default: int | str) -> Declared:
         "--limit",
         type=INDEX,
         default=default if isinstance(default, int) else None,
-        metavar="N",
         help=f"Maximum number of rows, 0 for all.  [default: {default}]",
     )
 
@@ -239,7 +238,6 @@ def workers_option(default: int | str, text: str = "Number of runs to do in para
         "--workers",
         type=Number(1, 1024),
         default=default if isinstance(default, int) else None,
-        metavar="N",
         help=f"{text}  [default: {default}]",
     )
 
@@ -262,7 +260,7 @@ def selection_options(
         metavar="N[,N]",
         help="The trials of the evaluations after N training episodes.",
     ),
-    every: int | None = option("--every", type=COUNT, metavar="N", help="Every Nth training episode."),
+    every: int | None = option("--every", type=COUNT, help="Every Nth training episode."),
     everything: bool = all_option,
     frames: bool = option(
         "--frames",

@@ -59,6 +59,8 @@ class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generi
 class Number(click.FloatRange):
     """A number between two bounds, a whole one unless another type is named."""
 
+    name = "n"  # in capitals what help shows
+
     def __init__(
         self, lowest: float, highest: float | None = None, kind: type = int, above: bool = False
     ) -> None:

@@ -64,7 +64,7 @@ def compare(
     ),
     axis: str = AXIS,
     at_step: int | None = view_input(
-        "at-step", "Compare after N training steps: --axis steps --moment N.", kind=int, metavar="N"
+        "at-step", "Compare after N training steps: --axis steps --moment N.", kind=int
     ),
     target: str | None = view_input(
         "target",

@@ -38,7 +38,6 @@ def console(
         "Maximum number of rows, 0 for all.  [default: 1000]",
         kind=int,
         default=1000,
-        metavar="N",
         maximum=10**9,
     ),
 ) -> ReadyAnswer:

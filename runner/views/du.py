@@ -63,7 +63,6 @@ def du(
         "limit",
         f"Maximum number of rows, 0 for all.  [default: {_LARGEST}, with --json all]",
         kind=int,
-        metavar="N",
     ),
     progress: ShownProgress = NO_PROGRESS,
 ) -> DiskUsage:

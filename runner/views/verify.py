@@ -24,7 +24,7 @@ def verify(
         kind=bool,
     ),
     sample: int | None = view_input(
-        "sample", "Rerun only N episodes of a loop, evenly spread.", kind=int, minimum=1, metavar="N"
+        "sample", "Rerun only N episodes of a loop, evenly spread.", kind=int, minimum=1
     ),
     tolerance: float = view_input(
         "tolerance",

@@ -117,12 +117,11 @@ def view_input(name: str, text: str, **attributes: Any) -> Any:
 
 _DEFAULT_ROWS: Final = 1000
 _MAX_ROW: Final = 2**62
-START: Final = Input("start", "The first row, from 0.", kind=int, default=0, metavar="N", maximum=_MAX_ROW)
+START: Final = Input("start", "The first row, from 0.", kind=int, default=0, maximum=_MAX_ROW)
 STOP: Final = Input(
     "stop",
     f"The first row not included.  [default: {_DEFAULT_ROWS:,} more]",
     kind=int,
-    metavar="N",
     maximum=_MAX_ROW,
 )
 

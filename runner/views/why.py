@@ -52,7 +52,6 @@ def why(
         "Maximum number of rows, 0 for all.  [default: 10]",
         kind=int,
         default=10,
-        metavar="N",
         maximum=100_000,
     ),
     progress: ShownProgress = NO_PROGRESS,

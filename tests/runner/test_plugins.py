@@ -56,7 +56,7 @@ def test_an_installed_view_and_export_are_commands(environment, run, tmp_path):
         lengths = recording.train.episodes.array()["length"].tolist()
     assert re.search(r"longest +From the package long-episodes", dualtaxi("--help"))
     assert re.search(r"lengths +From the package long-episodes", dualtaxi("export", "--help"))
-    assert "--count" in dualtaxi("longest", "--help")
+    assert "--count N" in dualtaxi("longest", "--help")
     answer = json.loads(dualtaxi("longest", str(run.folder), "--count", "3", "--json"))["lengths"]
     assert sorted(answer.values()) == sorted(lengths)[-3:]
     assert "| episode | steps |" in dualtaxi("longest", str(run.folder), "--markdown")

@@ -47,7 +47,7 @@ def branch_command(
     ),
     overrides: tuple[str, ...] = set_option,
     episodes: int | None = option(
-        "--episodes", type=COUNT, metavar="N", help="Training episodes in all.  [default: as many as RUN]"
+        "--episodes", type=COUNT, help="Training episodes in all.  [default: as many as RUN]"
     ),
     policy: str = option(
         "--policy",
@@ -70,7 +70,6 @@ def branch_command(
         type=COUNT,
         default=100_000,
         show_default=True,
-        metavar="N",
         help="For a loop: stop after N steps.",
     ),
     trust: bool = trust_option,

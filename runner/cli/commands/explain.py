@@ -57,7 +57,6 @@ def explain_command(
         type=Number(1, 10_000),
         default=20,
         show_default=True,
-        metavar="N",
         help="Number of seeds of each mixture.",
     ),
     workers: int | None = workers_option("one per processor"),

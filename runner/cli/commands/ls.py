@@ -92,7 +92,7 @@ def ls_command(
     ),
     columns: str | None = option("--columns", metavar="FIELD,...", help="Show these fields."),
     limit: int | None = limit_option(f"{ON_A_TERMINAL} in a terminal's table, else all"),
-    offset: int = option("--offset", type=INDEX, default=0, metavar="N", help="Skip the first N."),
+    offset: int = option("--offset", type=INDEX, default=0, help="Skip the first N."),
     quiet: bool = option("-q", "--quiet", is_flag=True, help="Print ids only."),
 ) -> Reply:
     """List the runs that match FILTER, or all, newest first.

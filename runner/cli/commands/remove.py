@@ -80,7 +80,7 @@ def prune_command(
         "--older-than", metavar="AGE", help="Runs that started longer ago than this: 30d, 12h, 2w."
     ),
     keep_last: int | None = option(
-        "--keep-last", type=INDEX, metavar="N", help="Keep the newest N runs of each configuration."
+        "--keep-last", type=INDEX, help="Keep the newest N runs of each configuration."
     ),
     statuses: tuple[str, ...] = option(
         "--status",

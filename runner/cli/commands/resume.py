@@ -122,9 +122,7 @@ LOOP_TRIALS: Final = 20
 @click.command("evaluate", cls=Command)
 def evaluate_command(
     source: Run = recorded_run,
-    step: int | None = option(
-        "--step", type=INDEX, metavar="N", help="After N training steps.  [default: the last]"
-    ),
+    step: int | None = option("--step", type=INDEX, help="After N training steps.  [default: the last]"),
     trials: int | None = option(
         "--trials",
         type=COUNT,

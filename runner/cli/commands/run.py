@@ -33,9 +33,7 @@ if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
 @job_option
 def run_command(
     config: Path = config_argument,
-    seed: int | None = option(
-        "--seed", type=INDEX, metavar="N", help="The seed, instead of the configuration's."
-    ),
+    seed: int | None = option("--seed", type=INDEX, help="The seed, instead of the configuration's."),
     overrides: tuple[str, ...] = set_option,
     name: str | None = option("--name", help="Name of the run.  [default: the configuration's name]"),
     workers: int = workers_option(1),
