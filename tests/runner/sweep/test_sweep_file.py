@@ -90,6 +90,13 @@ def test_an_invalid_sweep_is_refused(file, changes, expected):
     assert expected.replace('."step_size"', ".step_size") in refused(file, **changes)
 
 
+def test_an_unknown_environment_is_reported_once_with_its_place(file):
+    with pytest.raises(ConfigError) as error:
+        load_sweep(file(base=BASE | {"env": {"id": "NoSuch-v1"}}, parameters={"discount": [0.9, 0.99]}))
+    assert "base.env.id: environment 'NoSuch-v1'" in str(error.value)
+    assert "parameters" not in str(error.value)
+
+
 def test_an_unknown_reward_of_the_environment_is_reported_with_its_place(file):
     base = BASE | {"env": {"id": "dualtaxi:DualTaxi-v1"}}
     reply = refused(file, base=base, parameters={"env.kwargs.rewards.pick_up": [1, 2]})
