@@ -138,6 +138,10 @@ class Grid:
     """Headings of the columns that a narrow terminal leaves out, in this order."""
     gap: int = 2
     """Blanks between columns of text."""
+    status: str = ""
+    """Heading of the column of statuses, which a page marks."""
+    runs: str = ""
+    """Heading of the column of ids of runs, each of which leads to the page of that run."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:

@@ -435,7 +435,9 @@ def usage_sections(largest: Sequence[Usage], sums: Sums, freeable: Mapping[str, 
         links.append("")
     rows.append(("all", "", "", *cells(total), *[""] * len(same_as)))
     headings = ("id", "name", "status", *kinds, *same_as)
-    yield Section("", grids=[Grid(headings, rows, links=[*links, ""], left=left, cut=("name",))])
+    links.append("")
+    grid = Grid(headings, rows, links=links, left=left, cut=("name",), status="status", runs="same as")
+    yield Section("", grids=[grid])
     reasons = {
         FREED_BY[kind][0].lower(): f"{size(count)}. {FREED_BY[kind][1]}"
         for kind, count in freeable.items()

@@ -266,7 +266,7 @@ def _ranking_grid(sweep: Sweep, ranked: Sequence[Ranked]) -> Grid:
                 entry.state,
             )
         )
-    return Grid((*headings, *sweep.file.parameters, "state"), rows)
+    return Grid((*headings, *sweep.file.parameters, "state"), rows, status="state")
 
 
 def values_text(values: Mapping[str, object]) -> str:

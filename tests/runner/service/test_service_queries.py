@@ -73,6 +73,12 @@ def test_the_page_shows_what_it_is_asked(client):
     assert "<b>" not in text
 
 
+def test_columns_of_a_query_are_shown_as_they_are_whatever_their_names(client):
+    text = client.get("/sql", params={"query": "SELECT 1 AS i, 7 AS state, 'a b' AS \"same as\""}).text
+    assert "<td>7</td>" in text
+    assert '<td class="text">a b</td>' in text
+
+
 def test_hits_have_pictures_that_take_no_environment(client, recordings):
     with runner.record(Stranger(), recordings, name="own") as rec:
         rec.reset(seed=1)
