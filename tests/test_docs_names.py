@@ -52,6 +52,14 @@ def test_the_commands_with_csv_and_markdown_are_named():
     assert set(re.findall("`([a-z ]+)`", sentence)) == json - markdown
 
 
+def test_the_modules_that_the_architecture_names_exist():
+    text = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`([a-z_]+/[a-z_/]+\.py)`", text))
+    folders = (DOCS.parent, Path(runner.__file__).parent)
+    assert len(named) > 40
+    assert {name for name in named if not any((folder / name).is_file() for folder in folders)} == set()
+
+
 def options_of(command):
     return {name for parameter in command.params for name in parameter.opts}
 
