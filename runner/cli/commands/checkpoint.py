@@ -5,22 +5,15 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from runner.cli.command import CommandGroup, argument
-from runner.cli.options import (
-    force_option,
-    output_option,
-)
+from runner.cli.options import force_option, output_option
 from runner.cli.output import Reply, path_and_size, written
 from runner.cli.runs import recorded_run
 from runner.export.places import new_file
 from runner.runs.run import Run
-
-if TYPE_CHECKING:
-    pass
 
 
 @click.group("checkpoint", cls=CommandGroup)
