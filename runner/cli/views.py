@@ -35,6 +35,7 @@ from runner.cli.runs import (
     recording_and_run,
     two_recorded_runs,
 )
+from runner.errors import RunnerError
 from runner.export.places import new_file, require_new
 from runner.runs.run import Run, command_for
 from runner.util.humanize import size
@@ -132,6 +133,9 @@ def _text(run: Run, answer: Answer) -> Iterator[Part]:
 def _declared(name: str, given: Input, view: View) -> Declared:
     """Return the argument or option of an input; an argument completes the words that the view lists."""
     if given is ONLY_HERE:
+        if name not in _ONLY_HERE:
+            expected = ", ".join(_ONLY_HERE)
+            raise RunnerError(f"{view.name}: found {name!r} with ONLY_HERE, expected one of {expected}.")
         return _ONLY_HERE[name]
     if given.required:
         return argument(metavar=given.name.upper(), type=ExpressionText(given.name, view.words))

@@ -166,8 +166,10 @@ def _type_of(view: View) -> type[BaseModel]:
         limits: dict[str, Any] = (
             {} if given.kind is bool or given.values else {"max_length": given.max_length}
         )
-        if given.kind is int:
+        if given.kind in (int, float):
             limits = {"ge": given.minimum, "le": given.maximum}
+        if given.kind is float:
+            limits["allow_inf_nan"] = False
         default: Any = ... if given.required else given.default
         if given.multiple:
             kind, default = tuple[kind, ...], ()

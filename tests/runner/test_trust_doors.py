@@ -22,8 +22,9 @@ from starlette.testclient import TestClient
 
 import runner
 from runner.cli import cli
+from runner.cli.views import command_of
 from runner.config.job import identity_of
-from runner.errors import CannotRedo
+from runner.errors import CannotRedo, RunnerError
 from runner.execution.resume import resume
 from runner.execution.verify import verify
 from runner.recording.maker import EnvironmentMaker, VectorMaker
@@ -480,5 +481,11 @@ def test_a_view_that_takes_code_or_a_path_is_a_command_only(service):
     here = {name for name, view in VIEWS.items() if not view.is_served}
     assert here == {"du", "show", "values", "verify"}
     assert not View("made", "Made", made).is_served
+
+    def wrong(recording, code=ONLY_HERE):
+        """Take what no command shares."""
+
+    with pytest.raises(RunnerError, match="wrong: found 'code' with ONLY_HERE, expected one of words, "):
+        command_of(View("wrong", "Wrong", wrong))
     paths = {path for _, path in routes(service.app.routes)}
     assert {path for path in paths if path.rpartition("/")[2].partition(".")[0] in here} == set()

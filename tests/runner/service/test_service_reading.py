@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from click.testing import CliRunner
+from pydantic import ValidationError
 
 import runner
 from runner.analysis.qtable import one_array
@@ -19,6 +20,8 @@ from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs.resolve import find_run
 from runner.service.settings import ServiceLimits
+from runner.service.views import _type_of
+from runner.views.view import View, view_input
 
 RUN = "/api/v1/runs/first"
 
@@ -54,6 +57,20 @@ def test_a_range_of_records_that_is_too_long_is_refused(connect, settings):
     answer = client.get(f"{RUN}/evaluations", params={"stop": 10**9})
     assert answer.status_code == 422
     assert "at most 3" in answer.json()["error"]["message"]
+
+
+def test_a_view_takes_numbers_between_their_bounds():
+    share = view_input("share", "A share.", kind=float, default=0.5, maximum=1)
+    bound = view_input("least", "At least this.", kind=float)
+
+    def near(recording, share=share, least=bound):
+        """Find what is near."""
+
+    query = _type_of(View("near", "Near", near))
+    assert query(share="0.7").model_dump() == {"share": 0.7, "least": None}
+    for values in ({"share": "1.5"}, {"share": "nan"}, {"least": "inf"}, {"least": "-1"}):
+        with pytest.raises(ValidationError):
+            query(**values)
 
 
 def test_an_episode_that_is_too_long_is_refused_before_it_is_read(connect, settings, monkeypatch):
