@@ -326,6 +326,27 @@ def test_pages_take_every_reference_to_a_step(client, recordings):
         assert f"What if? {step.heading}, step {step.t:,}" in what_if
 
 
+def test_the_fields_of_a_replay_lead_to_an_episode(client):
+    for query, path in (
+        ("phase=train&episode=5", "train/5"),
+        ("phase=train", "train/0"),
+        ("phase=eval&after=60&trial=2", "eval/60/2"),
+        ("phase=eval&after=60", "eval/60/0"),
+    ):
+        answer = client.get(f"/runs/first/replay?{query}", follow_redirects=False)
+        assert answer.headers["location"].endswith(f"/replay/{path}")
+
+
+def test_the_page_of_the_disk_links_runs_and_the_runs_that_they_repeat(client, recordings):
+    first = find_run("first", recordings)
+    again = runner.run({**first.file.config, "name": "again"}, seed=first.seed, recordings=recordings)
+    assert again.summary.content_digest == first.summary.content_digest
+    page = until(lambda page: "same as" in page, lambda: page_of(client, "/disk"))
+    assert f'<a href="/runs/{again.run_id}">{again.run_id}</a>' in page
+    assert '<span class="status finished">finished</span>' in page
+    assert re.findall('<td class="text"><a href="/runs/([^"]*)">', page) == [first.run_id]
+
+
 def test_only_the_frame_of_the_viewer_may_compile(client):
     assert "wasm" not in client.get("/runs/first").headers["content-security-policy"]
     policy = client.get("/runs/first/rerun/frame").headers["content-security-policy"]
