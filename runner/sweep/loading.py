@@ -173,7 +173,7 @@ def _checked(sweep: Sweep, document: Document, checks: Checks) -> Sweep:
     for key, check in checks.items():
         with problems_at(("base", key), document, RunnerError):
             check(sweep.base)
-    if not any(path.startswith("env.") for path in sweep.file.parameters):
+    if not any(path.split(".")[0] == "env" for path in sweep.file.parameters):
         with problems_at(("base", "env", "id"), document, RunnerError):
             load_mdp(sweep.base.env.id, sweep.base.env.kwargs, sweep.base.rewards)
     errors = []

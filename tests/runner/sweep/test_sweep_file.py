@@ -97,6 +97,12 @@ def test_an_unknown_environment_is_reported_once_with_its_place(file):
     assert "parameters" not in str(error.value)
 
 
+def test_the_environment_of_the_base_may_be_unknown_if_each_trial_has_its_own(file):
+    each = [{"id": "CliffWalking-v1"}, {"id": "Taxi-v4"}]
+    sweep = load_sweep(file(base=BASE | {"env": {"id": "NoSuch-v1"}}, parameters={"env": each}))
+    assert list(sweep.file.parameters) == ["env"]
+
+
 def test_an_unknown_reward_of_the_environment_is_reported_with_its_place(file):
     base = BASE | {"env": {"id": "dualtaxi:DualTaxi-v1"}}
     reply = refused(file, base=base, parameters={"env.kwargs.rewards.pick_up": [1, 2]})
