@@ -157,6 +157,8 @@ def diff(
         difference = _diff_branch(difference, a, b, *branch)
     else:
         difference = _diff_loops(difference, a, b, None if first else targets or {})
+    if targets and not difference.metrics:
+        difference.notes.append("no metrics are compared, so the levels of targets are not looked for")
     return replace(difference, not_compared=_not_compared(difference, a, b, first))
 
 

@@ -272,6 +272,9 @@ def test_the_command_prints_what_differs_and_exits_with_1(record, folder):
     assert "step_size" not in result.stdout
     same = run(cli, ["diff", ids[0], ids[2], "--recordings", str(folder)])
     assert same.exit_code == 0, same.output
+    for words in ([ids[0], ids[2]], [*ids[:2], "--first"]):
+        aimed = run(cli, ["diff", *words, "--recordings", str(folder), "--target", "success_percent=80"])
+        assert "no metrics are compared, so the levels of targets are not looked for" in aimed.stdout
     unknown = run(cli, ["diff", ids[0], ids[1], "--recordings", str(folder), "--target", "sucess_percent=80"])
     assert unknown.exit_code == 2
     assert "Did you mean" in unknown.stderr
