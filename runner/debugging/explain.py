@@ -250,7 +250,7 @@ def _resolved(
                 hint = (
                     nearest(path.name, experiments) or " `dualtaxi config ls` lists those that are shipped."
                 )
-                raise RunNotFound(f"{error} There is no configuration of this name either.{hint}") from error
+                raise RunNotFound(f"{error}\nThere is no configuration of this name either.{hint}") from error
     if isinstance(source, ExperimentConfig):
         require(source)
         return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]

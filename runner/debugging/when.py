@@ -23,7 +23,7 @@ from runner.analysis.sections import Answer, Grid, Link, Section
 from runner.archive.places import opened
 from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
 from runner.debugging.quantities import JobColumns, check_lost
-from runner.errors import RunnerError
+from runner.errors import RecordingError, RunnerError
 from runner.recording.reader import Recording
 from runner.runs.run import Run
 from runner.util.expressions import CONDITION
@@ -182,6 +182,8 @@ def when(
         require_steps(recording, "search")
         start = 0 if first is None else _step_number(recording, first)
         stop = recording.train.steps.count() if last is None else _step_number(recording, last) + 1
+        if not recording.train.steps.count():
+            raise RecordingError(f"{recording.path}: has no training steps.")
         if start >= stop:
             raise RunnerError(
                 f"found first step {start:,} and last step {stop - 1:,}, expected them in order."

@@ -50,7 +50,7 @@ def read_sweep(name: str, recordings: Path) -> Sweep:
     """
     names = sweeps_in(recordings)
     if name not in names:
-        listed = f" There are {', '.join(names)}." if names else " `dualtaxi sweep run FILE` starts one."
+        listed = f" Its sweeps: {', '.join(names)}." if names else " `dualtaxi sweep run FILE` starts one."
         raise RunnerError(f"no sweep {name!r} in {recordings}.{nearest(name, names) or listed}")
     path = folder_of(name, recordings) / FILE
     try:

@@ -249,6 +249,13 @@ def test_bad_input_is_named(b, options, message, tmp_path):
         explained(LAKE, b, tmp_path, **options)
 
 
+def test_an_ambiguous_name_lists_runs_each_on_its_own_line(tmp_path):
+    for seed in (0, 1):
+        runner.run(LAKE | {"name": "twice", "seed": seed, "episodes": 10}, recordings=tmp_path)
+    with pytest.raises(RunnerError, match=r"matches 2 runs(?s:.*) UTC\nThere is no configuration"):
+        explained(LAKE, "twice", tmp_path)
+
+
 def test_a_loop_is_refused(tmp_path):
     import gymnasium
 

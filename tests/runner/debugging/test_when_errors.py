@@ -180,6 +180,12 @@ def test_a_condition_counts_as_0_or_1_and_a_division_by_zero_is_no_error(coopera
     assert found.first.step == 10
 
 
+def test_a_run_without_training_steps_is_named(tmp_path):
+    run = make_run(tmp_path, TAXIS | {"log": None, "episodes": 0, "evaluation": {"every": 1, "trials": 1}})
+    with pytest.raises(RecordingError, match="has no training steps"):
+        when(run, "step > 0")
+
+
 @pytest.mark.parametrize(
     ("first", "last", "message"),
     [

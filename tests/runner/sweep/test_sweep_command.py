@@ -126,6 +126,7 @@ def test_an_unknown_sweep_is_refused_with_the_nearest_name(type_in, file):
     assert "`dualtaxi sweep run FILE` starts one" in type_in("show", "smal", code=2).output
     type_in("run", str(file(limits={"runs": 1})), "--workers", "1", code=1)
     assert "Did you mean 'small'?" in type_in("show", "smal", code=2).output
+    assert "Its sweeps: small." in type_in("show", "hyperparameters", code=2).output
 
 
 def test_a_misspelt_command_is_not_taken_for_a_file(type_in):
