@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Annotated, Any, get_type_hints
 
 from fastapi import APIRouter, Path, Query, Response
@@ -23,7 +24,8 @@ StepPath = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["e
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 
 
-_FIELDS: Any = {name: (kind, ...) for name, kind in get_type_hints(WhatIf).items() if name != "mdp"}
+_KINDS = get_type_hints(WhatIf)
+_FIELDS: Any = {field.name: (_KINDS[field.name], ...) for field in fields(WhatIf) if field.name != "mdp"}
 WhatIfAnswer = create_model("WhatIfAnswer", __doc__=WhatIf.__doc__, **_FIELDS)
 
 

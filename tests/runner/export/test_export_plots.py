@@ -176,7 +176,7 @@ def test_axis_smoothing_and_logarithms_are_options_of_plot_and_report(pictured, 
         assert "memory of 10 % of the axis" in text
         assert "On logarithmic axes" in text
         assert "training steps" in text
-    assert "0<=x<=100" in plot(run.folder, "--smooth", "101").stderr
+    assert "expected a number from 0 to 100" in plot(run.folder, "--smooth", "101").stderr
     assert "a figure of its own" in plot(run.folder, "--normalise", "minmax", "--log-y").stderr
 
 
