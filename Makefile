@@ -22,7 +22,7 @@ serve: $(VENV)/.installed-service  ## open the runs in the browser
 
 test: export PYTHONDONTWRITEBYTECODE :=  # the tests start hundreds of processes: compile modules for them once
 test: $(VENV)/.installed-dev  ## run all tests
-	$(BIN)/python -m pytest -n 4 --dist worksteal
+	$(BIN)/python -m pytest -n 3 --dist worksteal
 
 test-integrations: $(VENV)-integrations/.installed  ## test the adapters against the real libraries (8 GB of them)
 	$(VENV)-integrations/$(notdir $(BIN))/python -m pytest tests/integrations
