@@ -6,6 +6,7 @@ import pytest
 
 from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef
 from runner.errors import RunnerError
+from runner.recording import recorder
 from runner.recording.reader import open_recording
 from runner.views.episodes import episodes
 
@@ -68,8 +69,9 @@ def test_the_nearest_word_is_suggested_where_it_is_accepted():
 
 
 @pytest.mark.parametrize("phase", ["train", "eval"])
-def test_episodes_come_in_an_order(record, phase):
+def test_episodes_come_in_an_order(record, phase, monkeypatch):
     """A part of an order is the same as that part of all episodes."""
+    monkeypatch.setattr(recorder, "FLUSH_SECONDS", -1)  # many chunks, however quickly the run goes
     with open_recording(record("recording.chunk_steps=256", "episodes=600")) as recording:
         table = recording.phase(phase).episodes
         assert phase == "eval" or len(table) > 1  # chunks
