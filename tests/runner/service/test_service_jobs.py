@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import concurrent.futures
-import errno
 import contextlib
+import errno
 import json
 import re
 import time
