@@ -632,7 +632,7 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
         facts = json.loads((place / "run.json").read_text()) | {"run_id": place.name, "name": f"pole{k % 2}"}
         (place / "run.json").write_text(json.dumps(facts))
     shutil.rmtree(cache_folder() / EPISODES)
-    monkeypatch.setattr(episode_index, "_LEAST", 3)
+    monkeypatch.setattr(episode_index, "_LEAST", 2)
     expressions = ("length > 20 and any(action == 1)", "then(action == 1, action == 0, within=1)")
 
     def hits():
@@ -643,7 +643,7 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
     monkeypatch.setattr(episode_index, "_PACKED", 1 << 70)
     loose = hits()
     assert all(found.count for found in loose)
-    for size in (1, 7):
+    for size in (1, 7, 2):  # where packs are cut depends on inodes; among twenty files, two stay together at 2
         monkeypatch.setattr(episode_index, "_PACKED", size)
         for _ in range(2):
             assert hits() == loose
