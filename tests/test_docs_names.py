@@ -11,7 +11,7 @@ import runner
 from runner.service import pages, queries, views
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
-from runner.views import VIEWS
+from runner.views import shipped_views
 from tests.doors import commands, routes
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -64,7 +64,7 @@ def options_of(command):
     return {name for parameter in command.params for name in parameter.opts}
 
 
-@pytest.mark.parametrize("view", [name for name, view in VIEWS.items() if view.has_tab])
+@pytest.mark.parametrize("view", [view.name for view in shipped_views() if view.has_tab])
 def test_every_view_has_a_row(view):
     address = f"/runs/RUN/{view}"
     assert [view, address, address] in [row[1:4] for row in ROWS]

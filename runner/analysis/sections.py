@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
+from types import MappingProxyType
 from typing import TYPE_CHECKING, BinaryIO, Final, NamedTuple
 
 from runner.errors import ExitCode
@@ -216,7 +217,11 @@ class Answer:
     limits: Sequence[str] = ()
     """What limits the answer, in sentences that are said where a page stands for the text."""
     contents: str = ""
-    """What the page has, in a few words."""
+    """What the file has, in a few words; given for a page, and for a file that stands for the text."""
+    lines: Mapping[str, Iterable[str]] = MappingProxyType({})
+    """Forms of the command, such as `csv`, whose lines are printed one by one: there may be very many."""
+    remarks: Iterable[str] = ()
+    """Sentences that a command prints after the answer in any form."""
 
     @property
     def step_to_look_at(self) -> object:

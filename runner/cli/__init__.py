@@ -40,9 +40,9 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "rerecord": ("resume", "Record the steps of a run that was recorded without them."),
     },
     "Inspect": {
-        "ls": ("ls", "List the recorded runs."),
-        "find": ("query", "Find the episodes of all runs that match an expression."),
-        "sql": ("query", "Ask the recorded runs, and every step of them, in SQL."),
+        "ls": (_VIEW, "List the recorded runs."),
+        "find": (_VIEW, "Find the episodes of all runs that match an expression."),
+        "sql": (_VIEW, "Ask the recorded runs, and every step of them, in SQL."),
         "show": (_VIEW, "Show a run: evaluations, tables, configuration."),
         "episodes": (_VIEW, "Show the episodes of a run: how each ended, its length and returns."),
         "evaluations": (_VIEW, "Show the evaluations of a run, every event counted."),
@@ -60,7 +60,7 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
         "checkpoint": ("checkpoint", "Write a checkpoint of a run into a file."),
         "values": (_VIEW, "Compute what a checkpoint's agent returns along a recorded episode."),
         "qtable": (_VIEW, "Show the exact Q-table of a run at any step."),
-        "table": ("tables", "Print an environment's transition table with names."),
+        "table": (_VIEW, "Print an environment's transition table with names."),
     },
     "Debug": {
         "branch": ("branch", "Change a recorded step, and see where that leads."),

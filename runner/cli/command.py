@@ -20,8 +20,13 @@ from runner.errors import nearest
 from runner.util.plugins import plugin_names
 
 _MAX_SHORT_HELP = 200
-_FORMS: Final = {"json": "Print JSON.", "csv": "Print CSV.", "markdown": "Print Markdown."}
-"""Forms of a reply, each an option with this help."""
+_FORMS: Final = {
+    "quiet": ("-q", "--quiet", "Print ids only."),
+    "csv": ("--csv", "Print CSV."),
+    "json": ("--json", "Print JSON."),
+    "markdown": ("--markdown", "Print Markdown."),
+}
+"""Forms of a reply: the flags and the help of the option of each."""
 
 Declared = Any
 """The default of a parameter, which stands for values of the parameter's own type."""
@@ -95,7 +100,11 @@ class Command(click.Command):
     ) -> None:
         call = _Record(callback, declared)
         declared_once = {parameter.name: parameter for parameter in call.parameters()}
-        flags = [click.Option([f"as_{form}", f"--{form}"], is_flag=True, help=_FORMS[form]) for form in forms]
+        flags = [
+            click.Option([f"as_{form}", *names], is_flag=True, help=text)
+            for form, (*names, text) in _FORMS.items()
+            if form in forms
+        ]
         super().__init__(name, callback=call, params=[*declared_once.values(), *params, *flags], **attributes)
         self.help = _with_examples(self.help)
         self.forms = forms

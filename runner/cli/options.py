@@ -33,6 +33,7 @@ from runner.util.values import Ranges
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
+    from runner.environments.mdp import Mdp
     from runner.export.plots.style import CurveStyle
     from runner.export.rerun.selection import Request
 
@@ -74,7 +75,29 @@ set_option: Final = option(
     metavar="KEY=VALUE",
     help="Override a value of the configuration, such as evaluation.trials=50; may be repeated.",
 )
+
+
+@record
+def environment_options(
+    env_id: str = option(
+        "--env",
+        default="dualtaxi:DualTaxi-v1",
+        show_default=True,
+        metavar="ID",
+        help="Gymnasium's id of the environment; before a colon, the module to import for it.",
+    ),
+    overrides: tuple[str, ...] = set_option,
+) -> Mdp:
+    """Return the MDP of the environment that the command names."""
+    from runner.config import from_mapping
+    from runner.environments.loading import load_mdp
+
+    config = from_mapping({"env": {"id": env_id}, "episodes": 1}, overrides)
+    return load_mdp(config.env.id, config.env.kwargs, config.rewards)
+
+
 html_option: Final = option("--html", type=PATH, metavar="FILE", help="Write an HTML page instead.")
+runs_option: Final = option("--runs", default="", metavar="FILTER", help="Runs, as for `dualtaxi ls`.")
 tags_option: Final = option("--tag", multiple=True, metavar="TAG", help="Add a tag; may be repeated.")
 force_option: Final = option("--force", is_flag=True, help="Replace existing output.")
 accept_changes_option: Final = option(

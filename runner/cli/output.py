@@ -10,7 +10,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -60,11 +60,11 @@ Part = str | Mapping[str, str] | Grid | Section
 class Reply:
     """What a command replies. Only the form that is printed is iterated over."""
 
-    data: Mapping[str, object] | Callable[[], Mapping[str, object]] | Iterable[str] = ()
-    """What --json prints: an object, a function that returns one, or the parts of a text."""
+    data: Mapping[str, object] | Callable[[], Mapping[str, object]] | None = None
+    """What --json prints: an object, or a function that returns one; None for nothing."""
     text: Iterable[Part] = ()
-    csv: Iterable[str] = ()
-    """Lines of CSV, which stand for the text where there is none."""
+    lines: Mapping[str, Iterable[str]] = field(default_factory=dict)
+    """Lines of forms, `text` among them, that are printed as they are; for what is too long to be held."""
     page: str = ""
     """A line about a page that was written: it stands for the text, and goes to stderr in other forms."""
     notes: Iterable[str] = ()
@@ -78,18 +78,18 @@ def print_replies(replies: Reply | Iterable[Reply], form: str = "text") -> int:
     for reply in [replies] if isinstance(replies, Reply) else replies:
         if reply.page:
             echo(reply.page, err=form != "text")
-        if form == "json":
-            data = reply.data() if callable(reply.data) else reply.data
-            parts = [json.dumps(finite(data), indent=1) + "\n"] if isinstance(data, Mapping) else data
-            sys.stdout.writelines(map(printable, parts))
+        if form in reply.lines:
+            sys.stdout.writelines(map(printable, reply.lines[form]))
+        elif form == "json":
+            if reply.data is not None:
+                data = reply.data() if callable(reply.data) else reply.data
+                echo(json.dumps(finite(data), indent=1))
         elif form == "markdown":
             for part in reply.text:
                 if isinstance(part, Remark):
                     say(part)
                 elif part:
                     echo("\n".join(markdown([_as_section(part)])))
-        elif form == "csv" or reply.text == ():
-            sys.stdout.writelines(map(printable, reply.csv))
         elif not reply.page:
             for number, part in enumerate(reply.text):
                 draw(part, is_first=not number)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import io
+import shutil
 import sys
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -15,12 +17,16 @@ from runner.analysis.sections import Answer
 from runner.cli.command import Command, Declared, argument, option
 from runner.cli.options import (
     checkpoint_option,
+    environment_options,
     episode_option,
     filter_argument,
     folders_option,
     force_option,
     html_option,
     policy_option,
+    require_one,
+    runs_option,
+    tags_option,
     trial_option,
     trust_option,
 )
@@ -68,10 +74,13 @@ _SUBJECTS: Final[dict[str, tuple[Declared, Callable[..., AbstractContextManager[
     "runs": (all_recorded_runs, nullcontext),
     "file": (recording_and_run, nullcontext),
     "folders": (folders_option, nullcontext),
+    "environment": (environment_options, nullcontext),
 }
 """The subject of a view -> what its command names, and how that is opened."""
 _ONLY_HERE: Final = {
     "words": filter_argument,
+    "runs": runs_option,
+    "tags": tags_option,
     "episode": episode_option,
     "trial": trial_option,
     "checkpoint": checkpoint_option,
@@ -88,6 +97,8 @@ def command_of(view: View) -> Command:
     def call(
         subject: Any, output: Path | None = None, force: bool = False, **values: object
     ) -> Iterator[Reply]:
+        if output is not None:
+            require_one("output", *(f"as_{form}" for form in view.forms if form in ("quiet", "csv")))
         if output not in (None, _STDOUT):
             (require_page if is_page else require_new)(output, force)
         if view.shows_progress:
@@ -95,33 +106,35 @@ def command_of(view: View) -> Command:
         with compilation_notice(), opened(subject) as content:
             with nullcontext() if view.shows_progress else stage_line("reading"):
                 answer = view.compute(content, **values)
-            if output == _STDOUT:
-                file = io.BytesIO()  # NumPy writes to a pipe by itself, and not all of it if the reader ends
-                answer.write(file)
-                text = [file.getvalue().decode(errors="replace")] if sys.stdout.isatty() else ()
-                if not text:
-                    sys.stdout.buffer.write(file.getvalue())
-                yield Reply((), text, exit_code=answer.exit_code)
+            if output is None:
+                text = _text(subject, answer)
+                yield Reply(answer.as_json, text, answer.lines, "", answer.remarks, answer.exit_code)
                 return
-            data: Any = answer.as_json
-            page, notes = "", []
-            if output is not None:
-                with stage_line("writing"), new_file(output, force) as path, path.open("wb") as stream:
-                    answer.write(stream)
-                data = answer.as_json() | {"files": files_written(output)}
-                if is_page:
-                    page = f"{output}: {answer.contents or size(output.stat().st_size)}"
-                    notes = [f"Note: {limit}." for limit in answer.limits]
-                else:
-                    notes = [path_and_size(output)]
-            yield Reply(data, _text(subject, answer), page=page, notes=notes, exit_code=answer.exit_code)
+            if output == _STDOUT:
+                with tempfile.TemporaryFile() as file:  # NumPy does not write all to a pipe whose reader ends
+                    answer.write(file)
+                    file.seek(0)
+                    if not sys.stdout.isatty():
+                        shutil.copyfileobj(file, sys.stdout.buffer)
+                    read = file.read().decode(errors="replace")
+                    yield Reply(text=[read] * bool(read), notes=answer.remarks, exit_code=answer.exit_code)
+                return
+            with stage_line("writing"), new_file(output, force) as path, path.open("wb") as stream:
+                answer.write(stream)
+            data = answer.as_json() | {"files": files_written(output)}
+            page, notes = "", [path_and_size(output)]
+            if is_page or answer.contents:
+                page = f"{output}: {answer.contents or size(output.stat().st_size)}"
+                notes = [f"Note: {limit}." for limit in answer.limits]
+            shown = () if answer.contents and not is_page else _text(subject, answer)
+            yield Reply(data, shown, {}, page, chain(notes, answer.remarks), answer.exit_code)
 
     declared = {"subject": named, **{name: _declared(name, each, view) for name, each in view.inputs.items()}}
     if view.file_ending:
         help_text, metavar = f"{view.file_help} FILE `-` is stdout.", f"FILE{view.file_ending}"
-        output = option("-o", "--output", type=FILE, metavar=metavar, help=help_text)
+        output = option(*view.file_flags, type=FILE, metavar=metavar, help=help_text)
         declared |= {"output": html_option if is_page else output, "force": force_option}
-    return Command(view.name, call, declared, help=view.help)
+    return Command(view.name, call, declared, forms=view.forms, help=view.help)
 
 
 def _text(run: Run, answer: Answer) -> Iterator[Part]:

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -162,10 +162,10 @@ class QueryResult:
             columns = [[_as_json(value) for value in column.to_pylist()] for column in batch.columns]
             yield from map(list, zip(*columns, strict=True))
 
-    def write_parquet(self, path: Path) -> int:
+    def write_parquet(self, file: Path | BinaryIO) -> int:
         """Write the rows into a file of Parquet; return their number."""
         count = 0
-        with pq.ParquetWriter(path, self.columns, compression="zstd") as writer:
+        with pq.ParquetWriter(file, self.columns, compression="zstd") as writer:
             for batch in self.batches():
                 writer.write_batch(batch)
                 count += batch.num_rows

@@ -26,7 +26,7 @@ from runner.service.dependencies import CatalogueOf, Computation, ComputationOf,
 from runner.service.errors import EXPECTED
 from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import filled, media_docs, status_of
-from runner.views import VIEWS, view_named
+from runner.views import shipped_views, view_named
 from runner.views.view import Given, Input, View, rows_in
 
 api = APIRouter()
@@ -202,6 +202,6 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
     return {"choices": choices, "refusal": refusal, "damage": damage}
 
 
-for _view in (*VIEWS.values(), *map(view_named, installed_names())):
+for _view in (*shipped_views(), *map(view_named, installed_names())):
     if _view.is_served:
         (_add_routes if _view.has_tab else _add_route_of_runs)(_view)

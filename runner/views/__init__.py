@@ -6,50 +6,41 @@ packages add views by entry points, see `runner.util.plugins`.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cache
+from importlib import import_module
 from typing import Final
 
 from runner.util import plugins
-from runner.views import (
-    checkpoints,
-    code,
-    compare,
-    console,
-    diff,
-    du,
-    episodes,
-    evaluations,
-    qtable,
-    show,
-    system,
-    values,
-    verify,
-    when,
-    why,
-)
 from runner.views.view import View
 
-VIEWS: Final = {
-    module.VIEW.name: module.VIEW
-    for module in (
-        episodes,
-        evaluations,
-        qtable,
-        when,
-        why,
-        checkpoints,
-        system,
-        console,
-        code,
-        diff,
-        compare,
-        show,
-        verify,
-        values,
-        du,
-    )
-}
-"""Name of a view -> the view; those of one run in the order of their tabs."""
+NAMES: Final = (
+    "episodes",
+    "evaluations",
+    "qtable",
+    "when",
+    "why",
+    "checkpoints",
+    "system",
+    "console",
+    "code",
+    "diff",
+    "compare",
+    "show",
+    "verify",
+    "values",
+    "du",
+    "ls",
+    "find",
+    "sql",
+    "table",
+)
+"""The shipped views, each the module of its name; those of one run in the order of their tabs."""
+
+
+def shipped_views() -> Iterator[View]:
+    """Yield the shipped views."""
+    return map(view_named, NAMES)
 
 
 @cache  # reading the metadata of all packages takes 0.1 s
@@ -59,4 +50,7 @@ def view_named(name: str) -> View:
     Raises:
         RunnerError: it cannot be imported.
     """
-    return VIEWS[name] if name in VIEWS else plugins.load_plugin(plugins.VIEWS, name, View)
+    if name not in NAMES:
+        return plugins.load_plugin(plugins.VIEWS, name, View)
+    view: View = import_module(f"runner.views.{name}").VIEW
+    return view

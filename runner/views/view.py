@@ -6,7 +6,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, BinaryIO, Final, Literal
 
@@ -57,12 +57,14 @@ NO_PROGRESS: Final = ShownProgress()
 class ReadyAnswer(Answer):
     """An answer of parts that were made together."""
 
-    data: Json
-    text: Iterable[Section]
+    data: Json = field(default_factory=dict)
+    text: Iterable[Section] = ()
     file: Callable[[], str] = str
     """Returns the text of the file."""
     contents: str = ""
     limits: Sequence[str] = ()
+    lines: Mapping[str, Iterable[str]] = field(default_factory=dict)
+    remarks: Iterable[str] = ()
     exit_code: int = ExitCode.OK
 
     def as_json(self) -> Json:
@@ -150,11 +152,13 @@ class View:
     title: str
     compute: Callable[..., Any]
     """Takes the subject, the inputs and, if it is slow, `progress`; returns an `Answer`."""
-    subject: Literal["recording", "run", "pair", "runs", "any run", "file", "folders"] = "recording"
+    subject: Literal["recording", "run", "pair", "runs", "any run", "file", "folders", "environment"] = (
+        "recording"
+    )
     """What the function takes first: a recording; or the run, to read files stored next to it, with answers
     that are not cached and have no API route, as they hold paths; or a list of two or more runs.
-    Only a command names any run, which may lack its recording; a file by its path, with its run if any; or
-    the folders of runs."""
+    Only a command names any run, which may lack its recording; a file by its path, with its run if any;
+    the folders of runs; or an environment, of which it is the MDP."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
@@ -174,8 +178,12 @@ class View:
     """Whether the page has an answer before anything is asked."""
     file_ending: str = ""
     """Ending of the file that the answer can be written as, such as `PAGE`; empty if there is none."""
+    file_flags: tuple[str, ...] = ("-o", "--output")
+    """The option that takes the file."""
     file_help: str = ""
     """What is in the file, unless it is a page."""
+    forms: tuple[str, ...] = ("json", "markdown")
+    """The options of the command for other forms than text, see `Answer.lines`."""
     exclusive_spool: bool = False
     """Whether the function writes large temporary files, so that one computation runs at a time."""
     refusal: Callable[[Recording], str] | None = None

@@ -78,7 +78,7 @@ def _reply(archived: Archived, dry_run: bool) -> Reply:
         "digest": manifest.digest,
     }
     remarks = [Remark("Nothing was kept: a dry run.")] if dry_run else []
-    return Reply(json_lines([values]), [rows, *remarks])
+    return Reply(text=[rows, *remarks], lines={"json": json_lines([values])})
 
 
 @click.command("restore", cls=Command)

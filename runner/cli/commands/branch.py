@@ -221,7 +221,7 @@ def _played(parent: Run, branch: Branch) -> Reply:
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}
     both = {"parent": asdict(branch.parent), "branch": asdict(branch.outcome)}
     return Reply(
-        {"run_id": branch.run.run_id, "origin": asdict(branch.origin)} | both,
+        {"run_id": branch.run.run_id, "origin": asdict(branch.origin), **both},
         [rows, grid, {"next": command_for(parent, "diff", branch.run.run_id)}],
     )
 

@@ -87,7 +87,9 @@ def play_command(
         if not recording.tabular and Values(recording).image:
             film = f"`dualtaxi export film {run.run_id}`"
             remarks = [Remark(f"Observations that are pictures are not shown: {film} does.")]
-        yield Reply(json_lines(played.steps()), itertools.chain(remarks, _shown(played, speed)))
+        yield Reply(
+            text=itertools.chain(remarks, _shown(played, speed)), lines={"json": json_lines(played.steps())}
+        )
 
 
 def _shown(played: ShownEpisode, speed: float) -> Iterator[str]:

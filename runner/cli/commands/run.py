@@ -162,7 +162,7 @@ def _interrupted(notes: list[str], config: ExperimentConfig, begun: int) -> Repl
 
 
 def _reply(run: Run, number: int) -> Reply:
-    return Reply(json_lines([run_as_json(run)]), _text(run, number))
+    return Reply(text=_text(run, number), lines={"json": json_lines([run_as_json(run)])})
 
 
 def _text(run: Run, number: int) -> Iterator[Part]:

@@ -119,7 +119,7 @@ def schema() -> Reply:
     from runner.config import json_schema
 
     text = json.dumps(json_schema(), indent=2)
-    return Reply(iter((text, "\n")), [text])
+    return Reply(text=[text], lines={"json": [text, "\n"]})
 
 
 @click.command("completion", cls=Command, forms=())

@@ -19,7 +19,7 @@ from runner.recording.run_file import EvaluationMetrics, has_environment
 from runner.runs.run import Run
 from runner.service.pages.rendering import Page, Values, made
 from runner.util import humanize, plugins
-from runner.views import VIEWS, view_named
+from runner.views import NAMES, shipped_views, view_named
 
 StatusName = Annotated[str, Query(max_length=20, description="The status that the page shows.")]
 
@@ -27,7 +27,7 @@ TABS: Final = (
     ("", "Overview", ""),
     ("replay", "Replay", "episodes"),
     ("learned", "What was learned", "tables"),
-    *((view.name, view.title, view.needs) for view in VIEWS.values() if view.has_tab),
+    *((view.name, view.title, view.needs) for view in shipped_views() if view.has_tab),
     ("config", "Configuration", ""),
     ("pictures", "Pictures", "pictures"),
     ("rerun", "Rerun", "episodes"),
@@ -37,7 +37,7 @@ TABS: Final = (
 
 def installed_names() -> list[str]:
     """Return the names of the views that installed packages add, except names of shipped pages."""
-    shipped = {*VIEWS, *(path for path, *_ in TABS)}
+    shipped = {*NAMES, *(path for path, *_ in TABS)}
     return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in shipped]
 
 

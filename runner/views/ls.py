@@ -1,4 +1,4 @@
-"""`dualtaxi ls`: the recorded runs as a table, ids, CSV or JSON."""
+"""`ls`: the recorded runs as a table, ids, CSV or JSON."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import click
-
-from runner.analysis.sections import Grid
-from runner.cli.command import Command, option
-from runner.cli.options import filter_argument, folders_option, limit_option, require_one
-from runner.cli.output import Reply, say
-from runner.cli.parameter_types import INDEX
+from runner.analysis.sections import Answer, Grid, Section
+from runner.query.text import MAX_PROBLEMS
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
     FIELDS,
@@ -31,14 +26,12 @@ from runner.runs.catalogue.columns import (
 from runner.util.humanize import capitalised
 from runner.util.row_text import csv_lines, json_list
 from runner.util.values import Json
+from runner.views.view import NO_PROGRESS, ONLY_HERE, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
-    from runner.cli.output import Part
     from runner.runs.catalogue.filters import Filter
     from runner.runs.catalogue.index import CatalogueIndex
 
-MAX_PROBLEMS: Final = 5
-"""Damaged runs whose problems are printed."""
 ON_A_TERMINAL: Final = 50
 """Runs listed on a terminal by default."""
 _READ_BYTES: Final = 1 << 20
@@ -83,71 +76,32 @@ Row = Json
 Render = Callable[[Iterable[Row], Sequence[str]], Iterator[str]]
 
 
-@click.command("ls", cls=Command, forms=("csv", "json", "markdown"))
-def ls_command(
-    words: tuple[str, ...] = filter_argument,
-    recordings: tuple[Path, ...] = folders_option,
-    sort: str = option(
-        "--sort", default="", metavar="FIELD,...", help="Sort by these fields; -FIELD for descending order."
-    ),
-    columns: str | None = option("--columns", metavar="FIELD,...", help="Show these fields."),
-    limit: int | None = limit_option(f"{ON_A_TERMINAL} in a terminal's table, else all"),
-    offset: int = option("--offset", type=INDEX, default=0, help="Skip the first N."),
-    quiet: bool = option("-q", "--quiet", is_flag=True, help="Print ids only."),
-) -> Reply:
-    """List the runs that match FILTER, or all, newest first.
-
-    A filter is a list of words, searched for in id, name, configuration, tags and note, or a condition in
-    Python's syntax: comparisons of fields, "TEXT" in FIELD, FIELD in ("A", "B"), like(FIELD, "A*"),
-    FIELD is None, and, or, not, arithmetic, max(), min(), abs(). The fields:
-
-    \b
-      id name config seed status tag note created age episodes steps success_percent
-      mean_length mean_penalties mean_return logged seconds bytes digest parent mode
-      environment host git archive folder, and config.PATH for any value of the
-      configuration
-
-    The table shows the training episodes done (and to do, if some are missing), the percentage of the last
-    evaluation's trials that succeeded, their mean return (of a loop without evaluations that of its last 100
-    training episodes), the size of the recording, how long ago the run began, which run recorded the same
-    content before, which run it is a branch of, and what was changed. For a loop it also shows the last
-    values that it logged. A narrow terminal has fewer columns.
-
-    Examples:
-      dualtaxi ls
-      dualtaxi ls tutorial
-      dualtaxi ls 'status == "finished" and config.discount > 0.9' --sort -success_percent --limit 5
-      dualtaxi ls 'created >= "2026-01-01" and (seed < 3 or age < "12h")' --columns id,seed,config,digest
-      dualtaxi ls --quiet '"tutorial" and "keep" not in tags'
-    """  # noqa: D301 - Click's mark for preformatted text
-    from runner.runs.catalogue.filters import parse
-
-    require_one("quiet", "as_csv", "as_json", "as_markdown")
-    shown = columns_of(columns) if columns else None
-    listing = _Listing(recordings, parse(" ".join(words)), sort, limit, offset)
-    if quiet:
-        return Reply(csv=listing.lines(["id"], _ids), notes=listing.notes())
-    names = shown or list(DEFAULT_JSON)
-    return Reply(
-        listing.lines(names, _objects),
-        listing.table(shown),
-        listing.lines(names, _csv_lines),
-        notes=listing.notes(),
-    )
-
-
-class _Listing:
+class Listing(Answer):
     """The runs that match a filter; once one form of them is read, how many, and which are damaged."""
 
     def __init__(
-        self, recordings: tuple[Path, ...], matching: Filter, sort: str, limit: int | None, offset: int
+        self,
+        recordings: Sequence[Path],
+        matching: Filter,
+        columns: Sequence[str] | None,
+        sort: str,
+        limit: int | None,
+        offset: int,
+        say: Callable[[str], None],
     ) -> None:
-        self._recordings, self._filter, self._sort = recordings, matching, sort
-        self._limit, self._offset = limit, offset
+        self._recordings, self._filter, self._columns, self._sort = recordings, matching, columns, sort
+        self._limit, self._offset, self._say = limit, offset, say
         self._total, self._listed = 0, 0
         self._problems: list[str] = []
+        names = columns or DEFAULT_JSON
+        self.lines = {
+            "quiet": self._lines(["id"], _ids),
+            "csv": self._lines(names, _csv_lines),
+            "json": self._lines(names, _objects),
+        }
+        self.remarks = self._remarks()
 
-    def lines(self, columns: Sequence[str], render: Render) -> Iterator[str]:
+    def _lines(self, columns: Sequence[str], render: Render) -> Iterator[str]:
         """Yield a text of the runs in bounded memory.
 
         It goes to a temporary file first: the index is locked while it is read, and the reader of the output
@@ -175,15 +129,16 @@ class _Listing:
             return total
 
         with tempfile.SpooledTemporaryFile(_SPOOL_BYTES, "w+", encoding="utf-8", newline="") as spool:
-            self._total = look(self._recordings, work, say)
+            self._total = look(self._recordings, work, self._say)
             spool.seek(0)
             while part := spool.read(_READ_BYTES):
                 yield part
 
-    def table(self, columns: Sequence[str] | None) -> Iterator[Part]:
+    def sections(self) -> Iterator[Section]:
         """Yield a table of the runs, by default of the columns that are of interest here."""
         from runner.runs.catalogue.index import look, order_of
 
+        columns = self._columns
         order, needed = order_of(self._sort), needed_for([*(columns or _DEFAULT_COLUMNS), "same_as"])
         limit = ON_A_TERMINAL if self._limit is None and sys.stdout.isatty() else self._limit or None
 
@@ -191,13 +146,12 @@ class _Listing:
             rows, total = index.page(self._filter, *order, limit=limit, offset=self._offset, columns=needed)
             return index.with_same_as(rows), total
 
-        found, self._total = look(self._recordings, work, say)
+        found, self._total = look(self._recordings, work, self._say)
         rows = [*self._noted(found)]
         if rows:
-            if columns:
-                yield _grid(rows, columns)
-            else:
-                yield _grid(rows, _informative(rows, len(self._recordings)), _OPTIONAL)
+            spare = () if columns else _OPTIONAL
+            shown = columns or _informative(rows, len(self._recordings))
+            yield Section("", grids=[_grid(rows, shown, spare)])
 
     def _noted(self, rows: Iterable[Row]) -> Iterator[Row]:
         """Yield rows, noting their number and the problems of damaged runs."""
@@ -206,7 +160,7 @@ class _Listing:
             self._problems += [row["problem"]] if row["problem"] else []
             yield row
 
-    def notes(self) -> Iterator[str]:
+    def _remarks(self) -> Iterator[str]:
         """Yield problems of damaged runs; how many matching runs are not listed, or why none is."""
         yield from map(capitalised, self._problems[:MAX_PROBLEMS])
         if (more := len(self._problems) - MAX_PROBLEMS) > 0:
@@ -220,9 +174,6 @@ class _Listing:
             yield f"No run in {folders} matches."
         elif not self._listed:
             yield f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one."
-
-
-# --- printing ---------------------------------------------------------------------------------------------
 
 
 def _ids(rows: Iterable[Row], _columns: Sequence[str]) -> Iterator[str]:
@@ -266,7 +217,7 @@ def _informative(rows: Sequence[Row], folders: int) -> list[str]:
     return [column for column in _DEFAULT_COLUMNS if is_informative.get(column, True)]
 
 
-def _grid(rows: Sequence[Row], columns: Sequence[str], spare: Sequence[str] = ()) -> Grid:
+def _grid(rows: Sequence[Row], columns: Sequence[str], spare: Sequence[str]) -> Grid:
     """Return a table, in which ids are never cut."""
     texts = [column for column in columns if column not in FIELDS or FIELDS[column].kind in LEFT_KINDS]
     headings, left, cut, spare = (
@@ -274,3 +225,52 @@ def _grid(rows: Sequence[Row], columns: Sequence[str], spare: Sequence[str] = ()
     )
     cells = [tuple(as_text(row, column) for column in columns) for row in rows]
     return Grid(headings, cells, left=left, cut=cut, spare=spare)
+
+
+def ls(
+    folders: Sequence[Path],
+    words: Sequence[str] = ONLY_HERE,
+    sort: str = view_input(
+        "sort", "Sort by these fields; -FIELD for descending order.", default="", metavar="FIELD,..."
+    ),
+    columns: str | None = view_input("columns", "Show these fields.", metavar="FIELD,..."),
+    limit: int | None = view_input(
+        "limit",
+        f"Maximum number of rows, 0 for all.  [default: {ON_A_TERMINAL} in a terminal's table, else all]",
+        kind=int,
+    ),
+    offset: int = view_input("offset", "Skip the first N.", kind=int, default=0),
+    progress: ShownProgress = NO_PROGRESS,
+) -> Listing:
+    """List the runs that match FILTER, or all, newest first.
+
+    A filter is a list of words, searched for in id, name, configuration, tags and note, or a condition in
+    Python's syntax: comparisons of fields, "TEXT" in FIELD, FIELD in ("A", "B"), like(FIELD, "A*"),
+    FIELD is None, and, or, not, arithmetic, max(), min(), abs(). The fields:
+
+    \b
+      id name config seed status tag note created age episodes steps success_percent
+      mean_length mean_penalties mean_return logged seconds bytes digest parent mode
+      environment host git archive folder, and config.PATH for any value of the
+      configuration
+
+    The table shows the training episodes done (and to do, if some are missing), the percentage of the last
+    evaluation's trials that succeeded, their mean return (of a loop without evaluations that of its last 100
+    training episodes), the size of the recording, how long ago the run began, which run recorded the same
+    content before, which run it is a branch of, and what was changed. For a loop it also shows the last
+    values that it logged. A narrow terminal has fewer columns.
+
+    Examples:
+      dualtaxi ls
+      dualtaxi ls tutorial
+      dualtaxi ls 'status == "finished" and config.discount > 0.9' --sort -success_percent --limit 5
+      dualtaxi ls 'created >= "2026-01-01" and (seed < 3 or age < "12h")' --columns id,seed,config,digest
+      dualtaxi ls --quiet '"tutorial" and "keep" not in tags'
+    """  # noqa: D301 - Click's mark for preformatted text
+    from runner.runs.catalogue.filters import parse
+
+    shown, matching = columns_of(columns) if columns else None, parse(" ".join(words))
+    return Listing(folders, matching, shown, sort, limit, offset, progress.say)
+
+
+VIEW: Final = View("ls", "Runs", ls, subject="folders", forms=("quiet", "csv", "json", "markdown"))
