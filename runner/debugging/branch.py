@@ -224,19 +224,21 @@ def branch_episode(
         ConfigError, CannotRedo, RecordingError, StorageError: as `branch`.
     """
     checked_run_name(task.name)
-    folder = recordings.absolute()
-    with storage_errors(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        staging = tempfile.TemporaryDirectory(prefix=".branch-", dir=folder)  # hidden: no run is listed there
-    with staging:
-        for message in stream_from_child(_record_branch, run.recording.absolute(), Path(staging.name), task):
+    with storage_errors(recordings):
+        recordings.mkdir(parents=True, exist_ok=True)
+        staging = tempfile.TemporaryDirectory(
+            prefix=".branch-", dir=recordings
+        )  # hidden: no run is listed there
+    with staging as name:
+        staged = Path(name).absolute()
+        for message in stream_from_child(_record_branch, run.recording.absolute(), staged, task):
             if isinstance(message, int):
                 report(message)
             else:
                 run_id, origin, stopped, is_recorded = message
-        with storage_errors(folder / run_id):
-            (Path(staging.name) / run_id).rename(folder / run_id)
-    own = run_at(folder / run_id)
+        with storage_errors(recordings / run_id):
+            (staged / run_id).rename(recordings / run_id)
+    own = run_at(recordings / run_id)
     with open_recording(run.recording) as recording:
         before = _outcome(recording, origin.phase, origin.episode, "unfinished")
     with open_recording(own.recording) as recording:

@@ -65,7 +65,7 @@ def find_run(
         count = sum(candidate.name == name for candidate in candidates)
         if count > 1:
             report(f"{count:,} runs are named {name}: the newest is taken, {chosen.run_id}.")
-    return chosen._replace(root=os.fspath(folder)).run()  # the path as the user gave it
+    return chosen.run(folder)
 
 
 def run_of_id(run_id: str, recordings: Path) -> Run | None:
@@ -94,9 +94,9 @@ def find_runs(name: str, recordings: Path, report: Tell) -> list[Run]:
         matches = look([recordings], lambda index: index.candidates(chosen), report)
         if not matches:
             raise RunNotFound(f"no run in {recordings} matches {name}. `dualtaxi ls` lists the runs.")
-        return [candidate.run() for candidate in reversed(matches)]
+        return [candidate.run(recordings) for candidate in reversed(matches)]
     runs = look([recordings], lambda index: of_name(name, index), report, quick=True)
-    return [candidate.run() for candidate in runs] or [find_run(name, recordings, report=report)]
+    return [candidate.run(recordings) for candidate in runs] or [find_run(name, recordings, report=report)]
 
 
 def run_with_id(run_id: str, recordings: Path) -> Run | None:
@@ -104,7 +104,7 @@ def run_with_id(run_id: str, recordings: Path) -> Run | None:
     from runner.runs.catalogue.index import look
 
     candidates = look([recordings], lambda index: matching(run_id, index), quick=True)
-    place = next((Path(run.root, run.entry) for run in candidates if run.run_id == run_id), None)
+    place = next((recordings / run.entry for run in candidates if run.run_id == run_id), None)
     return run_in(place) if place else None
 
 

@@ -166,10 +166,10 @@ class Candidate(NamedTuple):
         """When the run began, in UTC."""
         return datetime.fromtimestamp(self.milliseconds / 1000, UTC)
 
-    def run(self) -> Run:
-        """Return the run.
+    def run(self, root: Path | None = None) -> Run:
+        """Return the run; its path begins with `root`, which names the recordings folder as the user did.
 
         Raises:
             RunNotFound: it was removed in the meantime.
         """
-        return listed_run(Path(self.root, self.entry), self.run_id)
+        return listed_run(Path(root or self.root, self.entry), self.run_id)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -222,6 +223,12 @@ def test_the_command_and_what_show_lists(runs, tmp_path):
     assert printed["run_id"] in json.loads(command("show", run.run_id, "--json"))["branches"]
     assert "at 0:3, action 0 (left), then constant" in command("show", run.run_id)
     assert f"of run {run.run_id} at 0:3, action 1" in command("show", printed["run_id"])
+
+
+def test_the_path_of_a_branch_begins_with_the_folder_as_given(runs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = runner.branch(runs["CartPole-v1"], at="0:3", action=1, recordings="mine").run
+    assert run.folder == Path("mine", run.run_id)
 
 
 def test_a_dict_space_takes_json(tmp_path):

@@ -93,6 +93,13 @@ def test_a_bare_recording_is_imported_too(lake, tmp_path):
     assert imported.status == "finished"
 
 
+def test_the_path_of_an_imported_run_begins_with_the_folder_as_given(lake, tmp_path, monkeypatch):
+    file = export_mcap(lake, tmp_path / "a.mcap").path
+    monkeypatch.chdir(tmp_path)
+    folders = [import_recording(file, Path("theirs")).run.folder for _ in range(2)]
+    assert folders == [Path("theirs", lake.run_id)] * 2
+
+
 def test_a_resumed_import_leaves_the_imported_file_as_it_was(taxis, tmp_path):
     file = cut_off(taxis, tmp_path / "mine", 20_000).recording
     before = file.read_bytes()
