@@ -83,6 +83,11 @@ def head_of(run: Run) -> RunHead:
         "tables": has_tables,
         "training": run.can_train_again,
     }
+    missing = {
+        "episodes": "recorded steps",
+        "tables": "Q-tables",
+        "training": "training that the runner can repeat" if has_tables else "Q-tables",
+    }
     installed = [view for view in map(view_named, installed_names()) if view.has_tab]
     return RunHead(
         id=run.run_id,
@@ -96,11 +101,7 @@ def head_of(run: Run) -> RunHead:
             *((path, title) for path, title, need in TABS if has[need]),
             *((view.name, view.title) for view in installed),
         ),
-        lacking={
-            path: "training that the runner can repeat" if has_tables else "Q-tables"
-            for path, _, need in TABS
-            if need in ("tables", "training") and not has[need]
-        },
+        lacking={path: missing[need] for path, _, need in TABS if need in missing and not has[need]},
         steps=str(packing.get("steps", "all")) if isinstance(packing, Mapping) else "all",
     )
 

@@ -106,6 +106,7 @@ class ReplayStage:
 async def chosen_replay(
     run: RecordedRun,
     compute: ComputationOf,
+    catalogue: CatalogueOf,
     phase: Literal["train", "eval"] | None = None,
     episode: str = "",
     after: str = "",
@@ -113,12 +114,15 @@ async def chosen_replay(
     at: At = "",
 ) -> Response:
     """Redirect to the step `at`, to the episode that a form names, or to a typical one."""
+    reference = at or TYPICAL
     if phase == "train":
-        step = EpisodeRef.parse(f"train:{episode or 0}")
+        reference = episode or "0"
     elif phase == "eval" and after:
-        step = EpisodeRef.parse(f"eval:{after}:{trial or 0}")
-    else:
-        step = await step_of(run, compute, at or TYPICAL)
+        reference = f"eval:{after}:{trial or 0}"
+    try:
+        step = await step_of(run, compute, reference)
+    except RunnerError as error:
+        return _page(run, catalogue, EpisodeRef(), error)
     address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
     return RedirectResponse(address, HTTPStatus.FOUND)
 
@@ -178,12 +182,7 @@ async def _replay(
     refused: RunnerError | None = None,
     form: Mapping[str, str] = {},
 ) -> Response:
-    """Return the page of a step of an episode.
-
-    Args:
-        refused: why the step was not marked.
-        form: what was sent then.
-    """
+    """Return the page of a step of an episode; see `_page`."""
     part: bytes | RunnerError
     preparing = asyncio.create_task(prepare_pictures(run, streams, at))
     start = max(0, at.t - BEFORE)
@@ -193,6 +192,24 @@ async def _replay(
     except RunnerError as error:
         part = error
     await preparing
+    return _page(run, catalogue, at, part, refused, form)
+
+
+def _page(
+    run: Run,
+    catalogue: Catalogue,
+    at: EpisodeRef,
+    part: bytes | RunnerError,
+    refused: RunnerError | None = None,
+    form: Mapping[str, str] = {},
+) -> Response:
+    """Return the page of a step of an episode.
+
+    Args:
+        part: the part of the episode around the step, or why there is none.
+        refused: why the step was not marked.
+        form: what was sent then.
+    """
 
     def show() -> dict[str, object]:
         stage, problem = (

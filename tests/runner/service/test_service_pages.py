@@ -326,6 +326,14 @@ def test_pages_take_every_reference_to_a_step(client, recordings):
         assert f"What if? {step.heading}, step {step.t:,}" in what_if
 
 
+@pytest.mark.parametrize("query", ["phase=train&episode=x", "phase=eval&after=60&trial=-1", "at=step:999999"])
+def test_a_replay_that_there_is_not_keeps_tabs_and_form(client, query):
+    answer = client.get(f"/runs/first/replay?{query}", headers=ACCEPT_HTML)
+    assert answer.status_code in (400, 404)
+    for part in ('<form class="episode-form"', "/config", 'class="problem"'):
+        assert part in answer.text
+
+
 def test_the_fields_of_a_replay_lead_to_an_episode(client):
     for query, path in (
         ("phase=train&episode=5", "train/5"),
@@ -398,6 +406,17 @@ def test_output_is_shown_escaped_and_searched(client, recordings, capsys):
     assert "No line was found" in page_of(client, "/runs/printing/console?search=nothing")
     assert client.get("/runs/printing/console/part?status=running").status_code == 204
     assert client.get("/runs/printing/console?stream=else", headers=ACCEPT_HTML).status_code == 400
+
+
+def test_a_run_that_only_logged_has_no_replay(client, recordings, monkeypatch):
+    monkeypatch.setenv("DUALTAXI_RECORDINGS", str(recordings))
+    writer = SummaryWriter("logged")
+    writer.add_scalar("loss", 1.0, 0)
+    writer.close()
+    for tab, status in (("replay", 409), ("rerun", 200), ("episodes", 200)):
+        page = page_of(client, f"/runs/logged/{tab}", status)
+        assert "There is nothing to show here: the run has no recorded steps." in page
+        assert "<form" not in page.partition("<main")[2]
 
 
 def test_logged_pictures_are_shown_newest_first_with_their_steps(client, recordings):
