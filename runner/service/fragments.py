@@ -44,6 +44,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.addresses import link, places_in
 from runner.service.computed import as_json
+from runner.util.humanize import sentence
 from runner.util.values import Json
 from runner.views.view import Given
 
@@ -192,7 +193,7 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
     except RunnerError as error:
         if table is not None:
             raise
-        return f'<p class="hint">{escape(str(error).removeprefix("normalise: "))}</p>'.encode()
+        return f"<p>{escape(sentence(str(error).removeprefix('normalise: ')))}</p>".encode()
     return str(partials().answer(drawn_task_sections(comparison))).encode()
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 from fastapi import APIRouter, Depends, Query, Request, Response
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, RedirectResponse
 
 from runner.analysis.axes import EPISODES
 from runner.analysis.episodes import EpisodeRef
@@ -30,6 +30,7 @@ from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, result_of
 from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
+from runner.service.problems import requests_page
 from runner.util import humanize
 from runner.util.humanize import UNKNOWN, counted
 from runner.views.compare import MAX_SCORES
@@ -148,9 +149,15 @@ def overview(runs: ChosenRuns, scores: Scores = "") -> Response:
 
 @router.get("/tasks")
 async def tasks(
-    runs: ChosenRuns, compute: ComputationOf, scores: Scores = "", axis: AxisOf = EPISODES.name
+    request: Request,
+    runs: ChosenRuns,
+    compute: ComputationOf,
+    scores: Scores = "",
+    axis: AxisOf = EPISODES.name,
 ) -> Response:
-    """Return the comparison over environments by normalised scores, as a part of the page."""
+    """Return the comparison over environments by normalised scores, as a part of the page; else the page."""
+    if requests_page(request):
+        return RedirectResponse(f"/compare?{request.url.query}#environments")
     paths = [run.recording for run in runs]
     return HTMLResponse(await compute(fragments.tasks, paths, axis, scores))
 
