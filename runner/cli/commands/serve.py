@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import served_folders_option, workers_option
+from runner.cli.options import folders_option, workers_option
 from runner.cli.output import echo, say
 from runner.cli.parameter_types import FILE, Number
 from runner.service.settings import ServiceSettings
@@ -18,7 +18,7 @@ from runner.util.files import storage_errors
 
 @click.command("serve", cls=Command, forms=())
 def serve_command(
-    recordings: tuple[Path, ...] = served_folders_option,
+    recordings: tuple[Path, ...] = folders_option,
     host: str = option(
         "--host", default="127.0.0.1", show_default=True, metavar="HOST", help="The address to listen on."
     ),
