@@ -192,7 +192,7 @@ def _step_at(recording: Recording, at: EpisodeRef | None) -> Records:
     """
     if at is None:
         raise ConfigError(
-            "found no state or no action, expected both, or a step (`at`) whose state and action are meant."
+            "found no `state` or no `action`, expected both, or `at`, the step that they are taken from."
         )
     (block,) = at.steps_in(recording).rows(at.t, at.t + 1)
     recording.mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])

@@ -40,8 +40,12 @@ def values(
     from runner.runs.checkpoints import find_checkpoint
 
     at = episode or trial
-    if checkpoint is None or policy is None or at is None or (episode and trial):
-        raise ConfigError("expected --episode N or --eval N:TRIAL, --checkpoint and --policy.")
+    if episode and trial:
+        raise ConfigError("--episode and --eval exclude each other: choose one.")
+    if at is None or checkpoint is None or policy is None:
+        needed = {"--episode or --eval": at, "--checkpoint": checkpoint, "--policy": policy}
+        lacking = [name for name, value in needed.items() if value is None]
+        raise ConfigError(f"found no {', no '.join(lacking)}; see `dualtaxi values --help`.")
     chosen = find_checkpoint(run.checkpoints(), checkpoint, f"run {run.run_id}")
     with open_recording(run.recording) as recording, progress.stage("computing values"):
         at = at.resolved(recording)

@@ -266,5 +266,11 @@ def test_the_command_prints_what_python_returns(cooperative):
     assert found.steps[1].at in text
     assert "not a counterfactual" in text
     assert text.index("The steps that add or take most") < text.index("By reward")
-    wrong = CliRunner().invoke(cli, ["why", cooperative.run_id, "--state", "5000", *recordings])
-    assert wrong.exit_code == 2
+    for words, message in (
+        (["--state", "5000", "--action", "0"], "5000"),
+        (["--state", "5"], "expected both, or `at`, the step"),
+        (["--at", STEP, "--limit", "-1"], "--limit"),
+    ):
+        wrong = CliRunner().invoke(cli, ["why", cooperative.run_id, *words, *recordings])
+        assert wrong.exit_code == 2
+        assert message in wrong.stderr

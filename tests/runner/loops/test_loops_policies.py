@@ -174,8 +174,14 @@ def test_what_cannot_be_evaluated_says_why(folder):
     assert "--checkpoint" in done.output
     words = ["--checkpoint", "@0", "--policy", "agent_of_test:policy", "--step", "5"]
     assert "--step and --start are for" in dualtaxi(folder, "evaluate", pole.run_id, *words).output
-    for words in (["--episode", "0"], ["--checkpoint", "@0", "--policy", "a:b"]):
-        assert dualtaxi(folder, "values", pole.run_id, *words).exit_code == 2
+    for words, message in (
+        (["--episode", "0"], "found no --checkpoint, no --policy;"),
+        (["--checkpoint", "@0", "--policy", "a:b"], "found no --episode or --eval;"),
+        (["--episode", "0", "--eval", "0:0"], "--episode and --eval exclude each other"),
+    ):
+        done = dualtaxi(folder, "values", pole.run_id, *words)
+        assert done.exit_code == 2
+        assert message in done.output
     words = ["--episode", "9999", "--checkpoint", "@0", "--policy", "agent_of_test:values"]
     assert "no training episode 9,999" in dualtaxi(folder, "values", pole.run_id, *words).output
 
