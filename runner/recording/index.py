@@ -381,7 +381,7 @@ def check_beginning(stream: BinaryIO) -> int:
         raise RecordingError("found an empty file, expected a recording")
     if magic != MAGIC:
         error = CutOff if MAGIC.startswith(magic) else RecordingError
-        raise error(f"found {magic!r} at its start, expected an MCAP file: not a dualtaxi recording")
+        raise error("found another kind of file, expected an MCAP file: not a dualtaxi recording")
     header = next(raw_records(stream, len(MAGIC), stream.seek(0, 2)), None)
     if header is None or header.kind != Opcode.HEADER:
         raise CutOff(f"the Header record at {len(MAGIC)} cannot be read")

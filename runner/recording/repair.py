@@ -313,8 +313,8 @@ class DamagedFile:
         """The beginning of a chunk that was cut off at the end of the file, after its head."""
         if not self.size:
             raise RecordingError(f"{path}: found an empty file, expected a recording.")
-        if (magic := self._read(0, len(MAGIC))) != MAGIC:
-            raise RecordingError(f"{path}: found {magic!r} at its start, expected an MCAP file.")
+        if self._read(0, len(MAGIC)) != MAGIC:
+            raise RecordingError(f"{path}: found another kind of file, expected an MCAP file.")
 
     def good_records(self, report: Report = lambda *_: None) -> Iterator[Record]:
         """Yield the readable metadata, attachments and chunks, skipping all that is damaged."""

@@ -197,7 +197,9 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
         candidates = [one for one in candidates if one.step <= int(step)]
     if candidates:
         return candidates[-1]
-    available = ", ".join(one.reference for one in every[:20]) or "none; rec.checkpoint(...) records one"
+    if not every:
+        raise RunNotFound(f"{where} has no checkpoints; a loop records one by rec.checkpoint(name, value).")
+    available = ", ".join(one.reference for one in every[:20])
     raise RunNotFound(f"{where} has no checkpoint {reference!r}; it has: {available}.")
 
 

@@ -130,6 +130,10 @@ def test_commands_list_and_get_checkpoints(tmp_path):
         assert done.exit_code == 2
         assert "checkpoint" in done.output
     assert "expected" in dualtaxi(tmp_path, "checkpoint", "get", "one", "@x").output
+    with runner.record(make("CartPole-v1"), tmp_path, name="none") as rec:
+        rec.reset(seed=0)
+    lacking = dualtaxi(tmp_path, "checkpoint", "get", "none", "@0")
+    assert "has no checkpoints; a loop records one by rec.checkpoint" in lacking.output
 
 
 def test_a_changed_content_is_found_and_a_missing_one_is_noted(tmp_path):

@@ -206,11 +206,11 @@ def test_a_written_recording_passes_the_integrity_check(made_of, packing, tmp_pa
 
 FOREIGN = {
     "empty": (b"", "empty file, expected a recording"),
-    "text": (b"episodes: 100\n", "expected an MCAP file"),
+    "text": (b"episodes: 100\n", "found another kind of file, expected an MCAP file"),
     "a piece of the magic": (MCAP0_MAGIC[:5], "expected an MCAP file"),
     "only the magic": (MCAP0_MAGIC, "cannot be read|cut off"),
     "magic and rubbish": (MCAP0_MAGIC + b"\x01" + b"\xff" * 200, "cannot be read"),
-    "zeros": (bytes(1000), "expected an MCAP file"),
+    "zeros": (bytes(1000), "found another kind of file, expected an MCAP file"),
 }
 
 
