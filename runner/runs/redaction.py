@@ -42,12 +42,16 @@ SETTINGS_FILES: Final = (".toml", ".yaml", ".yml", ".json", ".cfg", ".ini", ".xm
 """Ends of the names of settings files, which hold secrets if they have the name of one: `api-key.json`."""
 _HARMLESS: Final = re.compile(r"\d{1,5}|\d?\.\d{1,5}|true|false|none|null", re.IGNORECASE)
 """Values that stay, such as that of `--max-tokens 512`, unless the name has `pass`."""
-_IN_SOURCES: Final = (
-    r"(?:token(?!i[sz])|secret|passw(?:or)?d|passphrase|credential|authorization|cookie|"
-    r"(?:api|access|private|auth|account|signing|encryption)[_-]?key)"
+_BUT_TOKEN: Final = (
+    "secret|passw(?:or)?d|passphrase|credential|authorization|cookie|"
+    "(?:api|access|private|auth|account|signing|encryption)[_-]?key"
 )
 """In sources a mere `key` is seldom a secret: `sort(key="length")`."""
-_SECRET_SETTING: Final = re.compile(_IN_SOURCES, re.IGNORECASE)
+_IN_SOURCES: Final = rf"(?:token(?!i[sz])|{_BUT_TOKEN})"
+_SECRET_SETTING: Final = re.compile(
+    rf"{_BUT_TOKEN}|(?:api|access|auth)[_-]?token|tokens?(?=[\d_-]*(?:\.|$))", re.IGNORECASE
+)
+"""A path of keys: `hf_token` is a secret, but not `token_embedding`."""
 _PLACEHOLDERS: Final = "{$<%["
 _PLACEHOLDER: Final = re.compile(r"(?:\$?\{.*\}|<.*>|\[.*\]|\$[A-Z_][A-Z0-9_]*|%\w+%)?")
 """A whole setting that stands for a value: a password may begin as one does."""
@@ -194,9 +198,9 @@ def redacted_line(text: str) -> str:
 def redacted_settings(value: Any, name: str = "") -> Any:
     """Return settings, as JSON has them, with secrets replaced by `[redacted]`.
 
-    As in sources, a mere `key` in a name does not count. Placeholders such as `${TOKEN}` and `<pad>` stay.
-    All parts of a mapping with the name of a secret are secrets. Of numbers, only whole ones are, and not
-    under `token`: `max_tokens` is a setting.
+    As in sources, a mere `key` in a name does not count, nor `token` before other words, unless the value
+    looks random. Placeholders such as `${TOKEN}` and `<pad>` stay. All parts of a mapping with the name of a
+    secret are secrets. Of numbers, only whole ones are, and not under `token`: `max_tokens` is a setting.
     """
     if isinstance(value, dict):
         return {key: redacted_settings(part, f"{name}.{key}" if name else key) for key, part in value.items()}
@@ -207,8 +211,10 @@ def redacted_settings(value: Any, name: str = "") -> Any:
         return REDACTED if is_secret else value
     if not isinstance(value, str):
         return value
-    is_secret = _SECRET_SETTING.search(name) and not _stays(name, value)
-    return REDACTED if is_secret and not _PLACEHOLDER.fullmatch(value) else redacted_line(value)
+    if _SECRET_SETTING.search(name) and not _stays(name, value) and not _PLACEHOLDER.fullmatch(value):
+        return REDACTED
+    word = re.sub(r"\W", "_", name)
+    return redacted_line(f"{word}: {value}").partition(": ")[2]
 
 
 class LineRedactor:

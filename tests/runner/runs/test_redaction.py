@@ -14,6 +14,7 @@ from runner.runs.redaction import (
     is_secret_name,
     redacted_arguments,
     redacted_line,
+    redacted_settings,
     redacted_text,
 )
 
@@ -112,6 +113,38 @@ def test_sources(text, shown):
 )
 def test_code_without_secrets_stays(text):
     assert redacted_text(text, {}) == text
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("api_key", "API-KEY", "apiKey", "access_token", "accessTokenValue", "hf_token", "token", "tokens"),
+        *("TOKEN_2", "AWS_SECRET_ACCESS_KEY", "password", "db_passwd", "client_secret", "secret_of_client"),
+        *("private_key", "credentials", "authorization", "session_cookie", "passphrase"),
+    ],
+)
+def test_settings_with_the_name_of_a_secret(name):
+    inside = {"of": ["hello", {"a": "b"}]}
+    found = redacted_settings({name: "hello", "more": {name: inside, "x": "hello"}})
+    redacted = {"of": [REDACTED, {"a": REDACTED}]}
+    assert found == {name: REDACTED, "more": {name: redacted, "x": "hello"}}
+
+
+def test_settings_that_only_begin_like_a_secret_stay():
+    settings = {
+        "token_embedding": {"type": "learned", "size": 512, "path": "tokens/v2.json"},
+        "token_level": "word",
+        "tokenizer": {"name": "gpt2-medium"},
+        "special_tokens": {"pad": "<pad>"},
+        "max_tokens": "512",
+        "a: b": "c: d",
+    }
+    assert redacted_settings(settings) == settings
+    random = "0a1b2c3d4e5f6a7b8c9d"
+    assert redacted_settings({"token_prod": random, "token_of": {"lab": random}}) == {
+        "token_prod": REDACTED,
+        "token_of": {"lab": REDACTED},
+    }
 
 
 def test_values_of_environment_variables():
