@@ -90,6 +90,7 @@ def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
         node = _Loader(text).get_single_node()
         builder = _Builder(source, lines)
         value = builder.value(node, ()) if node is not None else None
+        builder.places.setdefault((), Place(source, 1, 1) if lines else Place(source))  # of an empty text
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = Place(source, mark.line + 1, mark.column + 1) if mark and lines else Place(source)

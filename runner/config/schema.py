@@ -147,9 +147,8 @@ def _simple(branch: Schema) -> str:  # noqa: PLR0911 - one line a kind
                 branch.get("patternErrorMessage", "text, not empty" if "minLength" in branch else "text")
             )
         case kind:
-            return {"boolean": "true or false", "object": "a mapping", "null": "null"}.get(
-                str(kind), "a value"
-            )
+            mapping = "a mapping, not empty" if "minProperties" in branch else "a mapping"
+            return {"boolean": "true or false", "object": mapping, "null": "null"}.get(str(kind), "a value")
 
 
 def _bound(number: float) -> str:

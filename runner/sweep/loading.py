@@ -83,7 +83,8 @@ def _sweep(document: Document, name: str | None, stem: str, folder: Path | None)
         )
         raise refuse([*document.problems, problem], document)
     if "base" not in document.value and "episodes" in document.value:
-        raise ConfigError(f"{stem}: found an experiment, expected a sweep: `dualtaxi run` runs it.")
+        message = "found an experiment, expected a sweep: `dualtaxi run` runs it"
+        raise refuse([Problem((), message)], document)
     try:
         file = SweepFile.model_validate(dict(document.value))
         problems = document.problems
@@ -99,9 +100,8 @@ def _sweep(document: Document, name: str | None, stem: str, folder: Path | None)
         raise _combined(errors)
     sweep_name = name or file.name or stem
     if len(sweep_name) > MAX_NAME:
-        raise ConfigError(
-            f"name: found {len(sweep_name)} characters, expected at most {MAX_NAME}: runs carry it."
-        )
+        message = f"found {len(sweep_name)} characters, expected at most {MAX_NAME}: runs carry it"
+        raise refuse([Problem(("name",), message)], Document(name) if name else document)
     base, values = _base(file, document, sweep_name, folder)
     resolved = file.model_copy(update={"name": sweep_name, "base": values})
     return Sweep(sweep_name, resolved, base)
@@ -123,8 +123,10 @@ def _base(
             message = f"found the path {file.base!r}, expected the configuration itself: there is no folder"
             raise refuse([Problem(("base",), message)], document)
         path = folder / file.base
+        with problems_at(("base",), document, ConfigError):
+            text = read_text(path)
         load(path)  # reports every problem at its place in that file
-        within = read_yaml(read_text(path), str(path))
+        within = read_yaml(text, str(path))
     else:
         within = _part(document, "base")
     seeds, places = file.model_dump(mode="json")["seeds"], _places(document.places, "recording")

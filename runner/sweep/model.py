@@ -83,7 +83,7 @@ class SweepLimits(ConfigSection):
 
 _Base = Annotated[
     Annotated[str, Tag("path")] | Annotated[dict[str, object], Tag("mapping")],
-    Discriminator(lambda value: "mapping" if isinstance(value, Mapping) else "path"),
+    Discriminator(lambda value: {str: "path", dict: "mapping"}.get(type(value))),
 ]
 
 

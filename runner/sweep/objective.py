@@ -65,14 +65,16 @@ def never_recorded(metric: str, known: set[str]) -> RunnerError:
     """Return the error of an objective that no evaluation has."""
     if not known:
         return RunnerError(
-            f"objective.metric: {metric!r} was never recorded: there are no evaluations. "
+            f"objective.metric: found {metric!r}, which was never recorded: there are no evaluations. "
             "Set `evaluation` in the base."
         )
     hint = nearest(metric, known)
     if metric.startswith("exact.") and not any(name.startswith("exact.") for name in known):
         hint = " Set `evaluation: {exact: true}` in the base for exact measures."
     listed = ", ".join(sorted(name for name in known if not name.startswith("training.reward.")))
-    return RunnerError(f"objective.metric: {metric!r} was never recorded; there are {listed}.{hint}")
+    return RunnerError(
+        f"objective.metric: found {metric!r}, which was never recorded, expected one of {listed}.{hint}"
+    )
 
 
 def value_of(objective: Objective, curve: Curve) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -80,14 +81,37 @@ def test_an_unknown_parameter_is_reported_with_place_and_nearest_name(file):
             "expected a number: at is first_over",
         ),
         ({"base": BASE | {"episods": 5}}, "episods: unknown key"),
-        ({"base": "nowhere.yaml"}, "no such file"),
+        ({"base": "nowhere.yaml"}, "nowhere.yaml: no such file"),
+        ({"base": "quick"}, "quick: no such file. A shipped experiment"),
+        ({"base": 5}, "base: found 5, expected text or a mapping"),
+        ({"parameters": {}}, "parameters: found an empty mapping, expected a mapping, not empty"),
+        ({"name": "x" * 60}, "name: found 60 characters, expected at most 50"),
+        ({"episodes": 5}, "episodes: unknown key"),
         ({"recording": {"steps": "some"}}, "recording.steps: found 'some'"),
         ({"seeds": [1, 1]}, "found 1 for the second time"),
         ({"parameters": {"env.kwargs.is_slipery": [True]}}, "is_slipery"),
     ],
 )
 def test_an_invalid_sweep_is_refused(file, changes, expected):
-    assert expected.replace('."step_size"', ".step_size") in refused(file, **changes)
+    reply = refused(file, **changes)
+    assert expected.replace('."step_size"', ".step_size") in reply
+    assert all(re.match(r"\S+/small\.yaml:\d+:\d+: ", line) for line in reply.splitlines()), reply
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", ":1:1: found null, expected keys and values, such as base and trials"),
+        ("- a", ":1:1: found a list of 1, expected keys and values"),
+        ("episodes: 10", ":1:1: found an experiment, expected a sweep: `dualtaxi run` runs it"),
+    ],
+)
+def test_what_is_no_sweep_is_refused_with_its_place(tmp_path, text, expected):
+    path = tmp_path / "small.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_sweep(path)
+    assert str(caught.value).startswith(f"{path}{expected}")
 
 
 def test_an_unknown_environment_is_reported_once_with_its_place(file):
