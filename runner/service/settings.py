@@ -39,7 +39,7 @@ class ServiceLimits:
     upload_bytes: int = 1 << 40
     """Size of an upload."""
     uploads: int = 1000
-    """Uploads that are being received or verified."""
+    """Uploads that are being received or verified; and those that are over whose result is kept."""
     uploads_each: int = 100
     """Uploads of one client that are being received or verified."""
     spare_bytes: int = 256 << 20

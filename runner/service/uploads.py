@@ -114,7 +114,7 @@ class Uploads:
                 self._uploads[upload.owner, upload.id] = replace(upload, offset=offset)
             except (OSError, ValueError):
                 shutil.rmtree(folder, ignore_errors=True)
-        self._drop_idle()
+        self._drop_old()
         for upload in self.all():
             if upload.source.digest is not None:
                 self._proceed(upload)
@@ -169,7 +169,7 @@ class Uploads:
                 return upload if upload.is_over else there
             if (owner, upload_id) not in self._uploads:
                 upload = fresh
-                self._drop_idle()
+                self._drop_old()
                 self._require_place(owner)
             if upload.run_id != source.run_id:
                 remove_preview(self._recordings, upload.id, upload.run_id)
@@ -261,13 +261,16 @@ class Uploads:
         finally:  # clients see it when it is on disk
             self._uploads[upload.owner, upload.id] = upload
 
-    def _drop_idle(self) -> None:
-        """Drop uploads without a request for `IDLE_SECONDS`."""
+    def _drop_old(self) -> None:
+        """Drop uploads without a request for `IDLE_SECONDS`; of those that are over, only the newest stay."""
+        over = 0
         for upload in self.all():
+            over += upload.is_over
             body, changed = self._body(upload), 0.0
             with contextlib.suppress(OSError):
                 changed = (body.with_name(STATE_FILE) if upload.is_over else body).stat().st_mtime
-            if upload.state != "verifying" and time.time() - changed > IDLE_SECONDS:
+            is_old = time.time() - changed > IDLE_SECONDS or (upload.is_over and over > self._limits.uploads)
+            if is_old and upload.state != "verifying":
                 self.delete(upload.owner, upload.id)
 
     def _proceed(self, upload: Upload) -> Upload:

@@ -146,6 +146,16 @@ def test_an_unsound_recording_is_refused_and_leaves_nothing(uploads, lake, tmp_p
     assert (again.offset, again.problem) == (0, ""), "it can be sent again"
 
 
+def test_the_results_of_the_newest_uploads_are_kept(tmp_path):
+    uploads = start(tmp_path / "runs", uploads=2)
+    refused = [send(uploads, bytes([i])) for i in range(5)]
+    assert {upload.state for upload in refused} == {"refused"}
+    grow(uploads, ANNA)
+    assert [upload.id for upload in uploads.all() if upload.is_over] == [refused[4].id, refused[3].id]
+    assert len(list((tmp_path / "runs" / FOLDER).glob("*/upload.json"))) == 3
+    uploads.close()
+
+
 def test_bytes_changed_in_transit_are_refused(uploads, lake):
     data = lake.recording.read_bytes()
     upload = begin(uploads, ANNA, data)
