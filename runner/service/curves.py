@@ -16,11 +16,11 @@ from pydantic import BaseModel, Field
 from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
 from runner.analysis.groups import duplicates, groups_of
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
-from runner.analysis.series import RunSeries, read_series, series_of
+from runner.analysis.series import RunSeries, read_series, series_of, values_left_out
 from runner.errors import RunnerError
 from runner.export.plots.curves import curves_sheet, footnote
 from runner.export.plots.image import svg_file
-from runner.export.plots.style import CurveStyle, style_of, visible
+from runner.export.plots.style import CurveStyle, not_drawn, style_of, visible
 from runner.recording.reader import open_recording
 from runner.service.computed import as_json
 from runner.util import humanize
@@ -162,7 +162,7 @@ def curves_of(paths: Sequence[Path], options: CurveOptions, lines: bool = False)
     if most:
         drawn = "the lowest and highest of each stretch are drawn; zoom in for all of them."
         notes.insert(0, f"Thinned: of up to {most:,} points a curve {drawn}")
-    elif not averaged:
+    elif not any((averaged, *values_left_out(series), not_drawn(panels, options.style))):
         notes.insert(0, "Every recorded point is drawn.")
     result = Curves(
         over.name,

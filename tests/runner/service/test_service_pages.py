@@ -462,7 +462,7 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     )
     assert [len(curve["positions"]) for curve in curves["curves"]] == [20] * 64
     assert (curves["averaged"], len(curves["names"])) == ("", 100)
-    assert "720 values. Choose others by their names" in curves["notes"][1]
+    assert "720 values. Choose others by their names" in curves["notes"][0]
     curves = client.get("/api/v1/curves?run=alone&axis=v/0&metric=training.logged.v/99").json()
     assert [(one["metric"], one["values"][:2]) for one in curves["curves"]] == [
         ("training.logged.v/99", [99.0, 100.0])
@@ -470,6 +470,11 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     assert (curves["axis"], curves["notes"]) == (
         "v/0",
         ["Every recorded point is drawn.", "Each line is one run, as reported."],
+    )
+    curves = client.get("/api/v1/curves?run=alone&metric=training.logged.v/0&log_y=true").json()
+    (note,) = curves["notes"]
+    assert note.startswith(
+        "Each line is one run, as reported. On logarithmic axes points at 0 or below are left out"
     )
 
 
