@@ -208,7 +208,7 @@ async def learned(run: RecordedRun, compute: ComputationOf, state: StateParts = 
 @router.get("/config")
 def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     """Show configuration, provenance and log."""
-    lines: list[tuple[str, ...]] = []
+    lines, silence = list[tuple[str, ...]](), "The run logged no texts."
     details = describe_run(run, with_results=False)
     try:
         with open_recording(run.recording) as recording:
@@ -222,6 +222,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
             ]
     except RecordingError as error:
         details = replace(details, damage=details.damage or str(error))
+        silence = settings.without_folders(f"The log cannot be read: {error}")
     origin = [
         replace(section, facts={name: settings.without_folders(text) for name, text in section.facts.items()})
         for section in details.origin_sections()
@@ -239,7 +240,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
     sections = [
         Section("", parts=origin, layout="tables"),
         Section("", links=links),
-        Section("Log", grids=[log]) if lines else Section("Log", ["The run logged no texts."]),
+        Section("Log", grids=[log]) if lines else Section("Log", [silence]),
     ]
     return RunPage(run, "config", "run_config.html", {"setup": sections})
 

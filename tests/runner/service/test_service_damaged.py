@@ -12,7 +12,9 @@ from mcap.reader import make_reader
 from runner.cli import cli
 from runner.errors import RecordingError
 from runner.execution.verify import verify
+from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
+from runner.recording.schema import LOG_TOPIC
 from runner.runs.importing import import_recording
 from runner.runs.listing import list_runs
 from runner.runs.run import RUN_FILE
@@ -116,6 +118,17 @@ def test_no_value_in_a_run_file_hides_the_run_or_prevents_its_removal(recordings
     assert shown(many, "rm", "--yes", damaged[0]).exit_code == 0
     assert shown(many, "prune", "--status", "damaged", "--yes").exit_code == 0
     assert shown(many, "ls", "--quiet", 'status == "damaged"').stdout == ""
+
+
+def test_a_log_that_cannot_be_read_is_not_called_empty(recordings, client):
+    first, _ = reversed(list_runs(recordings))
+    *_, chunk = (part for part in survey(first.recording).chunks if part.channel == LOG_TOPIC.channel)
+    data = bytearray(first.recording.read_bytes())
+    data[chunk.offset + 60] ^= 1
+    first.recording.write_bytes(data)
+    page = client.get(f"/runs/{first.run_id}/config").text
+    assert f"The log cannot be read: {first.run_id}/recording.mcap: " in page
+    assert "logged no texts" not in page
 
 
 def test_a_damaged_run_has_a_message(recordings, client):
