@@ -231,7 +231,7 @@ PICTURE_SIZE: Final = Parsed(
     "WxH", "WIDTHxHEIGHT up to 8192x8192, such as 1600x900", lambda text: "{}x{}".format(*_pair(text, 8192))
 )
 GRID: Final = Parsed("RxC", "ROWSxCOLUMNS up to 8x8, such as 3x3", lambda text: _pair(text, 8))
-STEP: Final = Parsed("step", "EPISODE:T, step:N, or eval:N:TRIAL:T", _step)
+STEP: Final = Parsed("step", "EPISODE:T, step:N, eval:N:TRIAL:T, typical, best, worst or last", _step)
 PATH: Final = click.Path(path_type=Path)
 DIRECTORY: Final = click.Path(file_okay=False, path_type=Path)
 FILE: Final = click.Path(dir_okay=False, path_type=Path)

@@ -40,12 +40,12 @@ def why(
     ),
     at: str | None = view_input(
         "at",
-        "The step: EPISODE:T, step:N, or eval:N:TRIAL:T; T defaults to 0, so 120 is the start of episode "
-        "120. The value before the step is shown.  [default: the last]",
+        "The step: EPISODE:T, step:N, eval:N:TRIAL:T, typical, best, worst or last; T defaults to 0, so 120 "
+        "is the start of episode 120. The value before the step is shown.  [default: the last]",
         metavar="STEP",
         max_length=60,
         label="Before step",
-        placeholder="EPISODE:T, or eval:N:TRIAL:T; the end",
+        placeholder="EPISODE:T, step:N, eval:N:TRIAL:T, best or last; the end",
     ),
     limit: int = view_input(
         "limit",

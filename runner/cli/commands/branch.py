@@ -36,7 +36,8 @@ def branch_command(
         "--at",
         type=STEP,
         metavar="STEP",
-        help="The step: EPISODE:T, or step:N by its number in training; eval:N:TRIAL:T of an evaluation.",
+        help="The step: EPISODE:T, or step:N by its number in training; eval:N:TRIAL:T of an evaluation; or "
+        "typical, best, worst or last.",
     ),
     actions: tuple[str, ...] = option(
         "--action",
