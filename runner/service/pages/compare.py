@@ -30,7 +30,7 @@ from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, result_of
 from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
-from runner.service.problems import requests_page
+from runner.service.problems import requests_page, status_of
 from runner.util import humanize
 from runner.util.humanize import UNKNOWN, counted
 from runner.views.compare import MAX_SCORES
@@ -165,11 +165,14 @@ async def tasks(
 @router.get("/replay")
 async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response:
     """Show an episode of two runs, in step; by default the one in which they diverge."""
-    if at:
-        step = step_in(at)
-    else:
-        first = (await compute.shown(ShownDifference, fragments.difference, *runs)).first_frame
-        step = EpisodeRef.parse(first) if first else EpisodeRef(0)
+    step, problem = EpisodeRef(0), None
+    try:
+        if at:
+            step = step_in(at)
+        elif first := (await compute.shown(ShownDifference, fragments.difference, *runs)).first_frame:
+            step = EpisodeRef.parse(first)
+    except RunnerError as error:
+        problem = error
     names, steps = [run.run_id for run in runs], places_in(runs, step)
 
     def neighbour(by: int) -> str:
@@ -192,9 +195,11 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
             "before": neighbour(-1),
             "after": neighbour(1),
             "base": link("/compare/replay", {"run": names}),
+            "problem": problem,
+            "at": at,
         }
 
-    return Page("compare_replay.html", show)
+    return Page("compare_replay.html", show, status_of(problem) if problem else None)
 
 
 @router.get("/divergence")

@@ -38,6 +38,7 @@ def test_the_first_page_is_the_runs(client):
     page = page_of(client, "/runs")
     assert page.count("<tr>") == 3
     assert "2 runs" in page
+    assert "No run is on this page." in page_of(client, "/runs?page=9")
 
 
 def test_runs_are_searched_sorted_and_their_columns_chosen(client):
@@ -326,11 +327,19 @@ def test_pages_take_every_reference_to_a_step(client, recordings):
         assert f"What if? {step.heading}, step {step.t:,}" in what_if
 
 
-@pytest.mark.parametrize("query", ["phase=train&episode=x", "phase=eval&after=60&trial=-1", "at=step:999999"])
-def test_a_replay_that_there_is_not_keeps_tabs_and_form(client, query):
-    answer = client.get(f"/runs/first/replay?{query}", headers=ACCEPT_HTML)
+@pytest.mark.parametrize(
+    "address",
+    [
+        "/runs/first/replay?phase=train&episode=x",
+        "/runs/first/replay?phase=eval&after=60&trial=-1",
+        "/runs/first/replay?at=step:999999",
+        "/compare/replay?run=first&run=second&at=x",
+    ],
+)
+def test_a_replay_that_there_is_not_keeps_tabs_and_form(client, address):
+    answer = client.get(address, headers=ACCEPT_HTML)
     assert answer.status_code in (400, 404)
-    for part in ('<form class="episode-form"', "/config", 'class="problem"'):
+    for part in ('<form class="episode-form"', 'class="tabs"', 'class="problem"'):
         assert part in answer.text
 
 
