@@ -135,6 +135,10 @@ def read_text(file: FilePath) -> str:
         raise ConfigError(f"{file}: found a directory, expected a YAML file") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if file.suffix == ".py":
+        raise ConfigError(
+            f"{file}: found a Python file, expected a YAML file; `python {file}` runs a script."
+        )
     if len(content) > MAX_BYTES:
         raise ConfigError(
             f"{file}: larger than {size(MAX_BYTES)}, expected a configuration of a few kilobytes"

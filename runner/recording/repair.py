@@ -135,8 +135,8 @@ def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int])
         described, _ = _description(DamagedFile(stream, path))
         if missing := REQUIRED_RECORDS - described.keys():
             raise RecordingError(
-                f"{path}: its metadata {', '.join(sorted(missing))} is damaged or was never written: "
-                "its messages cannot be interpreted. `dualtaxi resume` retrains the run."
+                f"{path}: found no metadata {', '.join(sorted(missing))}, damaged or never written: its "
+                "messages cannot be interpreted. `dualtaxi resume` retrains the run."
             )
         check_run(described["run"], str(path))
         return _Salvage(path, DamagedFile(stream, path), described["run"], stated).write(fresh, report)

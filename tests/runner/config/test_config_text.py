@@ -57,6 +57,9 @@ def test_a_missing_file_is_reported(tmp_path):
         load(tmp_path / "other")
     with pytest.raises(ConfigError, match="found a directory, expected a YAML file"):
         load(tmp_path)
+    (tmp_path / "loop.py").write_text("import runner\nwith runner.record(env) as rec: ...\n")
+    with pytest.raises(ConfigError, match="found a Python file, expected a YAML file"):
+        load(tmp_path / "loop.py")
     with pytest.raises(ConfigError, match="cannot be read"):
         load(tmp_path / "quick.yaml" / "x.yaml")
     with pytest.raises(ConfigError, match="cannot be read"):

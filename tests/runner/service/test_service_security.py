@@ -356,7 +356,9 @@ def test_the_command_creates_lists_and_revokes_tokens(monkeypatch, tmp_path):
     listed = json.loads(token_command("ls", "--json").stdout)["tokens"]
     assert [token["name"] for token in listed] == ["laptop", "pusher"]
     assert secret not in token_command("ls").stdout
-    assert token_command("revoke", "nobody").exit_code == 2
+    refused = token_command("revoke", "nobody")
+    assert refused.exit_code == 2
+    assert "found 0 named 'nobody', expected one; there are: " in refused.stderr
     assert token_command("revoke", "laptop").exit_code == 0
     with pytest.raises(Unauthorized, match="was revoked"):
         kept.find(secret)
