@@ -109,7 +109,7 @@ each("svg[aria-label] text", (node) => /\\p{L}/u.test(text(node)) ?
 each("svg[aria-label] [stroke^='var(--line-']", (node) => "drawn: " + nameOf(node.closest("svg")) +
     ": curve " + "ABCDEFGHIJ"[/\\d+/.exec(node.getAttribute("stroke"))[0]]);
 each(".key li, .key button, .legend li", (node) => "series: " + text(node));
-each("p, li, dt, dd, td, label, output, .message, [data-message]", (node) => {
+each("p, li, dt, dd, td, label, output, .message", (node) => {
     const own = [...node.childNodes].filter((child) => child.nodeType === Node.TEXT_NODE ||
         ["B", "EM", "STRONG", "CODE", "SPAN", "TIME", "KBD", "I", "SUB"].includes(child.nodeName));
     return "text: " + own.map((child) => (child.textContent || "").trim()).join(" ");

@@ -93,7 +93,7 @@ def test_a_mistake_is_shown_at_its_line_then_a_job_is_submitted_and_watched(page
 def test_metrics_are_drawn_and_zoomed_and_the_address_follows(page):
     browser = page("/runs/first")
     wait(browser, lambda: len(browser.find_elements(By.CSS_SELECTOR, ".uplot canvas")) > 3)
-    assert "as reported" in text_of(browser, "[data-message]")
+    assert "as reported" in text_of(browser, ".plots > p")
     browser.find_element(By.NAME, "from").send_keys("10")
     browser.find_element(By.NAME, "to").send_keys("40" + Keys.ENTER)
     wait(browser, lambda: "from=10&to=40" in browser.current_url)
@@ -216,9 +216,9 @@ def test_axis_smoothing_and_logarithmic_scales_are_chosen_and_kept_in_the_addres
     set_field(browser, "log_y", True)
     wait(browser, lambda: "log_y=1" in browser.current_url)
     caption = "no value is positive in"  # returns of the taxis are negative
-    wait(browser, lambda: caption in text_of(browser, "[data-message]"))
+    wait(browser, lambda: caption in text_of(browser, ".plots > p"))
     browser.refresh()
-    wait(browser, lambda: caption in text_of(browser, "[data-message]"))
+    wait(browser, lambda: caption in text_of(browser, ".plots > p"))
     assert browser.find_element(By.NAME, "axis").get_attribute("value") == "steps"
     plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
@@ -270,16 +270,16 @@ def test_thinned_curves_say_so_and_are_read_again_where_one_zooms(page, folder):
         recordings=folder,
     )
     browser = page("/runs/long")
-    wait(browser, lambda: "Thinned: of up to" in text_of(browser, "[data-message]"))
+    wait(browser, lambda: "Thinned: of up to" in text_of(browser, ".plots > p"))
     assert ", thinned" in text_of(browser, ".plots")
     plot = browser.find_element(By.CSS_SELECTOR, ".u-over")
     browser.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)
     drag = ActionChains(browser).move_to_element_with_offset(plot, -40, 0).click_and_hold()
     drag.move_by_offset(2, 0).move_by_offset(10, 0).release().perform()
-    wait(browser, lambda: "as reported" in text_of(browser, "[data-message]"))
+    wait(browser, lambda: "as reported" in text_of(browser, ".plots > p"))
     assert "from=" in browser.current_url
     ActionChains(browser).double_click(browser.find_element(By.CSS_SELECTOR, ".u-over")).perform()
-    wait(browser, lambda: "Thinned" in text_of(browser, "[data-message]"))
+    wait(browser, lambda: "Thinned" in text_of(browser, ".plots > p"))
 
 
 @pytest.mark.parametrize(("address", "phase", "number"), [("train/7", "train", 7), ("train/59", "train", 59)])

@@ -5,9 +5,10 @@ import { json } from "./page.js";
 
 const box = document.querySelector("[data-charts]");
 const runs = JSON.parse(box.dataset.charts);
-const [form, template, plots, message, restore] = ["form", "template", "[data-plots]", "[data-message]", "[data-hidden]"].map(
-  (selector) => box.querySelector(selector),
+const [form, template, plots, restore] = ["form", "template", "[data-plots]", "[data-hidden]"].map((selector) =>
+  box.querySelector(selector),
 );
+const message = Object.assign(document.createElement("p"), { className: "hint wide", role: "status" });
 const fields = form.elements;
 const USUAL = { axis: "episodes", smooth: "0" };
 const COLOURS = 7; // of lines, in the style
@@ -58,8 +59,14 @@ function remember(kind, metric) {
     localStorage.setItem(kind, JSON.stringify([...metrics]));
     show();
   } catch (error) {
-    message.textContent = `The browser does not let pages keep anything: ${error.message}`;
+    complain(`The browser does not let pages keep anything: ${error.message}`);
   }
+}
+
+// Notes on what is drawn stand below the charts, which therefore stay where they are; an error stands above them.
+function complain(text) {
+  message.textContent = text;
+  plots.prepend(message);
 }
 
 // --- data -----------------------------------------------------------------------------------------------
@@ -102,7 +109,7 @@ async function draw() {
       }
     show();
   } catch (error) {
-    message.textContent = error.message;
+    complain(error.message);
   }
   box.removeAttribute("aria-busy");
 }
@@ -114,8 +121,8 @@ function show() {
   const [left, visible] = [true, false].map((is) => Object.keys(metrics).filter((name) => hidden.has(name) === is));
   const ranked = visible.sort((one, other) => pinned.has(other) - pinned.has(one)); // else in the order of the server
   for (const metric of ranked) plot(metric, metrics[metric], pinned.has(metric));
-  const order = ranked.map((metric) => shown.get(metric).figure);
-  if (order.some((figure, i) => plots.children[i] !== figure)) plots.append(...order);
+  const order = [...ranked.map((metric) => shown.get(metric).figure), message];
+  if (order.some((node, i) => plots.children[i] !== node)) plots.append(...order);
   for (const [metric, one] of shown)
     if (!ranked.includes(metric)) {
       one.chart.destroy();
@@ -230,7 +237,7 @@ function figureOf(metric, title) {
   pin.onclick = () => remember(PINNED, metric);
   hide.onclick = () => remember(HIDDEN, metric);
   picture.download = `${metric}.svg`;
-  table.onclick = () => download(metric).catch((error) => (message.textContent = error.message));
+  table.onclick = () => download(metric).catch((error) => complain(error.message));
   figure.classList.toggle("wide", metric === "training.reward");
   figure.querySelector("b").textContent = title;
   const [caption, place, key] = ["span", "[role=img]", ".key"].map((selector) => figure.querySelector(selector));
