@@ -202,17 +202,19 @@ class WhatIf(Answer):
     def sections(self, base: str = "") -> list[Section]:
         """Return what people see: the step, its pictures, and where each action leads.
 
-        The pictures have links, and the style of a page, if `base`, the address of the run, is given.
+        With `base`, the address of the run, the pictures have links and the style of a page, which shows the
+        notes itself.
         """
         drawn = (
             Figure(self.picture("" if base else svg.STYLE)),
             Figure(self.matrix(base), _OF_MATRIX, is_wide=True),
         )
         figures = [figure for figure in drawn if figure.svg]
+        notes = [] if base else list(map(sentence, self.notes))
         grid = replace(self.grid, links=list(map(self._page, self.actions)))
         return [
             Section("The step", facts=self.facts),
-            Section("", list(map(sentence, self.notes)), figures=figures, layout="split matrix"),
+            Section("", notes, figures=figures, layout="split matrix"),
             Section("Where each action leads", [_OF_TABLE], [grid]),
         ]
 

@@ -98,7 +98,7 @@ def what_if_page(path: Path, at: EpisodeRef, action: str | None, start: int, ste
         texts = {
             "action": str(number),
             "name": str(actions_in_words(recording.mdp)[number]),
-            "before": str(partials().answer(before, base)),
+            "before": str(partials().notes(found.notes) + partials().answer(before, base)),
             "after": str(partials().answer([after], base)),
         }
         return _compact(_branch_part(recording, at, str(number), start, steps) | texts)
@@ -193,7 +193,7 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
     except RunnerError as error:
         if table is not None:
             raise
-        return f"<p>{escape(sentence(str(error).removeprefix('normalise: ')))}</p>".encode()
+        return f'<p class="hint">{escape(sentence(str(error).removeprefix("normalise: ")))}</p>'.encode()
     return str(partials().answer(drawn_task_sections(comparison))).encode()
 
 
