@@ -439,9 +439,7 @@ def usage_sections(largest: Sequence[Usage], sums: Sums, freeable: Mapping[str, 
     grid = Grid(headings, rows, links=links, left=left, cut=("name",), status="status", runs="same as")
     yield Section("", grids=[grid])
     reasons = {
-        FREED_BY[kind][0].lower(): f"{size(count)}. {FREED_BY[kind][1]}"
-        for kind, count in freeable.items()
-        if count
+        FREED_BY[kind][0]: f"{size(count)}. {FREED_BY[kind][1]}" for kind, count in freeable.items() if count
     }
     if reasons:
         yield Section("Could be freed", facts=reasons)
