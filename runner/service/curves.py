@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -14,16 +14,20 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
-from runner.analysis.groups import duplicates, groups_of
+from runner.analysis.groups import Group, duplicates, groups_of
 from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.series import RunSeries, read_series, series_of, values_left_out
+from runner.environments.naming import spoken
 from runner.errors import RunnerError
+from runner.export.plots.comparisons import letter
 from runner.export.plots.curves import curves_sheet, footnote
 from runner.export.plots.image import svg_file
 from runner.export.plots.style import CurveStyle, not_drawn, style_of, visible
 from runner.recording.reader import open_recording
 from runner.service.computed import as_json
 from runner.util import humanize
+from runner.util.row_text import csv_lines
+from runner.util.values import finite
 
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
@@ -82,6 +86,14 @@ class ShownCurve:
     """Number of its group."""
     title: str
     unit: str
+    label: str
+    """Its name in a key: its group, if there are several runs, and its line, if there are several."""
+    colour: int
+    """Number of its colour among those of lines."""
+    dash: int
+    """Number of its line, and so of its dashes."""
+    summary: str
+    """What it shows between `start` and `stop`, in words."""
     positions: list[float]
     values: list[float | None]
     """The interquartile mean over several runs; below four runs, their mean."""
@@ -92,6 +104,8 @@ class ShownCurve:
     high: list[float | None] | None
     runs: list[list[float | None]]
     """The values of each run of the group, if they were requested."""
+    run_labels: list[str]
+    """The names of these runs in a key."""
     of: int
     """The number of points between `start` and `stop` that the axes can show."""
     thinned: bool
@@ -133,10 +147,12 @@ class Curves:
     """Names of logged values, the first 10,000, of which `training.logged.NAME` is a metric."""
 
 
-def curves_of(paths: Sequence[Path], options: CurveOptions, lines: bool = False) -> bytes:
+def curves_of(
+    paths: Sequence[Path], options: CurveOptions, lines: bool = False, table: bool = False
+) -> bytes:
     """Return the metrics of runs over an axis as JSON, runs that differ only in the seed as one curve.
 
-    `lines` adds the single runs of a curve.
+    `lines` adds the single runs of a curve. With `table`, the curves are the columns of a CSV file.
     """
     series: list[RunSeries] = []
     common: list[Axis] = []
@@ -149,13 +165,16 @@ def curves_of(paths: Sequence[Path], options: CurveOptions, lines: bool = False)
     if over not in common and options.axis not in AXES:
         common.append(over)
     groups = groups_of(series)
+    names = {run.run_id: (letter(number), run.name) for number, run in enumerate(series)}
     panels: list[Panel] = []
     shown: list[ShownCurve] = []
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
             if not options.metric or panel.metric in options.metric:
                 panels.append(panel)
-                shown += [_shown_curve(panel, curve, options, lines) for curve in panel.curves]
+                shown += [_shown_curve(panel, curve, options, lines, groups, names) for curve in panel.curves]
+    if table:
+        return "".join(csv_lines(*_columns(over.name, shown))).encode()
     most = max((curve.of for curve in shown if curve.thinned), default=0)
     notes = [footnote(groups, panels, options.style), *map(humanize.sentence, duplicates(groups))]
     averaged = " ".join(dict.fromkeys(run.averaged for run in series if run.averaged))
@@ -186,25 +205,70 @@ def figure_of(paths: Sequence[Path], options: FigureOptions) -> bytes:
     return svg_file(curves_sheet(groups, panels, options.style))
 
 
-def _shown_curve(panel: Panel, curve: Curve, options: CurveOptions, lines: bool) -> ShownCurve:
+def _columns(axis: str, curves: Sequence[ShownCurve]) -> tuple[list[str], Iterator[list[object]]]:
+    """Return the headings and the rows of a table with the axis, and each curve with its band and runs."""
+    columns = [
+        (name, dict(zip(curve.positions, values, strict=True)))
+        for curve in curves
+        for name, values in (
+            (f"{curve.label}, high", curve.high),
+            (f"{curve.label}, low", curve.low),
+            *zip(curve.run_labels, curve.runs, strict=True),
+            (curve.label, curve.values),
+        )
+        if values is not None
+    ]
+    positions = sorted({position for curve in curves for position in curve.positions})
+    rows = ([at, *(finite(values.get(at)) for _, values in columns)] for at in positions)
+    return [axis, *(name for name, _ in columns)], rows
+
+
+def _shown_curve(
+    panel: Panel,
+    curve: Curve,
+    options: CurveOptions,
+    lines: bool,
+    groups: Sequence[Group],
+    names: Mapping[str, tuple[str, str]],
+) -> ShownCurve:
     start, stop = options.start, math.inf if options.stop is None else options.stop
     is_visible = visible(curve.places, curve.middle, style_of(panel, options.style))
     inside = np.flatnonzero((curve.places >= start) & (curve.places < stop) & is_visible)
     drawn = inside[thinned(curve.middle[inside], options.points)]
     memory = max((panel.last if options.stop is None else stop) - start, 0) * options.smooth / 100
     has_band = len(curve.runs) > 1
+    group, number = groups[curve.group], panel.lines.index(curve.line)
+    line = [spoken(curve.line)] if len(panel.lines) > 1 and curve.line else []
+    letters = ", ".join(names[run.run_id][0] for run in group.runs)
+    many = len(group.runs) > 5
+    of = f"{group.label}, {len(group.runs)} runs" if many else f"{letters}: {group.label}"
+    label = ", ".join([of, *line] if len(names) > 1 else line) or panel.title
+    ends = (
+        [curve.middle[inside[-1]], curve.middle[inside].min(), curve.middle[inside].max()]
+        if len(inside)
+        else []
+    )
     return ShownCurve(
         metric=panel.metric,
         line=curve.line,
         group=curve.group,
         title=panel.title,
         unit=panel.unit,
+        label=label,
+        colour=curve.group if len(groups) > 1 else number,
+        dash=number,
+        summary="{} ends at {}, between {} and {}".format(label, *map(humanize.measure, ends))
+        if ends
+        else f"{label} has no point in this part",
         positions=curve.places[drawn].tolist(),
         values=curve.middle[drawn].tolist(),
         smoothed=smoothed(curve.places, curve.middle, memory)[drawn].tolist() if memory else None,
         low=curve.low[drawn].tolist() if has_band else None,
         high=curve.high[drawn].tolist() if has_band else None,
         runs=curve.runs[:, drawn].tolist() if has_band and lines else [],
+        run_labels=[
+            ", ".join([": ".join(names[run.run_id]), *line]) for run in group.runs if has_band and lines
+        ],
         of=len(inside),
         thinned=len(drawn) < len(inside),
     )

@@ -25,6 +25,7 @@ from runner.util.values import finite
 router = APIRouter(
     tags=["comparing"],
 )
+CSV: Final = "text/csv"
 MAX_RUNS: Final = 1000
 RunNames = Annotated[
     tuple[str, ...], Field(min_length=1, max_length=MAX_RUNS, description="A run; may be repeated.")
@@ -81,6 +82,20 @@ async def curves(
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
     paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
     return await compute.json(curves_of, paths, options, options.lines)
+
+
+@router.get(
+    "/curves.csv",
+    response_class=Response,
+    responses=media_docs(CSV),
+    summary="The points of the curves of several runs.",
+)
+async def curves_table(
+    catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[CurvesOfRuns, Query()]
+) -> Response:
+    """Return the curves as a table: the axis, and each curve with its band and its runs."""
+    paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
+    return Response(await compute(curves_of, paths, options, options.lines, True), media_type=CSV)
 
 
 @router.get(

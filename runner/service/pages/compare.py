@@ -83,9 +83,9 @@ class Compared:
         return " against ".join(names) if len(names) > 1 else f"{len(self.runs)} runs of {names[0]}"
 
     @property
-    def charts(self) -> list[dict[str, str]]:
-        """The runs, as `charts.js` reads them."""
-        return [{"id": run.head.id, "label": run.label} for run in self.runs]
+    def query(self) -> str:
+        """The runs, as an address names them."""
+        return link("", {"run": [run.head.id for run in self.runs]})
 
 
 def chosen_runs(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import io
 import json
@@ -167,6 +168,11 @@ def test_runs_that_differ_in_the_seed_are_one_curve_with_a_band(recordings, clie
     for k, values in enumerate(zip(*curve["runs"], strict=True)):
         assert curve["values"][k] == pytest.approx(np.mean(sorted(values)[1:-1]))
         assert min(values) <= curve["low"][k] <= curve["values"][k] <= curve["high"][k] <= max(values)
+    assert curve["label"] == "A, B, C, D, E: seeds"
+    head, *rows = csv.reader(client.get("/api/v1/curves.csv", params=params).text.splitlines())
+    label, runs = curve["label"], [f"{letter}: seeds" for letter in "ABCDE"]
+    assert head == ["episodes", f"{label}, high", f"{label}, low", *runs, label]
+    assert [float(row[-1]) for row in rows] == curve["values"]
     alone = client.get("/api/v1/curves", params={"run": params["run"][:1], "metric": "mean_length"}).json()
     assert (alone["curves"][0]["low"], alone["curves"][0]["runs"]) == (None, [])
 

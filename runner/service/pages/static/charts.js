@@ -4,7 +4,6 @@
 import { json } from "./page.js";
 
 const box = document.querySelector("[data-charts]");
-const runs = JSON.parse(box.dataset.charts);
 const [form, template, plots, restore] = ["form", "template", "[data-plots]", "[data-hidden]"].map((selector) =>
   box.querySelector(selector),
 );
@@ -74,7 +73,8 @@ function complain(text) {
 // Return the query for curves over the axis, with values that are neither empty nor usual.
 function queryOf(values) {
   const axis = new URLSearchParams(location.search).get("axis") ?? USUAL.axis;
-  const query = new URLSearchParams([["axis", axis], ...runs.map(({ id }) => ["run", id])]);
+  const query = new URLSearchParams(box.dataset.charts); // the runs
+  query.set("axis", axis);
   for (const [name, value] of Object.entries(values)) if (value && value !== USUAL[name]) query.set(name, value);
   return query;
 }
@@ -140,25 +140,11 @@ function show() {
   message.textContent = last.notes.join(" ");
 }
 
-// --- names and numbers ----------------------------------------------------------------------------------
+// --- numbers --------------------------------------------------------------------------------------------
 
-const named = (id) => runs.find((run) => run.id === id)?.label ?? id;
-const spoken = (name) => name.replaceAll("_", " ");
-const linesOf = (curves) => [...new Set(curves.map(({ line }) => line))];
 const known = (value) => value !== null && value !== undefined;
 const exact = (value) => value?.toLocaleString("en", { maximumSignificantDigits: 6 }) ?? "";
 const axisLabel = () => last.axes.find(({ name }) => name === last.axis).label;
-
-function groupName({ label, runs: own }) {
-  const letters = own.map((id) => named(id).split(": ")[0]);
-  return own.length > 5 ? `${label}, ${own.length} runs` : `${letters.join(", ")}: ${label}`;
-}
-
-function labelOf({ line, group, title }, curves) {
-  const several = last.groups.length > 1 || runs.length > 1,
-    part = linesOf(curves).length > 1 && spoken(line);
-  return [several && groupName(last.groups[group]), part].filter(Boolean).join(", ") || title;
-}
 
 function tick(value) {
   if (!known(value)) return "";
@@ -168,60 +154,48 @@ function tick(value) {
   return value.toLocaleString("en", { notation, maximumSignificantDigits: 6 }).replace("K", "k"); // as the server writes it
 }
 
-function summary(curve, label) {
-  const values = curve.values.filter(known);
-  if (!values.length) return `${label} has no point in this part`;
-  const [end, low, high] = [values.at(-1), Math.min(...values), Math.max(...values)].map(exact);
-  return `${label} ends at ${end}, between ${low} and ${high}`;
-}
-
 // --- plots ----------------------------------------------------------------------------------------------
 
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 // The series of curves: of each its band, its single runs, its values (faint if they are smoothed), and the smoothed
-// line. All have names; those with labels are in the key.
+// line. Those with labels are in the key.
 function seriesOf(curves) {
-  const lines = linesOf(curves);
   return curves.flatMap((curve) => {
-    const at = lines.indexOf(curve.line),
-      stroke = style(`--line-${(last.groups.length > 1 ? curve.group : at) % COLOURS}`),
+    const { label, colour, dash } = curve,
+      stroke = style(`--line-${colour % COLOURS}`),
       size = curve.positions.length > 80 ? 0 : curve.positions.length > 1 ? 4 : 9,
-      base = { stroke, dash: DASHES[at % DASHES.length], width: 1.8, label: "", spanGaps: true, points: { show: false } },
-      label = labelOf(curve, curves),
-      runName = (i) => [named(last.groups[curve.group].runs[i]), lines.length > 1 && spoken(curve.line)];
-    const values = curve.smoothed ? { stroke: `${stroke}55`, width: 1 } : { label, points: { show: size > 0, size } };
+      base = { stroke, dash: DASHES[dash % DASHES.length], width: 1.8, label: "", spanGaps: true, points: { show: false } },
+      values = curve.smoothed ? { stroke: `${stroke}55`, width: 1 } : { label, points: { show: size > 0, size } };
     const drawn = [
-      [curve.high, { name: `${label}, high`, width: 0, fill: `${stroke}33` }],
-      [curve.low, { name: `${label}, low`, width: 0 }],
-      ...curve.runs.map((run, i) => [run, { width: 0.7, stroke: `${stroke}aa`, label: runName(i).filter(Boolean).join(", ") }]),
+      [curve.high, { width: 0, fill: `${stroke}33` }],
+      [curve.low, { width: 0 }],
+      ...curve.runs.map((run, i) => [run, { width: 0.7, stroke: `${stroke}aa`, label: curve.run_labels[i] }]),
       [curve.values, values],
       [curve.smoothed, { label }],
     ];
     return drawn
       .filter(([values]) => values)
-      .map(([values, look]) => ({ ...base, name: look.label ?? label, positions: curve.positions, values, ...look }));
+      .map(([values, look]) => ({ ...base, positions: curve.positions, values, ...look }));
   });
 }
-
-const joined = (series) => uPlot.join(series.map(({ positions, values }) => [positions, values]));
 
 function plot(metric, curves, isPinned) {
   const { log_x, log_y } = chosen(),
     { title, unit } = curves[0],
     series = seriesOf(curves),
     looks = series.map(({ positions, values, ...look }) => look),
-    points = joined(series),
+    points = uPlot.join(series.map(({ positions, values }) => [positions, values])),
     logY = log_y && points.slice(1).some((values) => values.some((value) => value > 0));
   const one = shown.get(metric) ?? figureOf(metric, title);
-  const { caption, place, key, picture, pin } = one,
+  const { caption, place, key, picture, table, pin } = one,
     kinds = JSON.stringify([looks, log_x, logY, last.axis, plots.clientWidth < 500]);
   pin.setAttribute("aria-pressed", isPinned);
   picture.href = `/api/v1/curves.svg?${queryOf({ metric, smooth: fields.smooth.value, log_x, log_y })}`;
+  table.href = `/api/v1/curves.csv?${queryOf({ metric, lines: fields.lines.checked })}`;
   const parts = [unit, curves.some((curve) => curve.thinned) && "thinned", !points[0].length && "no point in this part"];
   caption.textContent = parts.filter(Boolean).join(", ");
-  const summaries = curves.map((curve) => summary(curve, labelOf(curve, curves)));
-  place.setAttribute("aria-label", `${title}, ${unit}: ${summaries.join("; ")}`);
+  place.setAttribute("aria-label", `${title}, ${unit}: ${curves.map(({ summary }) => summary).join("; ")}`);
   if (one.chart && one.kinds === kinds) return one.chart.setData(points);
   one.chart?.destroy();
   one.kinds = kinds;
@@ -237,29 +211,14 @@ function figureOf(metric, title) {
   pin.onclick = () => remember(PINNED, metric);
   hide.onclick = () => remember(HIDDEN, metric);
   picture.download = `${metric}.svg`;
-  table.onclick = () => download(metric).catch((error) => complain(error.message));
+  table.download = `${metric}.csv`;
   figure.classList.toggle("wide", metric === "training.reward");
   figure.querySelector("b").textContent = title;
   const [caption, place, key] = ["span", "[role=img]", ".key"].map((selector) => figure.querySelector(selector));
-  const one = { figure, caption, place, key, picture, pin };
+  const one = { figure, caption, place, key, picture, table, pin };
   shown.set(metric, one);
   plots.append(figure);
   return one;
-}
-
-// Save every recorded point of a metric, as CSV.
-async function download(metric) {
-  const { axis, curves } = await json(`/api/v1/curves?${queryOf({ metric, lines: chosen().lines })}`);
-  const series = seriesOf(curves),
-    data = joined(series),
-    heads = [axis, ...series.map(({ name }) => name)].map((name) => `"${name.replaceAll('"', '""')}"`),
-    rows = data[0].map((_, i) => data.map((values) => values[i] ?? ""));
-  const text = [heads, ...rows].map((row) => `${row.join(",")}\n`);
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(new Blob(text, { type: "text/csv" }));
-  link.download = `${metric}.csv`;
-  link.click();
-  URL.revokeObjectURL(link.href);
 }
 
 // A key of all labelled lines, as they are drawn; a click hides or shows a line.
