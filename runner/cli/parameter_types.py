@@ -15,7 +15,7 @@ from runner.errors import RunnerError
 from runner.runs.catalogue import columns
 from runner.runs.resolve import completions
 from runner.runs.run import recordings_folder
-from runner.util.values import Json, ranges_in, whole_number
+from runner.util.values import JsonView, ranges_in, whole_number
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -25,7 +25,8 @@ class Completed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # gen
     """Text that completes to the names which a function returns, each with an explanation."""
 
     def __init__(self, name: str, complete: Callable[[click.Context, str], Mapping[str, str]]) -> None:
-        self.name, self.complete = name, complete
+        self.name = name
+        self.complete = complete
 
     def shell_complete(
         self,
@@ -44,7 +45,9 @@ class Parsed(click.ParamType):  # type: ignore[type-arg,unused-ignore]  # generi
     """Text that a function parses; the function raises ValueError or RunnerError."""
 
     def __init__(self, name: str, expected: str, parse: Callable[[str], object]) -> None:
-        self.name, self.expected, self.parse = name, expected, parse
+        self.name = name
+        self.expected = expected
+        self.parse = parse
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> object:
         """Return the parsed value."""
@@ -65,7 +68,9 @@ class Number(click.FloatRange):
         self, lowest: float, highest: float | None = None, kind: type = int, above: bool = False
     ) -> None:
         super().__init__(lowest, highest, min_open=above)
-        self.lowest, self.highest, self.kind = lowest, math.inf if highest is None else highest, kind
+        self.lowest = lowest
+        self.highest = math.inf if highest is None else highest
+        self.kind = kind
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the number."""
@@ -162,21 +167,20 @@ class ExpressionText(Completed):
 
 
 def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
-    from runner.config import json_schema
+    from runner.config.schema import schema_at
 
-    return {f"{key}=": text for key, text in _keys(json_schema()).items()}
+    return {f"{key}=": text for key, text in _keys(schema_at(())).items()}
 
 
-def _keys(schema: Json, part: Json | None = None, prefix: str = "") -> dict[str, str]:
+def _keys(schema: JsonView, prefix: str = "") -> dict[str, str]:
     """Return the paths of a schema's values, sections included, and what each means."""
     keys = {}
-    for name, value in (schema if part is None else part).get("properties", {}).items():
+    for name, value in schema.get("properties", {}).items():
         path = f"{prefix}{name}"
         keys[path] = str(value.get("description", ""))
         for kind in (value, *value.get("anyOf", ())):
-            if reference := kind.get("$ref"):
-                section = schema["$defs"][reference.rpartition("/")[2]]
-                keys |= _keys(schema, section, f"{path}.")
+            if "ref" in kind:
+                keys |= _keys(kind, f"{path}.")
     return keys
 
 

@@ -48,13 +48,19 @@ def without_references(schema: JsonView) -> Schema:
             return [followed(item) for item in node]
         if not isinstance(node, dict):
             return node
-        if "$ref" in node:
-            name = node["$ref"].rpartition("/")[2]
-            return {"ref": name, **followed(schema["$defs"][name])}
-        return {key: followed(value) for key, value in node.items() if key != "$defs"}
+        others = {key: followed(value) for key, value in node.items() if key not in ("$defs", "$ref")}
+        if "$ref" not in node:
+            return others
+        name = node["$ref"].rpartition("/")[2]
+        return {"ref": name, **followed(schema["$defs"][name]), **others}
 
     result: Schema = followed(schema)
     return result
+
+
+@functools.cache
+def _without_references() -> Schema:
+    return without_references(_schema())
 
 
 def schema_at(location: tuple[str | int, ...], schema: Schema | None = None) -> Schema:
@@ -63,21 +69,20 @@ def schema_at(location: tuple[str | int, ...], schema: Schema | None = None) -> 
     Besides keys and list positions, a location may name the branch of a union on its way: the model's
     name for a mapping, the JSON type for anything else.
     """
-    node: Schema = _schema() if schema is None else schema
+    node = _without_references() if schema is None else schema
     for part in location:
         node = next((inner for branch in branches(node) for inner in _inside(branch, part)), {})
     return node
 
 
 def branches(node: Schema) -> Iterator[Schema]:
-    """Yield the alternatives that a schema offers, each with its `$ref` followed and its name as `ref`."""
-    for alternative in node.get("oneOf", node.get("anyOf", ())):
-        yield from branches(alternative)
-    if "$ref" in node:
-        name = node["$ref"].rpartition("/")[2]
-        yield {"ref": name, **_schema()["$defs"][name]}
-    elif "oneOf" not in node and "anyOf" not in node:
+    """Yield the alternatives that a schema without references offers."""
+    alternatives = node.get("oneOf", node.get("anyOf"))
+    if alternatives is None:
         yield node
+        return
+    for alternative in alternatives:
+        yield from branches(alternative)
 
 
 def _inside(branch: Schema, part: str | int) -> Iterator[Schema]:
