@@ -65,7 +65,7 @@ class StepBuffer:
     is_reset_twice = False
     """Whether a step after the end of an episode is a reset though the environment was reset since."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0915 - the state, with a docstring each
         self,
         recorder: Recorder,
         described: Described | Copied,
@@ -73,13 +73,14 @@ class StepBuffer:
         first_action: Callable[[object], None] = lambda _: None,
         mode: AutoresetMode | None = None,
     ) -> None:
-        self._recorder, self._first_action, self._mode = recorder, first_action, mode
-        self._phase, self._topics = phase, schema.topics_of(phase)
-        self._mdp, self._n, self._has_turns = (
-            described.mdp,
-            described.environments,
-            described.layout.has_turns,
-        )
+        self._recorder = recorder
+        self._first_action = first_action
+        self._mode = mode
+        self._phase = phase
+        self._topics = schema.topics_of(phase)
+        self._mdp = described.mdp
+        self._n = described.environments
+        self._has_turns = described.layout.has_turns
         self._batch = () if mode is None else (self._n,)
         self._of_agents: tuple[str, ...] = tuple(
             name for name in _OF_AGENTS if name in (recorder.dtype(self._topics.steps).names or ())
@@ -87,18 +88,21 @@ class StepBuffer:
         self._learners = recorder.dtype(self._topics.episodes)["returns"].shape[0]
         self._log = EpisodeLog(self._n, self._learners, self._mdp, self._has_turns, zero=-0.0)
         self._dtype = recorder.dtype(self._topics.resets)["observation"]
-        """The dtype of an observation, with its shape."""
-        self._are_bytes = self._dtype.hasobject
-        """Whether values vary in size."""
+        """The dtype of an observation, with its shape; of objects, where values vary in size."""
         self.off_table = 0
         """Committed steps whose reward the environment's table excludes; 0 without a table."""
-        self.filled, self._room, self._full_at, self._held = 0, 0, 0, 0
-        """Rows of the block that are in use, how many it has, with how many it is full now, and bytes of
-        varying size in them."""
+        self.filled = 0
+        """Rows of the block that are in use."""
+        self._room = 0
+        """Rows of the block; 0 before the first step."""
+        self._full_at = 0
+        """Rows in use with which the block is full: fewer where values take much memory."""
+        self._held = 0
+        """Bytes of values of varying size in the block, and in resets."""
         self.resets = 0
         """The number of resets so far."""
-        resets = max(recorder.capacity(self._topics.resets), self._n)
-        self._resets = np.zeros(resets, [*_RESET, ("observation", self._dtype)])
+        room = max(recorder.capacity(self._topics.resets), self._n)
+        self._resets = np.zeros(room, [*_RESET, ("observation", self._dtype)])
         self._waiting = 0
         """Resets that are not committed."""
         self._seen: Any = zeros((1, self._n), self._dtype)
@@ -114,11 +118,14 @@ class StepBuffer:
         """[rows, 2, N]: whether each row terminated, and truncated, the episodes."""
         self._over: Flags = np.zeros(self._n, np.bool_)
         """[N]: whether the episode of an environment was over before the block."""
-        self._ended, self._counted = 0, 0
-        """Ends of episodes in the block; in a vector, how many rows are counted so far."""
-        self._idle_at, self._last_position = 0, 0
-        """The last row before which no episode is in progress, -1 for none in the block; and the steps of the
-        run up to the last committed row: of this phase, in a vector of either."""
+        self._ended = 0
+        """Ends of episodes in the block; in a vector, in the rows counted so far."""
+        self._counted = 0
+        """Rows of the block whose ends are in `_ended`; of a vector."""
+        self._idle_at = 0
+        """The last row before which no episode is in progress; -1 for none in the block."""
+        self._last_position = 0
+        """Steps of the run up to the last committed row of this phase; in a vector, of either phase."""
         self._autoreset_states: dict[int, States] = {}
         """Rows with resets in place of steps, and what those depended on."""
         self._bytes: memoryview | None = None
@@ -304,7 +311,8 @@ class StepBuffer:
         given = self._action.fitted(actions, rewards.shape, of_one)
         seen = after = self._fitted(observations, *rewards.shape)
         last = None if finals is None else self._fitted(finals, *rewards.shape)
-        ended, firsts = terminated | truncated, None
+        ended = terminated | truncated
+        firsts = None
         if self._mode == AutoresetMode.DISABLED:
             over = np.vstack([self.over, ended[:-1]])
             if over.any():
@@ -314,7 +322,8 @@ class StepBuffer:
                     'expected a reset; another autoreset_mode than "Disabled" states that there was one.'
                 )
         elif self._mode == AutoresetMode.SAME_STEP and ended.any():
-            firsts, after = seen, seen.copy()
+            firsts = seen
+            after = seen.copy()
             after[ended] = self._observation.unknown(self._dtype) if last is None else last[ended]
         self._extend(given, after, rewards, np.stack([terminated, truncated], axis=1), firsts=firsts)
         self._seen[0] = seen[-1]
@@ -323,7 +332,8 @@ class StepBuffer:
         """Put down recorded steps, with new numbers, of the environment that was reset last."""
         if not self._room:
             self._begin(None)
-        action, after = rows["action"], rows["next_state" if self._starts else "next_observation"]
+        action = rows["action"]
+        after = rows["next_state" if self._starts else "next_observation"]
         if self._starts:
             least_state, least_action = self._starts
             action, after = action.astype(np.int64) + least_action, after.astype(np.int64) + least_state
@@ -342,16 +352,18 @@ class StepBuffer:
             arrays: what `_block` holds, [T, ...]; of one environment alone with the marks.
             firsts: the observations after resets by the steps that ended episodes, where there were such.
         """
-        steps, done = len(arrays[0]), 0
+        steps = len(arrays[0])
+        done = 0
         while done < steps:
-            row, count = self.filled, min(self._room - self.filled, steps - done)
+            row = self.filled
+            count = min(self._room - self.filled, steps - done)
             rows, part = slice(row, row + count), slice(done, done + count)
             for column, values in zip(self._block, arrays, strict=False):
                 column[rows] = values[part]
             if firsts is not None:
                 at, environments = np.nonzero(self._ends[rows].any(axis=1))
                 self._add_resets(row + at + 1, environments, firsts[done + at, environments])
-            if self._are_bytes:
+            if self._dtype.hasobject:
                 self._hold(sum(map(len, (*self._actions[rows].flat, *self._observations[rows].flat))))
             done += count
             self.filled = rows.stop
@@ -360,7 +372,8 @@ class StepBuffer:
 
     def continues_with(self, observations: object) -> bool:
         """Return whether these are the observations [N, ...] after the last batch or reset of the phase."""
-        given, now = self._fitted(observations, self._n), self._seen[0]
+        given = self._fitted(observations, self._n)
+        now = self._seen[0]
         return bool((given == now).all()) if now.dtype.hasobject else given.tobytes() == now.tobytes()
 
     # --- resets ---------------------------------------------------------------------------------------
@@ -429,27 +442,30 @@ class StepBuffer:
             seeds: of these resets; none have seeds and options unless given.
             states: what they depended on, by environment.
         """
-        if self._are_bytes:
+        if self._dtype.hasobject:
             self._hold(sum(map(len, observations)))
         start, self._waiting = self._waiting, self._waiting + len(environments)
         while self._waiting > len(self._resets):
             self._resets = np.concatenate([self._resets, np.zeros_like(self._resets)])
         added = self._resets[start : self._waiting]
         added["row"], added["environment"], added["observation"] = rows, environments, observations
-        large = []
+        large: dict[int, int] = {}
         for k, seed in enumerate(seeds):
             if seed is not None and seed > MAX_SEED:
-                large.append(k)
+                large[k] = seed
             elif seed is not None and seed >= 0:
-                added["seed"][k], added["seeded"][k] = seed, True
-        for k in range(len(environments)) if large and options else large:
-            attached = ResetOptions(json=options, large_seed=seeds[k] if k in large else None)
-            self._attached[start + k].append(attached)
+                added["seed"][k] = seed
+                added["seeded"][k] = True
         if options and not large:
             self._attached[start].append(ResetOptions(json=options, resets=len(environments)))
-        for k, environment in enumerate(environments) if states else ():
-            if environment in states:
-                self._attached[start + k].append(states[environment])
+        elif large:
+            for k in range(len(environments)):
+                if options or k in large:
+                    self._attached[start + k].append(ResetOptions(json=options, large_seed=large.get(k)))
+        if states:
+            for k, environment in enumerate(environments):
+                if environment in states:
+                    self._attached[start + k].append(states[environment])
         self.resets += len(environments)
 
     def _fitted(self, observations: object, *batch: int) -> Array:
@@ -470,7 +486,8 @@ class StepBuffer:
                 "reset() first"
             )
         self._first_action(action)
-        room, n = max(1, self._recorder.capacity(self._topics.steps) // self._n), self._n
+        room = max(1, self._recorder.capacity(self._topics.steps) // self._n)
+        n = self._n
         self._room = self._full_at = room
         masks = [(name, "<u4") for name in (*_OF_AGENTS, "environment")]
         self._marks = np.zeros(room, [*masks, ("over", "?"), ("begins", "?")])
@@ -478,20 +495,22 @@ class StepBuffer:
         dtypes = {"action": np.dtype(np.int64) if self._starts else action, "observation": self._dtype}
         if self._batch:
             self._actions, self._observations = (zeros((room, n), dtype) for dtype in dtypes.values())
-            self._rewards, self._ends = np.zeros((room, n)), np.zeros((room, 2, n), np.bool_)
+            self._rewards = np.zeros((room, n))
+            self._ends = np.zeros((room, 2, n), np.bool_)
             places = self._observations.reshape(room * n, *self._dtype.shape)
             self._put_last = filler(self._observation, places)
         else:
             ends = [("rewards", "<f8", (self._learners,)), ("ends", "?", (2, 1))]
             rows: Records = np.zeros(room, [*dtypes.items(), *ends])
             self._actions, self._observations = (rows[name][:, np.newaxis] for name in dtypes)
-            self._rewards, self._ends = rows["rewards"], rows["ends"]
+            self._rewards = rows["rewards"]
+            self._ends = rows["ends"]
         self._block = self._actions, self._observations, self._rewards, self._ends, self._marks
         if self._is_copied:
             return
         self._put_action = self._filler(self._action, self._actions)
         self._put_observation = self._filler(self._observation, self._observations)
-        if not (self._batch or self._of_agents or self._are_bytes):
+        if not (self._batch or self._of_agents or self._dtype.hasobject):
             self._bytes = None if self._starts else rows.view(np.uint8).data
             self._put, self.keep = step_filler(
                 self._action, self._observation, rows, self._put_parts, self._copied
@@ -500,7 +519,7 @@ class StepBuffer:
     def _copied(self, action: Value) -> Value:
         """Return a copy of an action; not as bytes, which are what `step_filler` makes of actions."""
         given = as_given(action)
-        looks_like_kept = isinstance(given, bytes | bytearray) and not (self._are_bytes or self._starts)
+        looks_like_kept = isinstance(given, bytes | bytearray) and not (self._dtype.hasobject or self._starts)
         return np.array(given) if looks_like_kept else given
 
     def _put_parts(
@@ -539,53 +558,59 @@ class StepBuffer:
 
     def commit(self) -> None:
         """Make the records of what was put down and hand them to the recorder."""
-        rows, n, before = self.filled, self._n, self._recorder.position
-        first, over, is_idle = self._recorder.steps[self._phase], self.over, self._idle_at == self.filled
+        rows = self.filled
+        before = self._recorder.position
+        first = self._recorder.steps[self._phase]
         if self._batch:
             self._last_position = before
         if not (rows or self._waiting):
             return
+        over = self.over
+        is_idle = self._idle_at == rows
+        episode = self._put_steps(first, before) if rows else np.empty((0, self._n), np.int64)
+        if self._waiting:
+            self._put_resets(episode, first, before)
+        self._recorder.advance(self._phase, rows * self._n)
+        if rows:
+            self._last_position = before + rows * self._n
+        self._over = over
+        self._idle_at = 0 if is_idle else -1
+        self._autoreset_states = {}
+        self.filled = self._waiting = self._held = self._ended = self._counted = 0
+        self._full_at = self._room
+
+    def _put_steps(self, first: int, before: int) -> Ints:
+        """Record the steps, and the ends of episodes; return the episode of each step, [rows, N].
+
+        Args:
+            first: the number of the first step within the phase.
+            before: the steps of the run before it.
+        """
+        rows = self.filled
+        n = self._n
         resets = self._resets[: self._waiting]
         was_reset = np.zeros((rows + 1, n), np.bool_)
         was_reset[resets["row"], resets["environment"] % n] = True
-        number = np.empty((0, n), np.int64)
-        if rows:
-            begins, only_reset, is_over = self._turns(was_reset[:-1])
-            rewards = self._rewards[:rows].reshape(rows, n, self._learners)
-            terminated, truncated = self._ends[:rows, 0], self._ends[:rows, 1]
-            columns = self._columns(rows, resets, only_reset)
-            columns |= {"rewards": rewards, "terminated": terminated, "truncated": truncated}
-            counts = None if self._mdp is None else self._counts(self._mdp, columns)
-            environment = self._marks["environment"][:rows, np.newaxis] if self._is_copied else None
-            ends = rewards, terminated, truncated
-            steps = TurnBlock(first, *ends, begins, only_reset, is_over, counts, environment)
-            episodes = self._log.take(steps)
-            number = episodes.number
-            columns["step"] = first + np.arange(rows * n).reshape(rows, n)
-            columns |= {"episode": number, "t": episodes.t}
-            if self._has_turns:
-                numbers = np.arange(n) if environment is None else environment
-                columns["environment"] = np.broadcast_to(numbers, (rows, n))
-                columns["taken"] = np.broadcast_to(np.logical_not(only_reset), (rows, n))
-            flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
-            self._recorder.put(self._topics.steps, flat, np.arange(before + 1, before + 1 + rows * n))
-            self._put_ends(episodes.ended, first, before)
-        if self._waiting:
-            resets = self._resets[: self._waiting]
-            last = resets[resets["row"] == rows]
-            cut = list(dict.fromkeys((last["environment"] % n).tolist()))
-            if self._starts:
-                self._state[last["environment"] % n] = last["observation"]
-            ended = self._log.interrupt(first + rows * n, np.array(cut, np.int64))
-            self._put_ends(ended, first, before)
-            self._put_resets(np.vstack([number, self._log.episode]), first, before)
-            resets["seed"], resets["seeded"] = 0, False
-        self._recorder.advance(self._phase, rows * n)
-        if rows:
-            self._last_position = before + rows * n
-        self._over, self._idle_at, self._autoreset_states = over, 0 if is_idle else -1, {}
-        self.filled = self._waiting = self._held = self._ended = self._counted = 0
-        self._full_at = self._room
+        begins, only_reset, is_over = self._turns(was_reset[:-1])
+        rewards = self._rewards[:rows].reshape(rows, n, self._learners)
+        terminated, truncated = self._ends[:rows, 0], self._ends[:rows, 1]
+        columns = self._columns(rows, resets, only_reset)
+        columns |= {"rewards": rewards, "terminated": terminated, "truncated": truncated}
+        counts = None if self._mdp is None else self._counts(self._mdp, columns)
+        environment = self._marks["environment"][:rows, np.newaxis] if self._is_copied else None
+        ends = rewards, terminated, truncated
+        steps = TurnBlock(first, *ends, begins, only_reset, is_over, counts, environment)
+        episodes = self._log.take(steps)
+        columns["step"] = first + np.arange(rows * n).reshape(rows, n)
+        columns |= {"episode": episodes.number, "t": episodes.t}
+        if self._has_turns:
+            numbers = np.arange(n) if environment is None else environment
+            columns["environment"] = np.broadcast_to(numbers, (rows, n))
+            columns["taken"] = np.broadcast_to(np.logical_not(only_reset), (rows, n))
+        flat = {name: values.reshape(rows * n, *values.shape[2:]) for name, values in columns.items()}
+        self._recorder.put(self._topics.steps, flat, np.arange(before + 1, before + 1 + rows * n))
+        self._put_ends(episodes.ended, first, before)
+        return episodes.number
 
     def _turns(self, was_reset: Flags) -> tuple[Flags, Flags | bool, Flags | bool]:
         """Return `was_reset`, `only_reset` and `is_over` of the `TurnBlock`; put down the resets among these.
@@ -659,12 +684,24 @@ class StepBuffer:
         self._recorder.put(self._topics.episodes, ended, positions)
 
     def _put_resets(self, episode: Ints, first: int, before: int) -> None:
-        """Record the resets in their order; `episode` is [rows + 1, N]."""
-        order = np.argsort(self._resets["row"][: self._waiting], kind="stable")
-        resets = self._resets[order]
-        steps, number = resets["row"] * self._n, self.resets - self._waiting
-        columns = {name: resets[name] for name in ("environment", "seed", "seeded", "observation")}
-        columns["episode"] = episode[resets["row"], resets["environment"] % self._n]
+        """Record the resets in their order, and the ends of the episodes that they cut off.
+
+        `episode` is of each step, [rows, N]; `first` and `before` are as for `_put_steps`.
+        """
+        resets = self._resets[: self._waiting]
+        last = resets[resets["row"] == self.filled]
+        environments = last["environment"] % self._n
+        if self._starts:
+            self._state[environments] = last["observation"]
+        cut = np.array(list(dict.fromkeys(environments.tolist())), np.int64)
+        self._put_ends(self._log.interrupt(first + self.filled * self._n, cut), first, before)
+        episode = np.vstack([episode, self._log.episode])
+        order = np.argsort(resets["row"], kind="stable")
+        ordered = resets[order]
+        steps = ordered["row"] * self._n
+        number = self.resets - self._waiting
+        columns = {name: ordered[name] for name in ("environment", "seed", "seeded", "observation")}
+        columns["episode"] = episode[ordered["row"], ordered["environment"] % self._n]
         columns |= {"reset": number + np.arange(len(order)), "step": first + steps}
         self._recorder.put(self._topics.resets, columns, before + steps)
         for offset, k in enumerate(order.tolist() if self._attached else ()):
@@ -674,3 +711,5 @@ class StepBuffer:
                 payload = attached._replace(reset=number + offset).to_payload()
                 self._recorder.append(topic, payload, before + int(steps[offset]))
         self._attached.clear()
+        resets["seed"] = 0
+        resets["seeded"] = False
