@@ -26,7 +26,7 @@ from runner.debugging.factors import Mixing
 from runner.environments.loading import load_once
 from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
-from runner.execution.initial_tables import tables_of
+from runner.execution.initial_tables import configured_tables
 from runner.execution.session import evaluation_metrics
 from runner.learning.learner import Learner
 from runner.planning.optimality import ExactEvaluator
@@ -106,7 +106,7 @@ def measure(
     plan = config.evaluation
     assert plan is not None
     mdp = load_once(config.env.id, config.env.kwargs, config.rewards)
-    learner = Learner(config, mdp, seed, tables_of(config, mdp, recordings))
+    learner = Learner(config, mdp, seed, configured_tables(config, mdp, recordings))
     layout = layout_of("job", len(learner.agents), len(mdp.event_names))
     steps, episodes = (
         blank_records(topic, layout.message(topic), _BLOCK_STEPS)
@@ -119,7 +119,8 @@ def measure(
     number = -(-config.episodes // plan.every)
     first = number * plan.trials
     learner.begin_evaluation(first)
-    done, trials = first, []
+    done = first
+    trials = []
     while done < first + plan.trials:
         if stop():
             return None
@@ -159,8 +160,12 @@ class Mixtures:
         workers: Workers[Measurement, MixtureResult],
         report: Callable[[int, int], None],
     ) -> None:
-        self.mixing, self.seeds, self.workers = mixing, tuple(seeds), workers
-        self._recordings, self._path, self._report = recordings, folder / VALUES, report
+        self.mixing = mixing
+        self.seeds = tuple(seeds)
+        self.workers = workers
+        self._recordings = recordings
+        self._path = folder / VALUES
+        self._report = report
         self._kept = {known.job: known for known in _kept(self._path)}
         self.in_file = sum(earlier.seed in self.seeds for earlier in self._kept.values())
         """Runs in the file that have one of the seeds, of whatever mixtures."""
@@ -220,7 +225,8 @@ class Mixtures:
         """Measure mixtures with all seeds, or the first `seeds`, if they are not known yet."""
         waiting = deque(self._tasks(mixtures, self.seeds[:seeds]))
         left = sum(len(task.seeds) for task in waiting)
-        busy, died = 0, list[Measurement]()
+        busy = 0
+        died = list[Measurement]()
         while waiting or busy:
             while waiting and self.workers.idle:
                 self.workers.submit(waiting.popleft())

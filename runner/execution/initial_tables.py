@@ -31,7 +31,8 @@ def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str =
     start = config.initial_q
     if not isinstance(start, RunTable):
         return config
-    source, step = find_run(start.run, recordings, exclude), start.step
+    source = find_run(start.run, recordings, exclude)
+    step = start.step
     if step is None:
         with opened(source) as recording:
             step = last_step(recording)
@@ -54,12 +55,7 @@ def address(run: Run, recordings: Path) -> str:
     return run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
 
 
-def configured_tables(job: Job, run: Run, mdp: Mdp) -> list[NamedTables] | None:
-    """Return what the learners of the run in a job's `initial_q` have; see `tables_of`."""
-    return tables_of(job.config, mdp, run.folder.parent, exclude=run.run_id)
-
-
-def tables_of(
+def configured_tables(
     config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = ""
 ) -> list[NamedTables] | None:
     """Return what the learners of the run in `initial_q` have; None if the configuration has none.

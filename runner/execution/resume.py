@@ -198,7 +198,7 @@ def _first_tables(job: Job, run: Run, mdp: Mdp) -> list[NamedTables] | None:
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
         if (tables := recorded_tables(recording)) is not None:
             return tables
-    return configured_tables(job, run, mdp)
+    return configured_tables(job.config, mdp, run.folder.parent, run.run_id)
 
 
 @contextlib.contextmanager
@@ -254,7 +254,8 @@ class _ResumedSession(Session):
 
     def summary(self, topics: dict[str, str]) -> Json:
         """Return the summary of the run."""
-        summary, recording = super().summary(topics), self._recording
+        summary = super().summary(topics)
+        recording = self._recording
         if self._reference.exhausted:
             return summary
         counts = {topic.name: recording.table(topic).count() for topic in schema.TOPICS}

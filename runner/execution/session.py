@@ -90,7 +90,7 @@ def run_job(
         mdp = mdp or load_mdp(job.config.env.id, job.config.env.kwargs, job.config.rewards)
         if initial is None:
             job, run = resolve_job(job, run)
-            initial = configured_tables(job, run, mdp)
+            initial = configured_tables(job.config, mdp, run.folder.parent, run.run_id)
         learner = Learner(job.config, mdp, job.seed, initial)
         file = create_recording(run.folder / runs.RECORDING_FILE)
     with file:
@@ -228,7 +228,8 @@ class Session:
         recorder, learner = self.recorder, self._learner
         learner.begin_evaluation()
         first = self._evaluated * plan.trials
-        done, trials = first, []
+        done = first
+        trials = []
         while done < first + plan.trials:
             if self._stop():
                 return False
@@ -333,7 +334,9 @@ def recorder_for(
     packed: PackedChunks | None = None,
 ) -> Recorder:
     """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
-    options, learners, events = job.config.recording, len(learner.agents), len(learner.mdp.event_names)
+    options = job.config.recording
+    learners = len(learner.agents)
+    events = len(learner.mdp.event_names)
     observer = None
     if clock and file is not None:
         console = LineRedactor() if options.console else None
@@ -362,7 +365,8 @@ def describe(
     facts = run_metadata(
         run.run_id, run.name, job.seed, job.identity, run.created_text, learner.agents, events
     )
-    config, environment = job.config.to_mapping(), _environment(learner.mdp)
+    config = job.config.to_mapping()
+    environment = _environment(learner.mdp)
     write_description(file, facts, config, made_by or provenance_entries(), environment)
 
 
