@@ -158,7 +158,10 @@ class Pipeline:
         Raises:
             BaseException: what `before` raised; nothing is written then, now or later.
         """
-        held, self._held, before, self._before = self._held, None, self._before, None
+        held = self._held
+        self._held = None
+        before = self._before
+        self._before = None
         if held is None or before is None:
             return
         try:
@@ -263,7 +266,9 @@ class Pipeline:
 def _rank(chunk: Chunk) -> int:
     """Return the rank of a chunk in its group: if only a part of it is written, steps have their resets."""
     message = TOPIC_OF[chunk.entry.channel].message
-    return 0 if message in (RESET, RESET_OPTIONS, RESET_STATE) else 1 if message in (STEP, ACTIONS) else 2
+    if message in (RESET, RESET_OPTIONS, RESET_STATE):
+        return 0
+    return 1 if message in (STEP, ACTIONS) else 2
 
 
 @dataclass
@@ -285,7 +290,9 @@ class MessageBatches:
 
     def extend(self, topic: Topic, log_times: Sequence[int], payloads: Sequence[bytes]) -> None:
         """Add messages to their topic's batch."""
-        pack, channel, head = MESSAGE_HEAD.pack, topic.channel, HEADER_BYTES - RECORD_HEAD.size
+        pack = MESSAGE_HEAD.pack
+        channel = topic.channel
+        head = HEADER_BYTES - RECORD_HEAD.size
         records = [
             pack(MESSAGE, head + len(payload), channel, 0, time, time) + payload
             for time, payload in zip(log_times, payloads, strict=True)

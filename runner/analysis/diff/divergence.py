@@ -30,8 +30,6 @@ from runner.util.differences import differing_rows
 _NOT_COMPARED: Final = ("step", "environment")
 _CHOICE: Final = ("explored", "acted")
 """The fields that tell how an action came about: a difference there comes before that of the action."""
-
-
 _OTHERS: Final = [name for name in schema.STEP_COLUMNS if name not in _NOT_COMPARED + _CHOICE]
 _AT_ACTION: Final = _OTHERS.index("action")
 _COMPARED: Final = (*_OTHERS[:_AT_ACTION], *_CHOICE, *_OTHERS[_AT_ACTION:])
@@ -162,11 +160,12 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
 
 def unbroken(recording: Recording) -> tuple[int, int]:
     """Return how many steps and episodes of training precede the first that were lost, if any."""
-    steps, episodes = (
-        min([table.count() if table else 0, *(start for start, _ in recording.lost.get(topic.name, []))])
-        for topic in schema.PHASES["train"]
-        for table in [recording.table(topic)]
-    )
+    counts = []
+    for topic in schema.PHASES["train"]:
+        table = recording.table(topic)
+        lost = [start for start, _ in table.lost]
+        counts.append(min([table.count() if table else 0, *lost]))
+    steps, episodes = counts
     return steps, episodes
 
 
@@ -191,7 +190,9 @@ def _divergence(
     step = theirs if ours is None else ours
     if step is None:
         return None
-    name, a, b = "step", "none" if ours is None else "one more", "none" if theirs is None else "one more"
+    name = "step"
+    a = "none" if ours is None else "one more"
+    b = "none" if theirs is None else "one more"
     if left is not None and right is not None:
         name = next(name for name in fields if _differs(left, right, name)[0])
         name, a, b = _differing_part(name, left[name][0], right[name][0])
@@ -234,7 +235,8 @@ def loop_divergence(a: Recording, b: Recording, phase: str) -> Divergence | None
     divergence = _first_in_phase(a, b, phase)
     if divergence is None or phase == "train":
         return divergence
-    number, evaluations = divergence.episode, evaluations_of(a)
+    number = divergence.episode
+    evaluations = evaluations_of(a)
     for evaluation in (*evaluations, *evaluations_of(b)):
         if evaluation.start <= number < evaluation.stop:
             return replace(
