@@ -21,7 +21,9 @@ class ActionRecorder:
     """
 
     def __init__(self, recorder: Recorder, environments: int, block_steps: int) -> None:
-        self._recorder, self._n, self._block_steps = recorder, environments, block_steps
+        self._recorder = recorder
+        self._n = environments
+        self._block_steps = block_steps
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
         self._rows: list[Records] = []
         self._phase = ""
@@ -37,10 +39,11 @@ class ActionRecorder:
             if name != "digest":
                 rows[name] = records[name]
         names = "t", after_step(records.dtype), "rewards", "terminated", "truncated"
-        for environment, places in turns_of(records) if len(rows) else ():
-            columns = (records[name][places] for name in names)
-            for row, digest in self._digests[topic.phase].add(environment, *columns):
-                rows["digest"][places[row]] = np.void(digest)
+        if len(rows):
+            for environment, places in turns_of(records):
+                columns = (records[name][places] for name in names)
+                for row, digest in self._digests[topic.phase].add(environment, *columns):
+                    rows["digest"][places[row]] = np.void(digest)
         self._rows.append(rows)
         is_large = sum(part.nbytes for part in self._rows) >= BLOCK_BYTES
         if is_large or sum(map(len, self._rows)) >= self._block_steps:
@@ -49,7 +52,8 @@ class ActionRecorder:
     def commit(self) -> None:
         """Hand what was taken to the recorder."""
         if self._rows:
-            rows, self._rows = np.concatenate(self._rows), []
+            rows = np.concatenate(self._rows)
+            self._rows = []
             position = int(rows["log_time"][-1]) // schema.STEP_NANOSECONDS
             topic = schema.topics_of(self._phase).actions
             self._recorder.append(topic, encode(schema.ACTIONS, packed(rows, self._n)), position)

@@ -89,7 +89,8 @@ class EpisodeDigests:
         steps["o"], steps["r"] = observations, rewards
         steps["e"][:, 0], steps["e"][:, 1] = terminated, truncated
         edges = sorted({0, *np.flatnonzero(t == 0).tolist(), *(row + 1 for row in at), rows})
-        data, size = steps.view(np.uint8).data, steps.itemsize
+        data = steps.view(np.uint8).data
+        size = steps.itemsize
         for first, stop in pairwise(edges):
             if t[first] == 0:
                 self._running[environment] = blake3()
@@ -120,7 +121,8 @@ def packed(rows: Records, n: int) -> Message:
             episode = rows["episode"][steps]
             last[steps] = np.append(episode[1:] != episode[:-1], True)
     marks = np.zeros(int(last.sum()), MARK)
-    marks["row"], marks["digest"] = np.flatnonzero(last), rows["digest"][last]
+    marks["row"] = np.flatnonzero(last)
+    marks["digest"] = rows["digest"][last]
     return {
         "step": int(rows["step"][0]),
         "count": len(rows),

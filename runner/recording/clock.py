@@ -46,7 +46,8 @@ class Stopwatch:
         """Begin the session, unless it has begun; return whether it begins now."""
         if self._origin is not None:
             return False
-        self.started, self._origin = time.time(), time.monotonic()
+        self.started = time.time()
+        self._origin = time.monotonic()
         self._next = SAMPLE_SECONDS
         return True
 

@@ -66,7 +66,9 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
     def write(topic: Topic, records: bytes | memoryview, times: Unsigned, offsets: Unsigned) -> None:
         fresh.add_chunk(encode_chunk(topic, records, times, offsets, packing))
 
-    batches, messages, read = MessageBatches(write), {}, Counter[str]()
+    batches = MessageBatches(write)
+    messages = {}
+    read = Counter[str]()
 
     def in_batches(record: Record) -> Record | None:
         if not isinstance(record, ReadChunk):
@@ -87,7 +89,8 @@ def _compact(file: RecordingFile, fresh: RecordingFile, packing: Packing) -> dic
     _require_same(file.path, read, file.message_counts)
     with open_recording(file.path) as recording:
         for phase in recording.phases:
-            topic, steps = phase.steps.actions.topic, 0
+            topic = phase.steps.actions.topic
+            steps = 0
             messages[topic.name] = 0
             most = min(packing.chunk_steps, max(1, BLOCK_BYTES // phase.steps.row_dtype.itemsize))
             for rows in in_blocks(phase.steps.rows() if phase.steps.are_actions else (), most):

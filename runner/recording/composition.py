@@ -67,12 +67,15 @@ def composition_of(recording: Recording) -> Composition | None:
     """
     if not has_environment(recording.config):
         return None
-    stated, maker = recording.environment, recording.train.maker_of()
-    name, limit = str(stated["env_id"]).rpartition(":")[2], stated["step_limit"] or None
+    stated = recording.environment
+    maker = recording.train.maker_of()
+    name = str(stated["env_id"]).rpartition(":")[2]
+    limit = stated["step_limit"] or None
     if maker is None:
         return Composition(name, stated["kwargs"], limit)
     spec = json.loads(maker.spec or "{}")
-    usual, usual_limit = maker.registered.get("kwargs", {}), maker.registered.get("max_episode_steps")
+    usual = maker.registered.get("kwargs", {})
+    usual_limit = maker.registered.get("max_episode_steps")
     given = spec.get("kwargs", stated["kwargs"])
     if "additional_wrappers" in spec:
         limit = spec.get("max_episode_steps")

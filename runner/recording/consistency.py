@@ -87,13 +87,17 @@ def check_extras(recording: Recording, phase: str, complete: bool) -> None:
         Inconsistent: one does not.
     """
     recorded = recording.phase(phase)
-    steps, extras, topic, last = recorded.steps, recorded.extras, recorded.topics.extras, -1
+    steps = recorded.steps
+    extras = recorded.extras
+    topic = recorded.topics.extras
+    last = -1
     # Steps of varying size are not looked up: their extras are only counted, and compared with one another.
     total = steps.total() if extras else 0
     if recording.leaves_out_steps and not steps.are_known:
         total = recording.result.get(f"{phase}_steps", _MAX_STEPS)
     for block in extras.blocks(stop=None if complete else total):
-        numbers, where = block["step"], f"{topic.name}, step {block['step'][0]} and later"
+        numbers = block["step"]
+        where = f"{topic.name}, step {block['step'][0]} and later"
         if numbers[0] <= last or (np.diff(numbers) <= 0).any() or numbers[-1] >= total:
             raise Inconsistent(f"{where}: found steps out of order, or after the last of {total:,}")
         last = int(numbers[-1])
@@ -137,8 +141,11 @@ class _PhaseCheck:
     """
 
     def __init__(self, recording: Recording, phase: str, stop: int | None) -> None:
-        self._recording, self._phase, self._stop = recording, recording.phase(phase), stop
-        self._n, self._learners = recording.environments, len(recording.agents)
+        self._recording = recording
+        self._phase = recording.phase(phase)
+        self._stop = stop
+        self._n = recording.environments
+        self._learners = len(recording.agents)
         self._is_whole = not self._phase.steps.are_actions
         """Whether steps have observations and rewards, and not their actions alone."""
         self._mdp = recording.mdp if recording.tabular and self._is_whole else None
@@ -179,7 +186,8 @@ class _PhaseCheck:
         Args:
             first: the number of the first step.
         """
-        numbers, names = range(first, first + rows.size), rows.dtype.names or ()
+        numbers = range(first, first + rows.size)
+        names = rows.dtype.names or ()
         self._check_times(numbers, rows)
         given, was_reset, environment = self._given(numbers, rows.shape)
         only_reset = ~is_taken(rows)
@@ -221,14 +229,18 @@ class _PhaseCheck:
         They are [steps of each environment, environments].
         """
         first, resets = numbers.start, self._resets
-        given, was_reset = zeros(shape, resets.left.dtype["observation"]), np.zeros(shape, np.bool_)
+        given = zeros(shape, resets.left.dtype["observation"])
+        was_reset = np.zeros(shape, np.bool_)
         environment = np.broadcast_to(self._environments, shape).astype(np.int64)
         for block in resets.before(numbers.stop):
-            step, is_unknown = block["step"], block["environment"] >= environment_count(self._recording)
+            step = block["step"]
+            is_unknown = block["environment"] >= environment_count(self._recording)
             if (is_unknown | (step % self._n != 0) | (step < first)).any():
                 raise self._out_of_order()
             at = self._places(first, block)  # of several resets before a step the last counts
-            given[at], was_reset[at], environment[at] = block["observation"], True, block["environment"]
+            given[at] = block["observation"]
+            was_reset[at] = True
+            environment[at] = block["environment"]
         begins = np.where(was_reset, np.arange(len(given))[:, np.newaxis], 0)
         begins = np.maximum.accumulate(begins, axis=0)
         environment = np.take_along_axis(environment, begins, axis=0)
@@ -252,7 +264,8 @@ class _PhaseCheck:
     def _states(self, rows: Records, given: Array, was_reset: Flags, only_reset: Flags) -> Columns:
         """Return the states before and after steps, by the steps, or resets, before them."""
         least = least_number(self._recording.spaces["observation"])
-        after, begun = rows["next_state"].astype(np.int64), given.reshape(rows.shape).astype(np.int64) - least
+        after = rows["next_state"].astype(np.int64)
+        begun = given.reshape(rows.shape).astype(np.int64) - least
         state = np.where(was_reset & ~only_reset, begun, np.vstack([self._state, after[:-1]]))
         if only_reset.any():
             state = np.where(state < 0, rows["state"], state)  # unknown
@@ -361,7 +374,8 @@ def _numbered(table: TopicChunks) -> Iterator[Records]:
     Raises:
         Inconsistent: messages are not numbered consecutively.
     """
-    first, number = 0, schema.NUMBERED_BY[table.topic.message]
+    first = 0
+    number = schema.NUMBERED_BY[table.topic.message]
     for block in table.rows():
         if (wrong := np.flatnonzero(block[number] != first + np.arange(len(block)))).size:
             found, expected = block[number][wrong[0]], first + wrong[0]

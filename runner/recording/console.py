@@ -87,13 +87,14 @@ class Tee:
 
     def patch(self) -> None:
         """Replace the methods, also of streams whose methods somebody has replaced since."""
-        for number, stream in self._streams if self._is_on else ():
-            with contextlib.suppress(Exception):  # None, or a stream of somebody's own that forbids it
-                before = vars(stream).get("write")
-                if getattr(before, "tee", None) is not self:
-                    write = self._writer(number, stream.write)
-                    stream.write = write
-                    self._patched.append((stream, before, write))
+        if self._is_on:
+            for number, stream in self._streams:
+                with contextlib.suppress(Exception):  # None, or a stream of somebody's own that forbids it
+                    before = vars(stream).get("write")
+                    if getattr(before, "tee", None) is not self:
+                        write = self._writer(number, stream.write)
+                        stream.write = write
+                        self._patched.append((stream, before, write))
 
     def _writer(self, number: int, original: Write) -> Write:
         """Return a method `write` that calls the original one, and keeps the text."""
@@ -168,11 +169,14 @@ class Screen:
     def write(self, now: float, text: str) -> None:
         """Show text that was written at some time."""
         for piece in _PIECE.finditer(text):
-            act, count = piece["act"] or piece[0], int(piece["count"] or 1)
+            act = piece["act"] or piece[0]
+            count = int(piece["count"] or 1)
             row = self._rows.setdefault(self._row, _Row(now))
             if piece["text"]:
                 line = ("" if self._replaces else row.text) + piece["text"]
-                row.text, row.is_new, self._replaces = line[:_MAX_COLUMNS], True, False
+                row.text = line[:_MAX_COLUMNS]
+                row.is_new = True
+                self._replaces = False
                 if len(line) > _MAX_COLUMNS:
                     self._move_to(self._row + 1)
                     self._rows[self._row] = _Row(now, line[_MAX_COLUMNS:])
@@ -186,10 +190,13 @@ class Screen:
             elif act in ("\r", "G"):
                 self._replaces = True
             elif act == "\b" or (act == "K" and (self._replaces or count == 2)):
-                row.text, row.is_new = row.text[:-1] if act == "\b" else "", True
+                row.text = row.text[:-1] if act == "\b" else ""
+                row.is_new = True
 
     def _move_to(self, row: int) -> None:
-        self._row, self._last, self._replaces = row, max(self._last, row), True
+        self._row = row
+        self._last = max(self._last, row)
+        self._replaces = True
 
     def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, int, str]]:
         """Yield (when it was begun, number, text) of the lines that are to be recorded now."""
@@ -203,7 +210,8 @@ class Screen:
                 and (due or is_last)
                 and (row.text or row.recorded is not None or number < self._last)
             ):
-                row.is_new, row.recorded = False, now
+                row.is_new = False
+                row.recorded = now
                 yield row.begun, number, row.text.expandtabs().rstrip()
             if number <= self._last - _WINDOW and not row.is_new:
                 del self._rows[number]
@@ -226,15 +234,16 @@ class ConsoleLog:
 
     def take(self, now: float, is_last: bool = False) -> Iterator[tuple[float, dict[str, object]]]:
         """Yield when they were begun, and the fields `stream`, `line` and `text` of the lines to record."""
-        for stream, screen in () if self.is_full else self._screens.items():
-            for begun, line, text in screen.take(now, is_last):
-                encoded = self._redact(text).encode(errors="replace")  # no surrogates
-                self._bytes += len(encoded) + _LINE_BYTES
-                yield begun, {"stream": stream, "line": line, "text": encoded.decode()}
-                if self._bytes > MAX_CONSOLE_BYTES:
-                    self.is_full = True
-                    yield now, {"line": -1, "text": _NOTE}
-                    return
+        if not self.is_full:
+            for stream, screen in self._screens.items():
+                for begun, line, text in screen.take(now, is_last):
+                    encoded = self._redact(text).encode(errors="replace")  # no surrogates
+                    self._bytes += len(encoded) + _LINE_BYTES
+                    yield begun, {"stream": stream, "line": line, "text": encoded.decode()}
+                    if self._bytes > MAX_CONSOLE_BYTES:
+                        self.is_full = True
+                        yield now, {"line": -1, "text": _NOTE}
+                        return
 
 
 @dataclass(frozen=True)

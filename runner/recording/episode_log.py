@@ -60,7 +60,11 @@ class EpisodeLog:
     """
 
     def __init__(self, n: int, agents: int, mdp: Mdp | None, has_turns: bool, zero: float = 0.0) -> None:
-        self._n, self._agents, self._mdp, self._has_turns, self._zero = n, agents, mdp, has_turns, zero
+        self._n = n
+        self._agents = agents
+        self._mdp = mdp
+        self._has_turns = has_turns
+        self._zero = zero
         self._environments = np.arange(n)
         """The environments of the last steps."""
         self.episode = np.zeros(n, np.int64)
@@ -90,7 +94,8 @@ class EpisodeLog:
         cut = was_reset & (left > 0) & ~after_end  # the reset ends an episode in progress
         number = np.cumsum(cut | after_end, axis=0, dtype=np.int64)
         sums, sum_of = self._summed(steps, number, ends[-1])
-        episode, total = self.episode + number, number[-1] + ends[-1]
+        episode = self.episode + number
+        total = number[-1] + ends[-1]
 
         at, column = (np.concatenate(pair) for pair in zip(np.nonzero(ends), np.nonzero(cut), strict=True))
         by_reset = np.arange(len(at)) >= np.count_nonzero(ends)
@@ -99,7 +104,8 @@ class EpisodeLog:
         environment = column
         if steps.environment is not None:
             environments = np.vstack([self._environments, steps.environment])
-            environment, self._environments = environments[at - by_reset + 1, column], environments[-1]
+            environment = environments[at - by_reset + 1, column]
+            self._environments = environments[-1]
         ended = self._end(
             environment,
             steps.first + (at - by_reset) * n + column,

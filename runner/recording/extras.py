@@ -316,24 +316,26 @@ class Extras(Mapping[str, DType]):
         Raises:
             RecordingError: they cannot be read, or take more than 134 MB.
         """
-        n, size = len(steps), len(steps) * self._values.itemsize
+        n = len(steps)
+        size = len(steps) * self._values.itemsize
         self._check_size(size, n)
         values = {name: zeros((n,), dtype) for name, dtype in self.items()}
         given = {name: np.zeros(n, np.bool_) for name in self}
-        for block in self.blocks(int(steps[0]), int(steps[-1]) + 1) if n else ():
-            rows = np.minimum(np.searchsorted(steps, block["step"]), n - 1)
-            wanted = steps[rows] == block["step"]
-            rows, chosen = rows[wanted], block[wanted]
-            for name in chosen["values"].dtype.names:
-                given[name][rows], part = chosen["given"][name], chosen["values"][name]
-                if not values[name].dtype.hasobject:
-                    values[name][rows] = part
-                    continue
-                is_given = chosen["given"][name]
-                for row, value in zip(rows[is_given].tolist(), part[is_given], strict=True):
-                    values[name][row] = value
-                    size += len(value) if isinstance(value, str) else value.nbytes
-                self._check_size(size, n)
+        if n:
+            for block in self.blocks(int(steps[0]), int(steps[-1]) + 1):
+                rows = np.minimum(np.searchsorted(steps, block["step"]), n - 1)
+                wanted = steps[rows] == block["step"]
+                rows, chosen = rows[wanted], block[wanted]
+                for name in chosen["values"].dtype.names:
+                    given[name][rows], part = chosen["given"][name], chosen["values"][name]
+                    if not values[name].dtype.hasobject:
+                        values[name][rows] = part
+                        continue
+                    is_given = chosen["given"][name]
+                    for row, value in zip(rows[is_given].tolist(), part[is_given], strict=True):
+                        values[name][row] = value
+                        size += len(value) if isinstance(value, str) else value.nbytes
+                    self._check_size(size, n)
         return {
             name: np.ma.MaskedArray(column, np.broadcast_to(_column(~given[name], column.ndim), column.shape))
             for name, column in values.items()

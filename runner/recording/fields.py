@@ -104,7 +104,9 @@ class Field:
         if self.dtype is not None:
             wider = None if self.dtype.shape else _WIDER.get(self.dtype.str)
             return self.dtype if wider is None else np.dtype(wider)
-        parts, offsets, at = self.parts or (), [], 0
+        parts = self.parts or ()
+        offsets = []
+        at = 0
         for part in parts:
             at += len(part.tag)
             offsets.append(at)
@@ -207,7 +209,8 @@ class Field:
 
     def _span(self, message: bytes, at: int, head: bytes) -> tuple[int, int]:
         """Return where the bytes of a value with its length begin, and where they end."""
-        length, start = 0, at + len(head)
+        length = 0
+        start = at + len(head)
         for k, byte in enumerate(message[start : start + 5]):
             length |= (byte & 0x7F) << 7 * k
             if byte < 128:
@@ -263,7 +266,8 @@ def _field(number: int, name: str, stored_name: str, description: Description) -
         return Field(number, name, Pb.TYPE_STRING, stored_as=stored_as)
     code = dtype.base.str
     code = code if dtype.shape else _WIDER.get(code, code)
-    kind, is_repeated = _KINDS.get(code, Pb.TYPE_BYTES), bool(dtype.shape) and code in _KINDS
+    kind = _KINDS.get(code, Pb.TYPE_BYTES)
+    is_repeated = bool(dtype.shape) and code in _KINDS
     return Field(number, name, kind, is_repeated, stored_as, dtype)
 
 

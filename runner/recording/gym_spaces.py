@@ -335,7 +335,9 @@ class _Registered(RecordedSpace[Space]):
         space: Space,
     ) -> None:
         super().__init__(space)
-        self._cls, self._to_json, self._from_json = cls, to_json, from_json
+        self._cls = cls
+        self._to_json = to_json
+        self._from_json = from_json
 
     def to_json(self, value: Value) -> Value:
         return as_json(self._to_json(value))
@@ -399,7 +401,8 @@ class _Box(RecordedSpace[SpaceT]):
 
     @classmethod
     def restore(cls, description: Description) -> Space:
-        dtype, shape = _dtype(description), tuple(description["shape"])
+        dtype = _dtype(description)
+        shape = tuple(description["shape"])
         if dtype.kind == "f":
             least, most = -np.inf, np.inf
         else:

@@ -53,7 +53,10 @@ class LeafValues:
     """
 
     def __init__(self, keys: Keys, space: RecordedSpace[Any], what: str, on_rounded: OnRounded) -> None:
-        self.keys, self.space, self._what, self._on_rounded = keys, space, what, on_rounded
+        self.keys = keys
+        self.space = space
+        self._what = what
+        self._on_rounded = on_rounded
         self.name = what + "".join(f"[{key!r}]" for key in keys)
         self.blank = encode_text("") if space.dtype is None else bytes(space.dtype.itemsize)
         """The bytes of the value of an agent that has none."""
@@ -258,7 +261,9 @@ class _Source:
                 None for all values.
             fit: called with other values; by default they are fitted.
         """
-        value, shape, inside = f"v{len(self._scope)}", batch + leaf.shape, self._inside(whole, leaf)
+        value = f"v{len(self._scope)}"
+        shape = batch + leaf.shape
+        inside = self._inside(whole, leaf)
         if values.agents:
             zeros = self.name(np.zeros(shape, leaf.base)[()])
             inside = f"{inside} if {self.name(leaf.keys[0])} in {whole} else {zeros}"
@@ -324,23 +329,26 @@ def filler(values: SpaceValues, column: Array, batch: tuple[int, ...] = ()) -> P
     source = _Source(check_agents=values.check_agents, to_bytes=values.to_bytes, REFUSED=REFUSED)
     lines = ["check_agents(value)"] if values.agents else []
     if column.dtype.hasobject:
-        rows, size = source.name(column.reshape(len(column), math.prod(batch))), "sum(map(len, data))"
+        rows = source.name(column.reshape(len(column), math.prod(batch)))
+        size = "sum(map(len, data))"
         lines.append(f"{rows}[row] = data = to_bytes(value, {source.name(batch)})")
         if not (batch or values.agents):
             packed = [
                 f"{source.name(struct.Struct(f'<{code}').pack)}({piece})" if len(code) == 1 else piece
                 for code, piece in source.packed("value", values, column)
             ]
-            size, lines = "len(data)", [f"try: data = b''.join(({', '.join(packed)},))"]
+            size = "len(data)"
+            lines = [f"try: data = b''.join(({', '.join(packed)},))"]
             lines.append("except REFUSED: data, = to_bytes(value)  # which says why")
             lines.append(f"if len(data) > {MAX_VALUE_BYTES}: to_bytes(value)  # which refuses it")
             lines.append(f"{rows}[row] = data")
         lines.append(f"return {size}")
-    for leaf in () if column.dtype.hasobject else values.leaves:
-        scalars = frozenset() if batch else leaf.exact_scalars
-        expression = source.value("value", values, leaf, scalars, batch)
-        lines.append(f"try: {source.name(leaf.column_in(column))}[row] = {expression}")
-        lines.append(f"except NO_VALUE as error: raise {source.name(leaf.refused)}(error) from error")
+    if not column.dtype.hasobject:
+        for leaf in values.leaves:
+            scalars = frozenset() if batch else leaf.exact_scalars
+            expression = source.value("value", values, leaf, scalars, batch)
+            lines.append(f"try: {source.name(leaf.column_in(column))}[row] = {expression}")
+            lines.append(f"except NO_VALUE as error: raise {source.name(leaf.refused)}(error) from error")
     function: Put = source.function("row, value", *lines, "return 0")
     return function
 
@@ -360,7 +368,8 @@ def step_filler(
     """
     if rows.itemsize > _MAX_PACKED:
         return put, copied
-    source, keep = _Source(put=put, memory=rows.view(np.uint8).data), copied
+    source = _Source(put=put, memory=rows.view(np.uint8).data)
+    keep = copied
     code, given = _joined(source.packed("action", action, rows["action"]))
     if code not in _CODES.values():  # else it is a number, which nobody can change
         kept = _Source(copied=copied)
@@ -368,7 +377,8 @@ def step_filler(
         pack = struct.Struct(f"<{code}")
         returned = f"try: return {kept.name(pack.pack)}({values})"
         keep = kept.function("action", returned, "except NO_VALUE: return copied(action)")
-        code, given = f"{pack.size}s", "action"
+        code = f"{pack.size}s"
+        given = "action"
     codes, seen = _joined(source.packed("observation", observation, rows["observation"]))
     pack_into = source.name(struct.Struct(f"<{code}{codes}d??").pack_into)
     parameters = "row, action, observation, reward, terminated, truncated"

@@ -69,7 +69,8 @@ class HostSampler:
 
         Percentages of the processor are means since the last call.
         """
-        psutil, now = self._psutil, time.monotonic()
+        psutil = self._psutil
+        now = time.monotonic()
         if now - self._looked > _CHILDREN_SECONDS:
             self._looked = now
             with contextlib.suppress(psutil.Error, OSError):

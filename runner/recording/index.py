@@ -276,7 +276,8 @@ class Index:
         fields = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, footer.summary_offset_start)
         if crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
             raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`")
-        self.finished, self.end = True, start
+        self.finished = True
+        self.end = start
         for raw in raw_records(stream, start, end):
             self.add(raw)
             start = raw.end
@@ -332,7 +333,8 @@ class Index:
         }
 
     def _statistics(self) -> Statistics:
-        chunks, counts = self.chunks.columns, self.count_messages()
+        chunks = self.chunks.columns
+        counts = self.count_messages()
         return Statistics(
             attachment_count=len(self.attachments),
             channel_count=len(self.channels),
@@ -398,7 +400,8 @@ def check_beginning(stream: BinaryIO) -> int:
 
 def checksum(stream: BinaryIO, start: int, end: int) -> int:
     """Return the checksum of a part of the file, which need not fit into memory."""
-    crc, at = 0, stream.seek(start)
+    crc = 0
+    at = stream.seek(start)
     while at < end and (piece := stream.read(min(_PIECE, end - at))):
         crc = crc32(piece, crc)
         at += len(piece)

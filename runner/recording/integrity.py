@@ -157,7 +157,8 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
         OtherVersion: the recording has another version of the format.
         RecordingError: a record is damaged, or the file ends before the data section does.
     """
-    indexed, names = True, ExtraNames(path)
+    indexed = True
+    names = ExtraNames(path)
     layout: Layout | None = None
     chunk: ReadChunk | None = None
     """The record before, if it is a chunk."""
@@ -165,7 +166,8 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
         report(raw.offset, contents.size)
         if chunk is not None:
             contents.chunks.append(_with_index(chunk, raw, indexed))
-            chunk, contents.end = None, raw.end
+            chunk = None
+            contents.end = raw.end
             continue
         if raw.ends_data:
             return

@@ -352,7 +352,8 @@ def decode_q_table(payload: bytes) -> QTable:
         RecordingError: shape, dtype and data do not fit together.
     """
     fields = decode(schema.Q_TABLE, payload)
-    shape, data = tuple(fields["shape"]), fields["data"]
+    shape = tuple(fields["shape"])
+    data = fields["data"]
     if fields["dtype"] != "<f8" or len(shape) != 2 or shape[0] * shape[1] * 8 != len(data):
         raise RecordingError(
             f"found a Q-table of shape {shape}, dtype {fields['dtype']!r} and {len(data)} bytes; "
@@ -380,7 +381,9 @@ def decode_array(payload: bytes) -> Snapshot:
         RecordingError: shape, dtype and data do not fit together.
     """
     fields = decode(schema.ARRAY, payload)
-    shape, kind, data = tuple(fields["shape"]), fields["dtype"], fields["data"]
+    shape = tuple(fields["shape"])
+    kind = fields["dtype"]
+    data = fields["data"]
     if not NUMBERS.fullmatch(kind) or math.prod(shape) * np.dtype(kind).itemsize != len(data):
         raise RecordingError(f"found an array of shape {shape}, dtype {kind!r} and {len(data)} bytes")
     values = np.frombuffer(data, kind).reshape(shape)

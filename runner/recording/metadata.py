@@ -109,7 +109,8 @@ def check_file(layout: Layout, index: Index, path: str) -> None:
             if (topic := schema.TOPIC_OF.get(number)) is not None and topic.message is schema.EXTRA
         }
     for number in sorted(topics.keys() | index.channels.keys()):
-        found, channel = index.channels.get(number), topics.get(number)
+        found = index.channels.get(number)
+        channel = topics.get(number)
         if found != channel:
             raise RecordingError(
                 f"{path}: found channel {number} for {found and found.topic!r}, "

@@ -176,9 +176,10 @@ class _Thread:
     def _distribute(self) -> None:
         """Give what was written to every observer. The caller holds the lock."""
         observers = list(self._observers)
-        for write in self._tee.take() if self._tee is not None else ():
-            for observer in observers:
-                observer.write(*write)
+        if self._tee is not None:
+            for write in self._tee.take():
+                for observer in observers:
+                    observer.write(*write)
 
     def _stop_unheard(self) -> None:
         """Give the streams back if no observer wants more of them. The caller holds the lock."""

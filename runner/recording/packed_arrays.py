@@ -50,11 +50,13 @@ def _read_array(stream: zstandard.ZstdDecompressionReader, max_bytes: int, where
 
     NumPy's own reader parses the header as Python, which a hostile one makes fail in many ways.
     """
-    prefix, length = stream.read(len(_PREFIX)), int.from_bytes(stream.read(2), "little")
+    prefix = stream.read(len(_PREFIX))
+    length = int.from_bytes(stream.read(2), "little")
     header = _HEADER.fullmatch(stream.read(min(length, _MAX_HEADER_BYTES)))
     if prefix != _PREFIX or header is None:
         raise RecordingError(f"{where}: found no `.npy` file of numbers, version 1.0.")
-    dtype, shape = np.dtype(header[1].decode()), tuple(int(n) for n in header[3].split(b",") if n.strip())
+    dtype = np.dtype(header[1].decode())
+    shape = tuple(int(n) for n in header[3].split(b",") if n.strip())
     size = math.prod(shape) * dtype.itemsize
     if size > max_bytes:
         raise RecordingError(
@@ -62,7 +64,8 @@ def _read_array(stream: zstandard.ZstdDecompressionReader, max_bytes: int, where
             f"environment may take {MAX_ARRAYS_BYTES:,}."
         )
     flat = np.empty(math.prod(shape), dtype)
-    target, filled = flat.view(np.uint8).data, 0
+    target = flat.view(np.uint8).data
+    filled = 0
     while filled < size and (more := stream.readinto(target[filled:])):
         filled += more
     if filled != size or stream.read(1):

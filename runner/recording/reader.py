@@ -112,7 +112,8 @@ class Recording(RunDescription):
                 )
             topic = known[topic]
         if topic not in self._tables:
-            message, lost = self.layout.message(topic), self.lost.get(topic.name, [])
+            message = self.layout.message(topic)
+            lost = self.lost.get(topic.name, [])
             chunks = self.file, topic, self._places[topic], message, lost
             if topic.message is schema.STEP:
                 actions = self.table(topics_of(topic.phase).actions)
@@ -245,15 +246,18 @@ class Phase:
 
     def __init__(self, recording: Recording, name: str) -> None:
         topics = schema.topics_of(name)
-        self.name, self.title = name, schema.PHASE_NAMES[name]
+        self.name = name
+        self.title = schema.PHASE_NAMES[name]
         steps = recording.table(topics.steps)
         assert isinstance(steps, Steps)
         self.steps = steps
-        self.episodes, self.resets = recording.table(topics.episodes), recording.table(topics.resets)
+        self.episodes = recording.table(topics.episodes)
+        self.resets = recording.table(topics.resets)
         self.infos, self.frames, self.metrics = map(
             recording.table, (topics.infos, topics.frames, topics.metrics)
         )
-        self._recording, self.topics = recording, topics
+        self._recording = recording
+        self.topics = topics
 
     def steps_of_episodes(self, start: int, stop: int | None) -> Iterator[Records]:
         """Yield the steps of the episodes number `start` up to `stop`; None for all that follow."""
@@ -310,7 +314,8 @@ class Phase:
         Raises:
             RecordingError: the recording has no such episode or steps, or they are too large for an array.
         """
-        steps, path = self.episode(episode), self._recording.path
+        steps = self.episode(episode)
+        path = self._recording.path
         if len(steps) * self.steps.row_dtype.itemsize > MAX_EPISODE_BYTES:
             raise RecordingError(
                 f"{path}: {self.title} episode {episode} has {len(steps):,} steps, too many for an array; "
@@ -396,9 +401,11 @@ class Phase:
         Raises:
             RecordingError: they are damaged.
         """
-        table, where = self._recording.table(self.topics.extras), str(self._recording.path)
+        table = self._recording.table(self.topics.extras)
+        where = str(self._recording.path)
         layouts = {layout.number: layout for layout in extra_layouts(self._recording)} if table else {}
-        index, parts = self._recording.file.index, []
+        index = self._recording.file.index
+        parts = []
         channels = self._recording.file.channels[table.places]
         for channel in sorted(set(channels.tolist())):
             layout = layouts.get(channel // schema.LAYOUT_STRIDE)
@@ -423,7 +430,8 @@ class Phase:
     def recent_means(self) -> RecentTraining:
         """Return the means of the last episodes; None where no value is finite."""
         recent = self.recent_episodes()
-        length, total = finite_mean(recent["length"]), finite_mean(recent["returns"].sum(axis=1))
+        length = finite_mean(recent["length"])
+        total = finite_mean(recent["returns"].sum(axis=1))
         return RecentTraining(len(recent), length, total)
 
     def all_metrics(self) -> list[Message]:

@@ -223,7 +223,8 @@ class RecordStore:
         try:
             with self._lock:
                 self._stream.seek(offset)
-                head, body = self._stream.read(RECORD_HEAD.size), self._stream.read(length - RECORD_HEAD.size)
+                head = self._stream.read(RECORD_HEAD.size)
+                body = self._stream.read(length - RECORD_HEAD.size)
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be read at {offset} ({error.strerror}).") from error
         if len(head) + len(body) != length:

@@ -104,7 +104,8 @@ class Recorder:
         packing = replace(packing or Packing(), values=not layout.has_states)
         self._file = file
         self._watchers: dict[MessageType, Watcher] = {}
-        self._packed, self._grouped = packed, before is not None
+        self._packed = packed
+        self._grouped = before is not None
         self._chunk_steps = packing.chunk_steps
         self._reference = reference or Reference()
         self._lanes = {
@@ -192,7 +193,8 @@ class Recorder:
 
     def fill(self, topic: Topic, positions: Unsigned) -> Iterator[tuple[Records, slice]]:
         """Yield blocks to fill with the records of a slice; `take` follows with `positions`, one a record."""
-        done, n = 0, len(positions)
+        done = 0
+        n = len(positions)
         while done < n:
             block = self.block(topic)[: n - done]
             part = slice(done, done + len(block))
@@ -332,7 +334,8 @@ class Recorder:
         Raises:
             Diverged: a record differs from the one that the recording already holds.
         """
-        lane, fresh = self._lanes[topic], self._filled(topic, len(positions))
+        lane = self._lanes[topic]
+        fresh = self._filled(topic, len(positions))
         if fresh.dtype.hasobject:  # messages of varying size, and the block is filled again
             self.extend(topic, encode_rows(lane.message, fresh), positions.tolist())
             return
@@ -378,9 +381,12 @@ class Recorder:
         """Send the records of the lane's open block to the pipeline; the block comes back when written."""
         if lane.open is None or not lane.filled:
             return
-        block, filled = lane.open, lane.open[: lane.filled]
+        block = lane.open
+        filled = lane.open[: lane.filled]
         lane.open, lane.filled = None, 0
-        packed, span, count = None, lane.span, self.counts[lane.topic.name]
+        packed = None
+        span = lane.span
+        count = self.counts[lane.topic.name]
         if self._packed and span and span[:2] == (count - len(filled), count):
             packed = partial(self._packed.data, span.entry)
         is_whole = len(block) == lane.capacity  # the first, smaller one is not used again

@@ -421,7 +421,8 @@ def _read_chunk(body: bytes, offset: int) -> ReadChunk:
     where = f"chunk at {offset}"
     head, records = unpack_chunk(body, where)
     channel, times, offsets = checked_messages(records, where)
-    length, size = RECORD_HEAD.size + len(body), head.uncompressed_size
+    length = RECORD_HEAD.size + len(body)
+    size = head.uncompressed_size
     span = head.start_time, head.end_time
     entry = ChunkEntry(offset, length, size, *span, channel, head.compression.encode(), len(times))
     return ReadChunk(body, entry, records, times, offsets)
@@ -451,7 +452,9 @@ def checked_messages(records: bytes, where: str) -> tuple[int, Unsigned, Unsigne
         offsets = np.arange(0, len(records), size, dtype=np.uint64)
         heads = np.frombuffer(records, np.uint8).reshape(-1, size)[:, :HEADER_BYTES]
     else:
-        starts, at, unpack_head = [], 0, RECORD_HEAD.unpack_from
+        starts = []
+        at = 0
+        unpack_head = RECORD_HEAD.unpack_from
         while at + HEADER_BYTES <= len(records):
             starts.append(at)
             at += RECORD_HEAD.size + unpack_head(records, at)[1]

@@ -175,7 +175,9 @@ class _Salvage:
     def __init__(
         self, path: Path, damaged: DamagedFile, run: Mapping[str, str], stated: Mapping[str, int]
     ) -> None:
-        self._path, self._damaged, self._counts = path, damaged, stated
+        self._path = path
+        self._damaged = damaged
+        self._counts = stated
         self._layout = layout_of_run(run, str(path))
         self._done = Repair(path)
         self._next = {topic.name: 0 for topic in self._layout.topics}
@@ -201,12 +203,14 @@ class _Salvage:
         with contextlib.suppress(RecordingError):  # one that makes no sense is worth as much as none
             result = parse_result(json_object(entries.get("json"), "the metadata 'result'"), problems)
             if not problems:
-                self._counts, self._result = _recorded_counts(result), entries
+                self._counts = _recorded_counts(result)
+                self._result = entries
 
     def _take_chunk(self, file: RecordingFile, chunk: ReadChunk) -> None:
         """Copy a good chunk; note a hole before it."""
         where = f"{self._path}: chunk at {chunk.offset}"
-        topic, count = chunk.topic, len(chunk.times)
+        topic = chunk.topic
+        count = len(chunk.times)
         if topic.name not in self._next:
             raise RecordingError(f"{where}: found messages of another kind of run.")
         if topic is schema.EXTRA_COLUMNS_TOPIC:
@@ -236,7 +240,8 @@ class _Salvage:
 
     def _numbers(self, chunk: ReadChunk) -> tuple[int, int]:
         """Return the numbers of a chunk's first and last message."""
-        topic, name = chunk.topic, schema.NUMBERED_BY[chunk.topic.message]
+        topic = chunk.topic
+        name = schema.NUMBERED_BY[chunk.topic.message]
         dtype, message = self._layout.dtype(topic), self._layout.message(topic)
         if dtype is not None:
             numbers = np.frombuffer(chunk.records, dtype)[name]

@@ -91,7 +91,8 @@ def content_of(path: Path) -> str:
     """
     check_up_to_cut(path)
     with open_recording(path) as recording:
-        found, result = content_hash(recording).topics(), recording.result
+        found = content_hash(recording).topics()
+        result = recording.result
     if result.content_digest is None:
         return combined_digest(found)
     stated = dict(result.topic_digests)
@@ -108,8 +109,9 @@ def content_hash(recording: Recording) -> ContentHash:
     """Return the digests of a recording's messages."""
     seen = ContentHash()
     for topic in recording.topics:
-        for records in recording.table(topic).records() if topic.digested else ():
-            seen.update(topic, records)
+        if topic.digested:
+            for records in recording.table(topic).records():
+                seen.update(topic, records)
     return seen
 
 
@@ -123,15 +125,17 @@ def continues(path: Path, earlier: Path) -> bool:
     with open_recording(path) as later, open_recording(earlier) as before:
         if later.run != before.run:
             return False
-        expected, seen = content_hash(before), ContentHash()
+        expected = content_hash(before)
+        seen = ContentHash()
         for topic in before.topics:
             table = before.table(topic)
             left = sum(table.entry(k).uncompressed_size for k in range(len(table)))
-            for records in later.table(topic).records() if left and topic.digested else ():
-                seen.update(topic, memoryview(records)[:left])
-                left -= min(left, len(records))
-                if not left:
-                    break
+            if left and topic.digested:
+                for records in later.table(topic).records():
+                    seen.update(topic, memoryview(records)[:left])
+                    left -= min(left, len(records))
+                    if not left:
+                        break
     return seen.topics() == expected.topics()
 
 

@@ -251,10 +251,6 @@ def _is_text(value: object) -> TypeGuard[str]:
     return isinstance(value, str)
 
 
-def _is_object(value: object) -> bool:
-    return isinstance(value, Mapping)
-
-
 def _maps_to(fits: Callable[[object], bool]) -> Callable[[object], bool]:
     return lambda value: isinstance(value, Mapping) and all(map(fits, value.values()))
 
@@ -276,7 +272,7 @@ _DIGEST: Final = Check(
 )
 _COUNT: Final = Check(_is_count, "a whole number from 0 up")
 _TEXT: Final = Check(_is_text, "a text")
-_OBJECT: Final = Check(_is_object, "an object")
+_OBJECT: Final = Check(lambda value: isinstance(value, Mapping), "an object")
 _NUMBER: Final = _within()
 _LENGTH: Final = _within(0)
 _STATUS: Final = Check(lambda value: value in STATED_STATUSES, f"one of {', '.join(STATED_STATUSES)}")

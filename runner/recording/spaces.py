@@ -189,7 +189,8 @@ def _value(description: Description, data: bytes, at: int) -> tuple[Value, int]:
     dtype = leaf_dtype(description)
     if dtype is None:
         (length,) = _LENGTH.unpack_from(data, at)
-        start, at = at + _LENGTH.size, at + _LENGTH.size + length
+        start = at + _LENGTH.size
+        at += _LENGTH.size + length
         if at > len(data):
             raise ValueError(f"a value of {length:,} bytes in {len(data):,}")
         item = item_dtype(description)

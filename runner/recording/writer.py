@@ -51,7 +51,8 @@ class RecordingFile:
         Raises:
             OSError: it exists, or cannot be written.
         """
-        self.path, self._index = path, contents or Index()
+        self.path = path
+        self._index = contents or Index()
         self._stream: BinaryIO = path.open("xb" if contents is None else "r+b", buffering=0)
         self._crc = 0
         self._indexed = True
@@ -151,7 +152,9 @@ class RecordingFile:
         Raises:
             OSError: it could not all be written; the file is then as it was before.
         """
-        crc, end, metadata = self._crc, self.size, dict(self._index.metadata)
+        crc = self._crc
+        end = self.size
+        metadata = dict(self._index.metadata)
         try:
             if name:
                 self.add_metadata(name, entries or {})
