@@ -44,7 +44,8 @@ def action_names(env: object, space: Space) -> tuple[str, ...]:
     Args:
         space: of the actions as the user takes them: names are only returned if there is one for each.
     """
-    layer, base = env, getattr(env, "unwrapped", env)
+    layer = env
+    base = getattr(env, "unwrapped", env)
     while layer is not base:
         if isinstance(layer, ActionWrapper) and not isinstance(layer, StickyAction):  # has other actions
             return ()

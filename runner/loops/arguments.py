@@ -45,8 +45,10 @@ def arguments_of(made: object, inner: str = "") -> tuple[Json, bool]:
     """
     kind: Any = type(made)
     parameters = inspect.signature(kind).parameters
-    recorded, kept = _recorded(made, parameters), _kept(kind)
-    kwargs, is_certain = dict(recorded), True
+    recorded = _recorded(made, parameters)
+    kept = _kept(kind)
+    kwargs = dict(recorded)
+    is_certain = True
     if inner and inner not in parameters:
         raise CannotBeMade(f"{class_name(made)} does not record its arguments: it has no parameter {inner}")
     for name, parameter in parameters.items():

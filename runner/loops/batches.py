@@ -53,8 +53,12 @@ class RecordedBatches(Recorded):
         options: Options,
         make: str,
     ) -> None:
-        self._envs, self._mode, self._spaces, self._make = envs, mode, given_spaces, make
-        self._options, self._phase = options, "train"
+        self._envs = envs
+        self._mode = mode
+        self._spaces = given_spaces
+        self._make = make
+        self._options = options
+        self._phase = "train"
         self._first: object = None
         """The observations of a reset before the first batch."""
         if isinstance(envs, VectorEnv):
@@ -160,7 +164,8 @@ class RecordedBatches(Recorded):
         seen, done = _numpy(observations), _numpy(actions)
         before = None
         if {len(part) for part in _arrays(seen) if part.ndim} == {steps + 1}:
-            before, seen = element_of(seen, 0), element_of(seen, slice(1, None))
+            before = element_of(seen, 0)
+            seen = element_of(seen, slice(1, None))
         if "_loop" not in vars(self):
             self._open_from(before, seen, done)
         self._check_finals(finals, ends | cut, seen)
@@ -313,7 +318,8 @@ def _derived(batch: object) -> Space:
     if isinstance(batch, tuple):
         return spaces.Tuple([_derived(part) for part in batch])
     array = np.asarray(batch)
-    kind, shape = array.dtype, array.shape[2:]
+    kind = array.dtype
+    shape = array.shape[2:]
     if kind.kind not in "biuf":
         raise ConfigError(
             f"found a batch of {kind}, whose space is unknown: pass observation_space and action_space"

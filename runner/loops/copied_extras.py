@@ -37,7 +37,8 @@ class CopiedExtras:
         """The names in the run, by number of the process and the name there."""
         for (number, _), extras in self._extras.items():
             for name, column in extras.columns.items():
-                new, before = name, columns.get(name, column)
+                new = name
+                before = columns.get(name, column)
                 both = united(before, column)
                 if both is None or before["type"] == column["type"] != both["type"]:
                     new = f"{name} ({sources[number].name})"[:MAX_NAME_LENGTH]

@@ -77,7 +77,9 @@ class PendingExtras:
     def __init__(
         self, recorder: Recorder, leave_out: Callable[[Exception], None], batch: tuple[int, ...] = ()
     ) -> None:
-        self._recorder, self._leave_out, self._batch = recorder, leave_out, batch
+        self._recorder = recorder
+        self._leave_out = leave_out
+        self._batch = batch
         self._n = batch[0] if batch else 1
         self._taken = recorder.steps
         self._described: dict[str, Description] = {}
@@ -85,8 +87,10 @@ class PendingExtras:
         self._layout = ExtraLayout(-1, 0, {})
         """The last layout that the recording has."""
         self._columns: dict[str, _Column] = {}
-        self._room, self._max_rows = 0, 0
-        """The rows that the columns hold, and how many of them may wait now."""
+        self._room = 0
+        """The rows that the columns hold."""
+        self._max_rows = 0
+        """How many of these rows may wait now."""
         self._phase = ""
         self._steps: list[int] = []
         """The number of each row's step; of several environments, of the first one's step."""
@@ -94,8 +98,10 @@ class PendingExtras:
         """The names that were given, in rows that do not have all."""
         self._fixed_bytes = 0
         """Bytes of a step's values of one size."""
-        self._held, self._held_row = 0, -1
-        """Bytes of varying size put down since rows were last handed on, and the last row that has some."""
+        self._held = 0
+        """Bytes of varying size put down since rows were last handed on."""
+        self._held_row = -1
+        """The last row that has some of these bytes."""
         self._row_bytes: dict[str, int] = {}
         """The most bytes of an environment in that row, by name."""
         self._final = dict.fromkeys(schema.PHASES, -1)
@@ -184,7 +190,8 @@ class PendingExtras:
         sizes = np.full(shape[0] * self._n, self._fixed_bytes)
         flat = {}
         for name, value in values.items():
-            column, whole = self._described[name], _values(name, value, shape)
+            column = self._described[name]
+            whole = _values(name, value, shape)
             if leaf_dtype(column) is None:
                 flat[name] = _objects([encoded(column, item) for item in _listed(whole, shape)])
                 sizes += [len(item) for item in flat[name].tolist()]
@@ -235,12 +242,14 @@ class PendingExtras:
             return {name: value for name, value in fitting.items() if name not in changed}
         if self._steps:
             self._partial.setdefault(0, set(self._described))
-        self._fixed_bytes, self._described = size, described
+        self._fixed_bytes = size
+        self._described = described
         width = row_dtype({"type": "Dict", "spaces": described}).itemsize * self._n
         self._room = self._max_rows = max(1, min(_MAX_ROWS, _MAX_BYTES // width))
         left = len(self._steps)
         for name, description in described.items():
-            before, column = self._columns.get(name), self._column(name, description)
+            before = self._columns.get(name)
+            column = self._column(name, description)
             self._columns[name] = column
             if before is None:
                 continue
@@ -255,7 +264,8 @@ class PendingExtras:
         self, values: Mapping[str, object], lead: tuple[int, ...]
     ) -> tuple[dict[str, Description], int]:
         """Return the descriptions of the values that can be recorded, and the bytes of all of one size."""
-        described, size = dict[str, Description](), self._fixed_bytes
+        described = dict[str, Description]()
+        size = self._fixed_bytes
         for name, value in values.items():
             known = self._described.get(name)
             try:
@@ -273,12 +283,14 @@ class PendingExtras:
 
     def _column(self, name: str, description: Description) -> _Column:
         """Return a column for values of a description."""
-        dtype, batch = leaf_dtype(description), self._batch
+        dtype = leaf_dtype(description)
+        batch = self._batch
         if dtype is None:
             column = np.empty((self._room + 1, *batch), object)
             column.fill(NOTHING)
             return _Column(None, (), frozenset(), column, self._varying_fit(name, description))
-        base, shape = np.dtype(dtype.base.str), (*batch, *dtype.shape)
+        base = np.dtype(dtype.base.str)
+        shape = (*batch, *dtype.shape)
         exact = {kind for kind in SCALARS if np.can_cast(kind, base)}
         exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
 
@@ -293,7 +305,8 @@ class PendingExtras:
 
     def _varying_fit(self, name: str, description: Description) -> Callable[[int, object], Any]:
         """Return the function that returns values of varying size as bytes, and counts these."""
-        batch, item_type = self._batch, item_dtype(description)
+        batch = self._batch
+        item_type = item_dtype(description)
         base = None if item_type is None else item_type.base
 
         def is_alike(item: Any) -> bool:
@@ -307,7 +320,8 @@ class PendingExtras:
                 _needed(name, description, value, batch)
             data = [encoded(description, item) for item in items]
             if row != self._held_row:
-                self._held_row, self._row_bytes = row, {}
+                self._held_row = row
+                self._row_bytes = {}
             self._row_bytes[name] = max(map(len, data))
             if (size := self._fixed_bytes + sum(self._row_bytes.values())) > MAX_EXTRA_BYTES:
                 del self._row_bytes[name]
@@ -332,7 +346,8 @@ class PendingExtras:
         """Hand the first n rows to the recorder."""
         if n <= 0:
             return
-        given, columns = self._given(n), {}
+        given = self._given(n)
+        columns = {}
         for name, column in self._columns.items():
             columns[name] = column.values[:n].reshape(-1, *column.shape[len(self._batch) :])
         steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
@@ -342,7 +357,9 @@ class PendingExtras:
         for column in self._columns.values():
             column.values[:left] = column.values[n : n + left]
         self._partial = {row - n: names for row, names in self._partial.items() if row >= n}
-        self._max_rows, self._held, self._held_row = self._room, 0, self._held_row - n
+        self._max_rows = self._room
+        self._held = 0
+        self._held_row -= n
 
     def _send(self, steps: Ints, columns: Mapping[str, Array], given: Mapping[str, Flags]) -> None:
         """Hand the values with these steps, and whether each was given, to the recorder."""
@@ -360,10 +377,11 @@ class PendingExtras:
         """Return whether each environment's step has a value, by name, in n rows; blank those without one."""
         given = {name: np.ones(n, np.bool_) for name in self._columns}
         for row, names in self._partial.items():
-            for name in given.keys() - names if row < n else ():
-                given[name][row] = False
-                column = self._columns[name]
-                column.values[row : row + 1].fill(NOTHING if column.dtype is None else 0)
+            if row < n:
+                for name in given.keys() - names:
+                    given[name][row] = False
+                    column = self._columns[name]
+                    column.values[row : row + 1].fill(NOTHING if column.dtype is None else 0)
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
 

@@ -164,7 +164,9 @@ class _Fold:
     def __init__(
         self, run: Run, sources: Sequence[Source], left_out: Mapping[str, str], report: Report
     ) -> None:
-        self._run, self._sources, self._report = run, sources, report
+        self._run = run
+        self._sources = sources
+        self._report = report
         self._left_out = left_out
         self._read: dict[int, Counter[str]] = {source.number: Counter() for source in sources}
         """The messages read of each process, by topic."""
@@ -182,10 +184,13 @@ class _Fold:
 
     def write(self, fresh: Path) -> Json:
         """Write the new recording; return the summary of the run."""
-        first, started = self._first, time.monotonic()
+        first = self._first
+        started = time.monotonic()
         facts = self._facts()
-        layout, packing = layout_of_run(facts, str(fresh)), recorded_packing(first.config)
-        self._layout, self.content = layout, Content(layout)
+        layout = layout_of_run(facts, str(fresh))
+        packing = recorded_packing(first.config)
+        self._layout = layout
+        self.content = Content(layout)
         with create_recording(fresh, layout) as file:
             file.add_metadata("run", facts)
             for name in first.file.metadata_names:
@@ -268,7 +273,8 @@ class _Fold:
         """Return the units of all processes in the order of the run."""
         for source in self._sources:
             for phase, units in source.units.items():
-                before, position = units["first"] - units["environment"], units["position"]
+                before = units["first"] - units["environment"]
+                position = units["position"]
                 trained = before if phase == "train" else position - before
                 units["key"] = self._keys(source, position, trained, before)
         units = np.concatenate([units for source in self._sources for units in source.units.values()])
@@ -303,7 +309,9 @@ class _Fold:
         buffers = {phase: StepBuffer(recorder, copied, phase) for phase in PHASES}
         begun = dict.fromkeys(PHASES, 0)
         extras = CopiedExtras(recorder, self._sources)
-        active, copied_steps, total = buffers["train"], 0, sum(self._totals.values())
+        active = buffers["train"]
+        copied_steps = 0
+        total = sum(self._totals.values())
         for unit in self._units:
             phase, source = PHASES[unit["phase"]], self._sources[unit["source"]]
             buffer = buffers[phase]
@@ -314,7 +322,8 @@ class _Fold:
             unit["new_reset"] = buffer.resets
             unit["new_step"] = buffer.progress[0]
             unit["new_position"] = recorder.position + buffer.pending
-            reset, read = source.reset(phase, unit), self._read[source.number]
+            reset = source.reset(phase, unit)
+            read = self._read[source.number]
             environment = source.environment + int(unit["environment"])
             buffer.copy_reset(reset, environment)
             self.content.take(topics.resets, reset)
@@ -361,7 +370,8 @@ class _Fold:
 
     def _messages(self, source: Source, topic: Topic) -> Iterator[tuple[int, bytes]]:
         """Yield position and payload in the run of a process's messages of a topic."""
-        phase, read = topic.phase, self._read[source.number]
+        phase = topic.phase
+        read = self._read[source.number]
         if topic.message in (schema.RESET_OPTIONS, schema.RESET_STATE):
             for attached in _of_resets(source, topic):
                 read[topic.name] += 1
@@ -417,7 +427,8 @@ class _Fold:
         trained = min(int(key), self._totals["train"])
         position = trained + evaluated
         if topic.message == schema.LOG:
-            seconds, level = position * STEP_NANOSECONDS / 1e9, log_level(fields["level"])
+            seconds = position * STEP_NANOSECONDS / 1e9
+            level = log_level(fields["level"])
             yield position, encode_log(fields["message"], seconds, level, fields["name"])
         elif {"phase", "step", "episode"} <= fields.keys():
             fields["step"] = evaluated if fields["phase"] == "eval" else trained
@@ -505,7 +516,8 @@ def left_out(source: Source, read: Mapping[str, int]) -> str:
     for topic in source.recording.topics:
         if topic.name.endswith("/episode") or topic in _OWN_TOPICS:
             continue
-        copied, recorded = read.get(topic.name, 0), source.stated.get(topic.name, 0)
+        copied = read.get(topic.name, 0)
+        recorded = source.stated.get(topic.name, 0)
         recorded = max([recorded, *(stop for _, stop in source.recording.lost.get(topic.name, []))])
         if topic.message is schema.STEP:
             copied = source.stops[topic.phase]

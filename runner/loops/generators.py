@@ -48,7 +48,8 @@ class _Generator:
 
     def before(self, steps: int) -> ResetState | None:
         """Return what a reset without a seed is going to depend on; None if it is not to be recorded."""
-        generator, last = getattr(self._base, self._name, None), self._generator
+        generator = getattr(self._base, self._name, None)
+        last = self._generator
         self._generator = generator
         if steps < self.due and generator is last:
             return None
@@ -67,7 +68,8 @@ class _Generator:
             state: what `before` returned; None for a reset with a seed.
             seed: the seed of the reset.
         """
-        generator, before = getattr(self._base, self._name, None), self._generator
+        generator = getattr(self._base, self._name, None)
+        before = self._generator
         self._generator = generator
         if seed is None and generator is not before and (drawn := seed_of(generator)) is not None:
             return ResetState(np_random_seed=drawn)

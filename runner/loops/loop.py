@@ -52,7 +52,8 @@ class Loop:
         self.started = self._loop_run.started
         self._recorder = self._loop_run.recorder
         self._recorder.when_full = self._write
-        self.mode, self._make_rows = mode, make_rows
+        self.mode = mode
+        self._make_rows = make_rows
         self._rows: dict[str, StepBuffer] = {}
         self.active: StepBuffer | None = None
         """The rows of the last step; None before any, and when the loop is closed."""
@@ -337,5 +338,6 @@ class Loop:
 
     def disown(self) -> None:
         """Leave the recording to the process that this one was just forked from."""
-        self.is_foreign, self.active = True, None
+        self.is_foreign = True
+        self.active = None
         self.lock = threading.RLock()  # a thread that does not exist here may have held the other one

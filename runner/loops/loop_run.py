@@ -49,7 +49,9 @@ class LoopRun:
         is_shard = options.join is not None
         client = connect(str(options.recordings)) if is_server(options.recordings) and not is_shard else None
         self.started = time.monotonic()
-        self.described, self._options, self._maker = described, options, maker
+        self.described = described
+        self._options = options
+        self._maker = maker
         self.own_makers: dict[str, EnvironmentMaker] = {}
         """How the environments of phases were made, where another one is recorded into the run; without the
         phases that are written."""
@@ -130,7 +132,9 @@ class LoopRun:
             del self.own_makers[phase]
 
     def _run_facts(self) -> dict[str, str]:
-        described, mdp, run = self.described, self.described.mdp, self.run
+        described = self.described
+        mdp = self.described.mdp
+        run = self.run
         content = {key: value for key, value in self._config.items() if key not in NOT_CONTENT}
         job = json.dumps(content | {"seed": self._options.seed}, sort_keys=True)
         facts = {"kind": described.kind, "spaces": json.dumps(described.recorded_spaces)}

@@ -169,7 +169,8 @@ def vector_maker_of(
         first: its first environment, or one made as that was; the vector itself if there is none.
     """
     layers = list(layers_of(envs))
-    base, reason = layers[-1], ""
+    base = layers[-1]
+    reason = ""
     mode = mode_of(base)
     if mode == "custom":
         maker = _custom_vector(base)
@@ -209,7 +210,8 @@ def vector_maker_of(
 
 def _custom_vector(base: object) -> EnvironmentMaker:
     """Return how a vector environment of its own class was made."""
-    spec, top = getattr(base, "spec", None), top_package(type(base).__module__)
+    spec = getattr(base, "spec", None)
+    top = top_package(type(base).__module__)
     try:
         if not isinstance(spec, EnvSpec):
             raise CannotBeMade(f"{class_name(base)} does not state how it was made")
@@ -250,7 +252,8 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         wrappers=tuple(map(class_name, layers[:-1])),
         agent_action_names={agent: names for agent, names in named.items() if names},
     )
-    top, assumed = top_package(module), []
+    top = top_package(module)
+    assumed = []
     has_function = callable(getattr(sys.modules.get(module), function, None))
     wrappers = [
         layer for layer in reversed(layers[:-1]) if not type(layer).__module__.startswith("pettingzoo.")
@@ -259,7 +262,9 @@ def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
         if is_of_rllib:
             if env.creator is None:
                 raise CannotBeMade("it is not known what made it")
-            entry_point, arguments, wrappers = entry_point_of(env.creator), env.arguments, []
+            entry_point = entry_point_of(env.creator)
+            arguments = env.arguments
+            wrappers = []
             top = top_package(entry_point)
         else:
             is_converted = getattr(outer, "env", None) is None and hasattr(outer, "aec_env")

@@ -58,7 +58,8 @@ class Picture:
         """Return the picture as PNG, the film as animated WebP."""
         if len(self.frames) == 1:
             return image_bytes(self.frames[0], "png")
-        buffer, images = io.BytesIO(), map(pillow().fromarray, self.frames)
+        buffer = io.BytesIO()
+        images = map(pillow().fromarray, self.frames)
         duration = max(1, round(1000 / self.fps))
         next(images).save(
             buffer, "webp", save_all=True, append_images=images, duration=duration, loop=0, method=0
@@ -93,7 +94,8 @@ def picture_of(value: Any, dataformats: str = "HWC", fps: float = 4.0) -> Pictur
         save(drawn := io.BytesIO(), format="png")
         value = pillow().open(drawn)
     if callable(convert := getattr(value, "convert", None)):
-        value, dataformats = np.asarray(convert("RGB")), "HWC"
+        value = np.asarray(convert("RGB"))
+        dataformats = "HWC"
     return Picture(_pixels(_numbers(value), dataformats), fps)
 
 
@@ -160,7 +162,8 @@ def _pixels(array: NDArray[Any], layout: str) -> NDArray[np.uint8]:
         raise ConfigError(f"picture: found shape {list(array.shape)}, expected the axes {layout}")
     for axis in "TNC":  # T before N: the films of a batch are tiled
         if axis not in layout:
-            array, layout = array[np.newaxis], axis + layout
+            array = array[np.newaxis]
+            layout = axis + layout
     array = _tiled(array.transpose([layout.index(axis) for axis in "NTHWC"]))
     if array.shape[-1] not in (1, 3, 4):
         raise ConfigError(f"picture: found {array.shape[-1]} channels, expected 1, 3 or 4")

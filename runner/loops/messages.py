@@ -40,7 +40,8 @@ _LONG_NAME: Final = 200
 
 def _info_text(value: Any, limit: int) -> str:
     """Return a field of an info as JSON of at most `limit` bytes."""
-    text, is_array = "", is_packed(value)
+    text = ""
+    is_array = is_packed(value)
     if is_array and value.nbytes <= limit:
         array = packed(value)
         data = array.pop("base64")  # has nothing to escape, so the encoder need not look at it
@@ -94,7 +95,9 @@ class Messages:
         run_folder: Path,
     ) -> None:
         self._run_folder = run_folder
-        self._loop, self._recorder, self._outcomes = loop, recorder, outcomes
+        self._loop = loop
+        self._recorder = recorder
+        self._outcomes = outcomes
         self._options = options
         self.has_logged = False
         """Whether anything was logged."""
@@ -230,7 +233,8 @@ class Messages:
 
     def _json_of(self, fields: Mapping[str, object]) -> str:
         """Return fields of an info as a JSON object; where one cannot be recorded the reason stands."""
-        pieces, size = [], 0
+        pieces = []
+        size = 0
         for key, value in fields.items():
             try:
                 text = _info_text(value, MAX_INFO_BYTES - size)
@@ -263,7 +267,8 @@ class Messages:
                     f"frames: found {pixels.dtype} of shape {list(pixels.shape)} from render(), expected "
                     "uint8 of [height, width, 3]."
                 )
-            kind, frame = self._options.frame_format, frame_id(phase, environment, is_reset)
+            kind = self._options.frame_format
+            frame = frame_id(phase, environment, is_reset)
             self._submit(topics_of(phase).frames, partial(image_bytes, pixels, kind), kind, frame)
 
     def picture(self, name: str, picture: Picture) -> None:

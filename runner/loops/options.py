@@ -189,7 +189,9 @@ def options_of(
     packing: Arguments = {name: options[name] for name in PACKING if name in options}
     if options.get("steps") == "actions":  # an index of messages would take more than they do
         packing = {"index": "chunk"} | packing
-    info, config, seed = options.get("info", ()), options.get("config"), options.get("seed")
+    info = options.get("info", ())
+    config = options.get("config")
+    seed = options.get("seed")
     if isinstance(info, str) and info != ALL_INFO:
         raise ConfigError(f"info: found {info!r}, expected a list of names, such as [{info!r}]")
     try:
@@ -201,7 +203,8 @@ def options_of(
         ) from error
     if options.get("frames_every"):
         pillow()
-    join, shard = options.pop("join", None), options.get("shard")
+    join = options.pop("join", None)
+    shard = options.get("shard")
     if join is None and shard is not None:
         raise ConfigError(f"shard: found {shard!r} without join, expected the run to join: join=RUN")
     if join is not None and (options.get("name") is not None or seed is not None or settings):

@@ -48,7 +48,9 @@ class Outcomes:
             self._recent = np.concatenate([self._recent, results])[-RECENT_EPISODES:]
         else:
             if self._evaluated_after != self._trained:
-                self._evaluated_after, self._trials, self._values = self._trained, 0, {}
+                self._evaluated_after = self._trained
+                self._trials = 0
+                self._values = {}
             self._trials += len(records)
             for metric in self._defined:
                 values = metric.of_trials(records).astype(np.float64)

@@ -81,7 +81,8 @@ class RecordedParallel(RecordedAlone):
 
     def _extras_by_name(self, values: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return the values of agents as `agent/name`."""
-        agents, by_name = self._loop.described.agents, dict[str, Value]()
+        agents = self._loop.described.agents
+        by_name = dict[str, Value]()
         for agent, named in values.items():
             if agent in agents and isinstance(named, Mapping):
                 by_name |= {f"{agent}/{name}": value for name, value in named.items()}

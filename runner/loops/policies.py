@@ -114,7 +114,8 @@ def play_checkpoint(
 
 
 def _play(rec: Any, act: Policy, seed: int, name: str) -> None:
-    observation, over = rec.reset(seed=seed)[0], False
+    observation = rec.reset(seed=seed)[0]
+    over = False
     while not over:
         with from_policy(name):
             action = act(observation)

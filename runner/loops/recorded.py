@@ -251,10 +251,12 @@ class Recorded:
 
     def _record_frames(self, resets: Any = False, ends: Flags | bool = False) -> None:
         """Record pictures of the environments that were reset or whose episode ended, now and then of all."""
-        n, frames_of = self._loop.described.environments, self._options.frames_of
+        n = self._loop.described.environments
+        frames_of = self._options.frames_of
         resets, is_due = np.broadcast_to(resets, n), np.broadcast_to(resets | np.asarray(ends), n)
         if self._until_frame <= 0 or resets.all():
-            self._until_frame, is_due = self._options.frames_every, np.ones(n, np.bool_)
+            self._until_frame = self._options.frames_every
+            is_due = np.ones(n, np.bool_)
         due = [i for i in (range(n) if frames_of is None else frames_of) if is_due[i]]
         images = self._pictures(due) if due else ()
         if images is None or len(images) < len(due):
@@ -269,7 +271,9 @@ class Recorded:
 
     def _record_into(self, loop: Loop, is_owner: bool = True) -> None:
         """Record into a loop; its owner closes it when the process ends, if not before."""
-        self._loop, self._messages, self._options = loop, loop.messages, loop.options
+        self._loop = loop
+        self._messages = loop.messages
+        self._options = loop.options
         if is_owner:
             weakref.finalize(self, _close_abandoned, loop)
 

@@ -50,7 +50,8 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         super().__init__(base.num_envs, base.observation_space, base.action_space)
         self.metadata = base.metadata
         self._given: object = None
-        self._watch, self._record_step = self.recorded._watch, self.recorded.record_step
+        self._watch = self.recorded._watch
+        self._record_step = self.recorded.record_step
         self.training_steps: Callable[[], int] | None = None
         """Returns after how many training steps the environments evaluate; called at their resets."""
 

@@ -60,7 +60,10 @@ class Source:
         is_placed: bool,
         stated: Mapping[str, int],
     ) -> None:
-        self.name, self.recording, self.number, self.environment = name, recording, number, environment
+        self.name = name
+        self.recording = recording
+        self.number = number
+        self.environment = environment
         self.stated = stated
         self.is_placed = is_placed
         self.n = recording.environments
@@ -88,7 +91,8 @@ class Source:
         for rows in table.rows():
             numbers = rows[schema.NUMBERED_BY[table.topic.message]]
             count = int(np.append(numbers == number + np.arange(len(rows)), False).argmin())
-            number, last = number + count, int(rows["step"][count - 1]) if count else last
+            number += count
+            last = int(rows["step"][count - 1]) if count else last
             if count < len(rows):
                 break
         return number, last
@@ -100,7 +104,8 @@ class Source:
 
     def _units(self, phase: str) -> Records:
         """Return the units of a phase, ordered by environment, without key and new numbers."""
-        table, stop = self.recording.phase(phase).resets, self.stops[phase]
+        table = self.recording.phase(phase).resets
+        stop = self.stops[phase]
         dtype = np.dtype([(name, "i8") for name in _RESET])
         parts = (block[list(_RESET)].astype(dtype) for block in table.rows())
         resets = np.concatenate([np.empty(0, dtype), *parts])
@@ -176,7 +181,8 @@ def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, st
     first = 0
     for folder in [run.folder, *shard_folders(run)]:
         name = folder.name if folder != run.folder else ""
-        part, path = run_in(folder), folder / RECORDING_FILE
+        part = run_in(folder)
+        path = folder / RECORDING_FILE
         stated = part.summary.messages if part is not None else {}
         try:
             check_up_to_cut(path)  # every byte is good, up to the end or to where it was cut off

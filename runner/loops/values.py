@@ -133,7 +133,9 @@ def check_phase(phase: str) -> None:
 
 def warn_user(message: str) -> None:
     """Warn of something in the user's loop, at the line of the loop and not in this package."""
-    level, frame = 1, sys._getframe()
+    level = 1
+    frame = sys._getframe()
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_PACKAGE):
-        level, frame = level + 1, frame.f_back
+        level += 1
+        frame = frame.f_back
     warnings.warn(message, RuntimeWarning, stacklevel=level)

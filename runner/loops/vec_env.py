@@ -28,15 +28,19 @@ class VecEnvVector(AnyVectorEnv):
     def __init__(self, base: Any) -> None:
         self.base = base
         self.num_envs = base.num_envs
-        self.single_observation_space, self.single_action_space = base.observation_space, base.action_space
-        self.observation_space, self.action_space = base.observation_space, base.action_space
+        self.single_observation_space = base.observation_space
+        self.single_action_space = base.action_space
+        self.observation_space = base.observation_space
+        self.action_space = base.action_space
         self.render_mode = base.render_mode
         self.mode = _MODES.get(type(base).__name__, "custom")
         """How the environments are put together, as in `VectorMaker`."""
         self.envs: list[object] = base.envs if self.mode == "sync" else []
         self.spec = base.get_attr("spec", indices=[0])[0] if self.mode == "async" else None
-        self.step_async, self._step_wait = base.step_async, base.step_wait
-        self._reset, self._close = base.reset, base.close
+        self.step_async = base.step_async
+        self._step_wait = base.step_wait
+        self._reset = base.reset
+        self._close = base.close
         self._rewards_dtype = base.buf_rews.dtype if self.mode == "sync" else None
         if self.mode == "sync":
             base.buf_rews = np.zeros(self.num_envs)

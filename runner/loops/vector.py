@@ -45,7 +45,8 @@ class RecordedVector(Recorded, _Wrapper):
         phase: str = "train",
     ) -> None:
         VectorWrapper.__init__(self, env)
-        self._mode, self._resets_within = mode, mode == AutoresetMode.SAME_STEP
+        self._mode = mode
+        self._resets_within = mode == AutoresetMode.SAME_STEP
         self._watch = watch
         first = next(iter(getattr(env.unwrapped, "envs", ())), None)  # none where they are in other processes
         layers = [*layers_of(env), *layers_of(first)]
@@ -72,7 +73,8 @@ class RecordedVector(Recorded, _Wrapper):
         Args:
             extras: arrays [N, ...], or lists of N texts or arrays of any lengths.
         """
-        watch, frames_every = self._watch, self._options.frames_every
+        watch = self._watch
+        frames_every = self._options.frames_every
         watch.steps += 1
         over = None
         states = None
@@ -141,7 +143,9 @@ class RecordedVector(Recorded, _Wrapper):
         self, *, seed: int | Sequence[int | None] | None = None, options: ResetOptions | None = None
     ) -> ResetResult:
         """Reset all environments, or those of `options["reset_mask"]`, and record it."""
-        n, mask, given = self.env.num_envs, None, options
+        n = self.env.num_envs
+        mask = None
+        given = options
         if isinstance(options, Mapping) and "reset_mask" in options:
             mask = options["reset_mask"]
             given = {key: value for key, value in options.items() if key != "reset_mask"} or None
