@@ -212,7 +212,9 @@ def _logged(recording: Recording, axis: Axis) -> tuple[Floats, Floats]:
                 steps.append(step)
                 values.append(value)
             if len(steps) > _MAX_KNOWN:
-                steps, values, every = steps[1::2], values[1::2], 2 * every
+                steps = steps[1::2]
+                values = values[1::2]
+                every = 2 * every
     if not steps and axis is UPDATES:
         raise RecordingError(
             f"{recording.path}: has no axis of updates: nothing was logged as {' or '.join(UPDATE_NAMES)}; "

@@ -42,7 +42,8 @@ Step = np.void | Message
 
 def shortcomings(recording: Recording) -> list[str]:
     """Return what is missing from a recording, a sentence each; nothing if it is complete."""
-    sentences, status = [], recording.status
+    sentences = []
+    status = recording.status
     if damage := damage_of(run_at(recording.path), recording):
         sentences.append(damage)
     elif status != "finished":

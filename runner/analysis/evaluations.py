@@ -189,7 +189,8 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
     The evaluations of a loop are its evaluation episodes between two training episodes; values that are not
     finite are left out of their means.
     """
-    agents, events = recording.agents, recording.environment["event_names"]
+    agents = recording.agents
+    events = recording.environment["event_names"]
     if recording.eval.has_metrics:
         return [evaluation_record(metrics, agents, events) for metrics in recording.eval.all_metrics()]
     trials = recording.eval.episodes.array()
@@ -325,10 +326,12 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
     fixed = len(columns)
     for kind, names in sorted(kinds.items(), key=lambda own: (own[1][0] not in success_events, len(own[1]))):
         counts = [[record.events[name] for name in names] for record in records]
-        heading, cells = spoken(kind), [str(sum(own)) for own in counts]
+        heading = spoken(kind)
+        cells = [str(sum(own)) for own in counts]
         if names[0] in success_events and len(names) > 1:
             agents = [name.rpartition(".")[0].rpartition("_")[2] for name in names]
-            heading, cells = f"{heading} {'/'.join(agents)}", ["/".join(map(str, own)) for own in counts]
+            heading = f"{heading} {'/'.join(agents)}"
+            cells = ["/".join(map(str, own)) for own in counts]
         columns[heading.replace(" ", "\n", 1)] = cells
     events = [*columns][fixed:]
     spare = sorted(events, key=lambda heading: (heading != "pickup", -events.index(heading)))

@@ -88,9 +88,11 @@ class _QuantityCounts:
         usable = values[is_usable(values)]
         self.left_out += len(values) - len(usable)
         if len(usable):
-            self.low, self.high = min(self.low, float(usable.min())), max(self.high, float(usable.max()))
-            for value in self.distinct if self.is_distinct else ():
-                usable = usable[usable != value]  # faster than sorting a block of the same few values
+            self.low = min(self.low, float(usable.min()))
+            self.high = max(self.high, float(usable.max()))
+            if self.is_distinct:
+                for value in self.distinct:
+                    usable = usable[usable != value]  # faster than sorting a block of the same few values
             if self.is_distinct and len(usable):
                 self.distinct.update(np.unique(usable)[: _MAX_DISTINCT + 1].tolist())
 

@@ -39,7 +39,8 @@ def mark_steps(
 ) -> list[Mark]:
     """Mark steps of a run with the same text; arguments and errors as for `mark`."""
     run.require_folder()
-    text, names = text.strip(), tuple(sorted(set(tags)))
+    text = text.strip()
+    names = tuple(sorted(set(tags)))
     with opened(run) as recording:
         existing = [_existing(recording, EpisodeRef.parse(at)) for at in steps]
     check_tags(names)

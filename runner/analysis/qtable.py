@@ -149,7 +149,8 @@ def tables_of(
         step = step_of_episode(recording, episode)
     if not recording.has_tables:
         return _recorded(recording, step, state)
-    mdp, step = recording.mdp, last_step(recording) if step is None else step
+    mdp = recording.mdp
+    step = last_step(recording) if step is None else step
     number = None if state is None else state_of(mdp, state)  # before the tables are replayed
     replay = TableReplay(recording, step)
     tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]

@@ -404,7 +404,8 @@ def _mean_episodes(
     recording: Recording, moments: Positions, edges: Floats, not_finite: Counter[str]
 ) -> dict[int, Readings]:
     """Return mean length and return of the training episodes that end in each stretch, by its number."""
-    agents, bins = len(recording.agents), len(edges) - 1
+    agents = len(recording.agents)
+    bins = len(edges) - 1
     count, length = np.zeros(bins), np.zeros(bins)
     totals, usable_returns = np.zeros((bins, agents)), np.zeros((bins, agents))
     for block in recording.train.episodes.blocks():
@@ -425,7 +426,8 @@ def _mean_episodes(
         for k in np.flatnonzero(count).tolist()
     }
     if not by_stretch and recording.train.steps:  # no episode ended: the unfinished ones
-        steps, total = 0, np.zeros(1)
+        steps = 0
+        total = np.zeros(1)
         for block in recording.train.steps.rows():
             steps += len(block)
             total = total + block["rewards"].sum(axis=0, dtype=np.float64)

@@ -126,7 +126,8 @@ class RunDetails(Answer):
 
     def facts(self) -> dict[str, object]:
         """Return everything but the series, as JSON can hold it."""
-        run, summary = self.run, self.run.summary
+        run = self.run
+        summary = self.run.summary
         return {
             "run_id": run.run_id,
             "name": run.name,
@@ -209,8 +210,11 @@ class RunDetails(Answer):
         return sections if self.provenance else sections[:2]
 
     def _identity(self) -> dict[str, str]:
-        run, summary, clock = self.run, self.run.summary, self.clock
-        origin, environment = origin_in(self.config), str(self.environment or "")
+        run = self.run
+        summary = self.run.summary
+        clock = self.clock
+        origin = origin_in(self.config)
+        environment = str(self.environment or "")
         folder = f"{run.folder}{os.sep}"
         steps = ""
         if environment and None not in (self.train_steps, self.episodes, self.eval_steps):
@@ -296,7 +300,8 @@ def describe_recording(run: Run, recording: Recording, with_results: bool = True
     Raises:
         RecordingError: it is damaged.
     """
-    config, is_loop = run.file.config, not recording.can_train_again
+    config = run.file.config
+    is_loop = not recording.can_train_again
     done = recording.done() | {key: run.summary[key] for key in recording.done() if key in run.summary}
     spaces = recording.spaces if is_loop and has_environment(recording.config) else {}
     details = RunDetails(

@@ -83,7 +83,8 @@ def branch_training(
         RunnerError: the episodes before the branch are not those of the parent.
         StorageError: the folder of the new run cannot be written.
     """
-    run_name, folder = branch_name(run, name), recordings_folder(recordings)
+    run_name = branch_name(run, name)
+    folder = recordings_folder(recordings)
     with open_recording(run.recording) as recording:
         job, where = branch_job(recording, at, action, overrides, episodes)
         fresh = create_run(folder, job.config, job.seed, run_name, parent=run)
@@ -104,7 +105,8 @@ def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: St
     Raises:
         RunnerError: the episodes before the branch are not those of the parent.
     """
-    step, packing = job.config.branches[-1].step, from_mapping(parent.config).recording.packing
+    step = job.config.branches[-1].step
+    packing = from_mapping(parent.config).recording.packing
     with unless_empty(run):
         packed = PackedChunks.before(parent, step) if job.config.recording.packing == packing else None
         initial = recorded_tables(parent)
@@ -125,7 +127,8 @@ def branch_job(
     parent, taken = from_mapping(recording.config), training_steps(recording)
     is_end = at == EpisodeRef.parse(taken)  # from there on, training can be longer
     step = taken if is_end else training_step(recording, at)
-    where, now = reference_to(recording, step), parent.from_step(step)
+    where = reference_to(recording, step)
+    now = parent.from_step(step)
     total = [] if episodes is None else [f"episodes={episodes}"]
     wanted = from_mapping(now.to_mapping(), [*overrides, *total])
     if wanted.episodes <= where.episode:
@@ -139,7 +142,8 @@ def branch_job(
         actions=chosen_actions(recording.mdp, action),
         settings=_changes(now, wanted),
     )
-    seed, given = recording.seed or 0, wanted.to_mapping()
+    seed = recording.seed or 0
+    given = wanted.to_mapping()
     branches = [each.model_dump(mode="json") for each in (*parent.branches, branch)]
     changes = {key: given[key] for key in OF_THE_WHOLE} | {"seeds": [seed], "branches": branches}
     return Job(from_mapping(parent.to_mapping() | changes), seed), where

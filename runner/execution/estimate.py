@@ -19,8 +19,10 @@ from runner.config import ExperimentConfig
 from runner.util.codecs import CODECS
 
 CLUMSY_EPISODES: Final = 500
-CLUMSY, SKILLED = 0.5, 0.1
-"""Typical length of an episode as a share of the step limit: at first and in trials, and later."""
+CLUMSY: Final = 0.5
+"""Typical length of an episode as a share of the step limit, at first and in trials."""
+SKILLED: Final = 0.1
+"""The same share for later episodes."""
 LEAST: Final = 1 / 6
 """The steps of an agent that learns quickly, as a share of the typical figure."""
 INDEX_BYTES: Final = 16

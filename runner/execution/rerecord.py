@@ -101,7 +101,8 @@ def rerecord(
             )
         if holds_steps(current):
             return current
-        fresh, started = current.recording.with_suffix(".rerecording"), time.monotonic()
+        fresh = current.recording.with_suffix(".rerecording")
+        started = time.monotonic()
         try:
             with storage_errors(fresh):
                 fresh.unlink(missing_ok=True)
@@ -110,8 +111,10 @@ def rerecord(
         finally:
             fresh.unlink(missing_ok=True)
         with open_recording(current.recording) as recording:
-            config, summary = recording.config, recorded_facts(recording)["summary"]
-        seconds, size = round(time.monotonic() - started, 3), current.recording.stat().st_size
+            config = recording.config
+            summary = recorded_facts(recording)["summary"]
+        seconds = round(time.monotonic() - started, 3)
+        size = current.recording.stat().st_size
         return current.update(config=config, summary=summary | {"seconds": seconds, "bytes": size})
 
 
@@ -303,7 +306,8 @@ def _whole_steps(recording: Recording, replay: Replay, piece: Piece, states: Int
                 "the state of the random generators before it was not recorded. Whole steps are recorded of "
                 f"all episodes or of none; `dualtaxi verify {recording.run_id}` reruns the others."
             )
-    are_steps, begun = is_taken(records), []
+    are_steps = is_taken(records)
+    begun = []
     for reset in piece.resets:
         row = reset.step - piece.first + reset.environment
         if row >= len(records) or are_steps[row]:

@@ -288,7 +288,8 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
     from runner.execution.session import Session, recorder_for
     from runner.learning.learner import Learner
 
-    env, complete = job.config.env, recording.status == "finished"
+    env = job.config.env
+    complete = recording.status == "finished"
     verification = Verification(
         recording.path,
         verdict="reproduced" if complete else "interrupted",
@@ -353,7 +354,8 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
 
 def differing_environment(recording: Recording, mdp: Mdp) -> Differences:
     """Return which arrays of an environment differ from the recorded ones."""
-    then, now = recording.mdp.arrays(), mdp.arrays()
+    then = recording.mdp.arrays()
+    now = mdp.arrays()
     return {
         f"environment.{name}": ("as recorded", "another")
         for name in sorted({*then, *now})
@@ -558,7 +560,8 @@ def _rerun(path: Path, found: Verification, sample: int | None, trust: bool) -> 
         else:
             found = _rerun_sample(recording, found, sample, trust)
         if found.difference is not None:
-            finding, reason = str(found.difference), why_uncertain(recording, trust)
+            finding = str(found.difference)
+            reason = why_uncertain(recording, trust)
             found = replace(found, verdict="differs", finding=finding, reason=reason)
     if found.verdict == "consistent":
         found = replace(found, verdict="reproduced")
@@ -687,7 +690,8 @@ def _compare_names(recording: Recording, learners: list[str] | None = None) -> N
     Raises:
         Diverged: two of them differ.
     """
-    described, config = recording.environment, recording.config.get("env")
+    described = recording.environment
+    config = recording.config.get("env")
     for key, name in (("env_id", "id"), ("kwargs", "kwargs")):
         expected = config.get(name) if isinstance(config, Mapping) else None
         if described.get(key) != expected:

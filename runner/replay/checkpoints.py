@@ -91,7 +91,8 @@ class Checkpoints:
 
     def _load(self, step: int, shapes: Sequence[tuple[int, ...]]) -> list[Floats] | None:
         """Return the tables of a checkpoint; None if it is damaged, and then it is removed."""
-        path, sizes = self._path(step), [math.prod(shape) for shape in shapes]
+        path = self._path(step)
+        sizes = [math.prod(shape) for shape in shapes]
         try:
             data = path.read_bytes()
             if zstandard.frame_content_size(data) != 8 * sum(sizes):

@@ -182,14 +182,16 @@ class Stepper:
         """Whether `reset` may get options that name something."""
         self.ends_once = False
         """Whether an episode that terminated is not truncated too."""
-        self._recording, self._has_states = recording, recording.has_states
+        self._recording = recording
+        self._has_states = recording.has_states
         self.observation_space, self.action_space = self._spaces()
         self._check_spaces()
         leaf = StateValues if self._has_states else LeafValues
         space = self.observation_space
         self._observation = SpaceValues(space, "observation", leaf=leaf, is_game=self.is_game)
         self._after = "next_state" if self._has_states else "next_observation"
-        topics, agents = recording.train.topics, recording.agents
+        topics = recording.train.topics
+        agents = recording.agents
         steps, resets = map(recording.layout.rows, (topics.steps, topics.resets))
         ends = [("rewards", "<f8", (len(agents),)), ("terminated", "?"), ("truncated", "?")]
         masks = [(f"agents_{name}", "<u4") for name in _ENDS[1:] if len(agents) > 1]
@@ -230,7 +232,10 @@ class Stepper:
 
     def _take(self, stop: int, returned: Returned) -> None:
         """Take the steps up to `stop`; `returned.done` is right also if one fails."""
-        step, actions, fill, draws = self.env.step, self._actions, self._fill, self.draws
+        step = self.env.step
+        actions = self._actions
+        fill = self._fill
+        draws = self.draws
         first = k = returned.done // self.n
         try:
             for k in range(first, stop):
@@ -283,8 +288,10 @@ class Stepper:
             ends: [rows], for rewards and ends.
             got: [rows], for what games return besides.
         """
-        put, pack = filler(self._observation, seen), _ENDING.pack_into
-        data, size = ends.view(np.uint8).data, _ENDING.size
+        put = filler(self._observation, seen)
+        pack = _ENDING.pack_into
+        data = ends.view(np.uint8).data
+        size = _ENDING.size
 
         def fill(row: int, result: Any) -> None:
             observation, reward, terminated, truncated, _ = result
@@ -313,7 +320,8 @@ class Stepper:
 
     def _decoded(self, actions: Array) -> Iterator[Value]:
         """Yield actions of varying size."""
-        description, where = self._recording.spaces["action"], f"{self._recording.path}: an action"
+        description = self._recording.spaces["action"]
+        where = f"{self._recording.path}: an action"
         return (decode(description, data, where) for data in actions)
 
     def _check_spaces(self) -> None:
@@ -380,7 +388,8 @@ class GameStepper(Stepper):
         return game_spaces(self.env)
 
     def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:
-        put, agents = filler(self._observation, seen), self.env.possible_agents
+        put = filler(self._observation, seen)
+        agents = self.env.possible_agents
         masks = [got[name] for name in got.dtype.names or () if name.startswith("agents_")]
 
         def fill(row: int, result: Any) -> None:
@@ -401,7 +410,8 @@ class GameStepper(Stepper):
 
     def actions(self, rows: Records) -> Sequence[Value]:
         """Return the actions of recorded steps as the environment takes them."""
-        agents, column = self.env.possible_agents, rows["action"]
+        agents = self.env.possible_agents
+        column = rows["action"]
         by_agent: Any = self.action_space
         acting = [
             [agent for i, agent in enumerate(agents) if acted >> i & 1] for acted in rows["acted"].tolist()
@@ -427,7 +437,8 @@ class VectorStepper(Stepper):
     def __init__(self, env: Any, recording: Recording, autoreset: str, drawn: int = 0) -> None:
         self.n = recording.environments
         super().__init__(env, recording)
-        self._autoreset, self._drawn = autoreset, drawn
+        self._autoreset = autoreset
+        self._drawn = drawn
         self._observation = SpaceValues(self.observation_space, "observation")
         self._over = np.zeros(self.n, np.bool_)
         """[n]: whether the episode of an environment ended with the last step."""
@@ -440,7 +451,8 @@ class VectorStepper(Stepper):
         return spaces_of_one(self.env)
 
     def _reset(self, step: int, resets: Sequence[RecordedReset], returned: Returned) -> None:
-        are_steps, explicit = is_taken(returned.rows[step * self.n :][: self.n]), []
+        are_steps = is_taken(returned.rows[step * self.n :][: self.n])
+        explicit = []
         automatic = list[RecordedReset]()
 
         def add(reset: RecordedReset) -> None:
@@ -494,7 +506,8 @@ class VectorStepper(Stepper):
 
     def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:  # noqa: ARG002
         rows = seen.reshape(len(seen) // self.n, self.n, *seen.shape[1:])
-        put, put_last = filler(self._observation, rows, (self.n,)), filler(self._observation, seen)
+        put = filler(self._observation, rows, (self.n,))
+        put_last = filler(self._observation, seen)
         columns = [ends[name].reshape(-1, self.n) for name in _ENDS]
 
         def fill(step: int, result: Any) -> None:
@@ -514,7 +527,9 @@ class VectorStepper(Stepper):
 
     def actions(self, rows: Records) -> Sequence[Value]:
         """Return the actions of all environments as the vector takes them, for each of its steps."""
-        space, n, column = self.action_space, self.n, np.array(rows["action"])
+        space = self.action_space
+        n = self.n
+        column = np.array(rows["action"])
         if column.dtype.hasobject:
             values = super().actions(rows)
             rooms: Any = (create_empty_array(space, n) for _ in range(0, len(values), n))
@@ -589,10 +604,13 @@ class Replay:
         """The number of the first step after which pictures are drawn."""
         self.drawn = 0
         """The environment that is drawn, of a vector that is stepped as a whole."""
-        self._recording, self._trust, self._make = recording, trust, make
+        self._recording = recording
+        self._trust = trust
+        self._make = make
         self._tolerance = tolerance or None
         self._digests = {phase: EpisodeDigests() for phase in schema.PHASES}
-        self._report, self.render = report, render
+        self._report = report
+        self.render = render
         self._last_step_time = last_step_time(recording)
         """When the steps end that were recorded: later resets came after steps that were lost."""
         self._steppers: dict[_Key, Stepper] = {}
@@ -631,7 +649,8 @@ class Replay:
             environment: one of `environments`; `ALL` yields the steps of each in turn.
             start: where to begin if it was not rerun before; None for the first reset that is known.
         """
-        phase, n = piece.phase, self._recording.environments if environment == ALL else 1
+        phase = piece.phase
+        n = self._recording.environments if environment == ALL else 1
         rows, resets = self.recorded_steps(piece, environment)
         begin = 0
         if not self.is_known(phase, environment):
@@ -647,7 +666,8 @@ class Replay:
         drawn = (
             int(np.searchsorted(rows["step"].astype(np.int64), self.draw_from)) // n if draws else stop + 1
         )
-        stepper.draws, end = False, begin
+        stepper.draws = False
+        end = begin
         while end < stop or resets:
             if end >= drawn and not stepper.draws:
                 stepper.draws, self._max_rows = True, 1  # the first picture is to come at once
@@ -657,8 +677,9 @@ class Replay:
             block = rows[begin * n : end * n]
             here = [(row - begin, reset) for row, reset in resets if row < end or end == stop]
             resets = resets[len(here) :]
-            for _, reset in () if stepper.is_trusted else here:
-                require_plain("option of a reset,", reset.given.options or {}, {})
+            if not stepper.is_trusted:
+                for _, reset in here:
+                    require_plain("option of a reset,", reset.given.options or {}, {})
             started = time.monotonic()
             returned = stepper.run(block, here)
             self._adapt(time.monotonic() - started, returned.frames if stepper.draws else None)
@@ -676,7 +697,9 @@ class Replay:
 
         Steps at which a vector only reset the environment are left out: the reset stands for them.
         """
-        n, rows, first = self._recording.environments, piece.rows, piece.first
+        n = self._recording.environments
+        rows = piece.rows
+        first = piece.first
         resets = [reset for reset in piece.resets if environment in (ALL, reset.environment)]
         resets = [reset for reset in resets if reset.time <= self._last_step_time]
         if environment == ALL:
@@ -727,7 +750,8 @@ class Replay:
         Raises:
             CannotRedo: it cannot be made, or has other spaces.
         """
-        key, maker = self._key(phase, environment), self._recording.phase(phase).maker_of(environment)
+        key = self._key(phase, environment)
+        maker = self._recording.phase(phase).maker_of(environment)
         if key in self._steppers:
             return self._steppers[key]
         env, is_trusted = self._environment(maker, environment)
@@ -758,13 +782,16 @@ class Replay:
         """Return the steps of an environment up to the first difference."""
         rows, got, starts, done = returned.rows, returned.got, returned.starts, returned.done
         first = self._first_row(phase, environment, rows[:done], got[:done])
-        failed, differing = self._first_start(starts), None
+        failed = self._first_start(starts)
+        differing = None
         if first is not None and (failed is None or starts[failed].row > first[0]):
             row, name = first
-            done, starts = row + 1, [start for start in starts if start.row <= row]
+            done = row + 1
+            starts = [start for start in starts if start.row <= row]
             differing = _place_of(rows[row]), self._values(name, rows[row], got[row])
         elif failed is not None:
-            done, starts = starts[failed].row, starts[: failed + 1]
+            done = starts[failed].row
+            starts = starts[: failed + 1]
             _, reset, value, _ = starts[failed]
             part, was, now = self._observation(reset.observation, value)
             differing = _place_of_reset(reset), (f"first {part}", was, now)
@@ -794,14 +821,16 @@ class Replay:
             return None
         values = np.empty((2, len(starts)), self._recording.train.resets.row_dtype["observation"])
         for k, start in enumerate(starts):
-            values[0, k], values[1, k] = start.reset.observation, start.got
+            values[0, k] = start.reset.observation
+            values[1, k] = start.got
         return first_differing_row(values[0], values[1], self._tolerance)
 
     def _first_digest(self, phase: str, environment: int, rows: Records, got: Records) -> int | None:
         """Return the first row at which the episode so far has another digest than was recorded."""
         if not len(rows) or "digest" not in (rows.dtype.names or ()):
             return None
-        after, t = got[after_step(got.dtype)], rows["t"]
+        after = got[after_step(got.dtype)]
+        t = rows["t"]
         recorded = np.ascontiguousarray(rows["digest"])
         marked = set(np.flatnonzero(recorded.view(np.uint8).reshape(len(rows), -1).any(axis=1)).tolist())
         ends = got["terminated"], got["truncated"]
@@ -851,7 +880,9 @@ def _place_of_reset(reset: RecordedReset) -> tuple[int, int, int]:
 
 def _failed_at(returned: Returned, text: str) -> tuple[int, int, int]:
     """Return where an environment raised an error: in the first row or reset that it did not return from."""
-    rows, done, waiting = returned.rows, returned.done, returned.resets[len(returned.starts) :]
+    rows = returned.rows
+    done = returned.done
+    waiting = returned.resets[len(returned.starts) :]
     if waiting and (waiting[0][0] <= done or done >= len(rows)):
         return _place_of_reset(waiting[0][1])
     if not len(rows):  # another environment of the vector raised it

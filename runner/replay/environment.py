@@ -274,7 +274,9 @@ def _episode(
         _Astray: steps before the episode differ, and it was not begun at the beginning of the recording.
         CannotRedo: the state of the random generators at its beginning is not known.
     """
-    reset, is_whole, is_begun = target.reset, ALL in replay.environments, False
+    reset = target.reset
+    is_whole = ALL in replay.environments
+    is_begun = False
     environment = ALL if is_whole else reset.environment
     replay.drawn = reset.environment
     for piece, is_target in _approach(recording, target, start, is_whole):
@@ -302,14 +304,16 @@ def _approach(
     recording: Recording, target: _Target, start: RecordedReset | None, is_whole: bool
 ) -> Iterator[tuple[Piece, bool]]:
     """Yield pieces from a reset up to the end of an episode, each with whether it belongs to the episode."""
-    reset, is_reached = target.reset, False
+    reset = target.reset
+    is_reached = False
     for piece in pieces(recording, schema.PHASES, 0 if start is None else start.time, target.stop_time):
         is_of_phase = piece.phase == reset.phase
         numbers = [other.number for other in piece.resets if is_of_phase]
         if reset.number in numbers:
             # The environments of a vector that are reset with the same step stay together.
             at = [other.step for other in piece.resets].index(reset.step)
-            at, rows = at if is_whole else numbers.index(reset.number), reset.step - piece.first
+            at = at if is_whole else numbers.index(reset.number)
+            rows = reset.step - piece.first
             yield piece.part(0, rows, piece.resets[:at]), False
             yield piece.part(rows, len(piece.rows), piece.resets[at:]), True
             is_reached = True
@@ -323,14 +327,19 @@ def _held(blocks: Iterator[RerunSteps], is_last: bool) -> Iterator[RerunSteps]:
     Raises:
         _Astray: they do not, and there is another place to begin.
     """
-    held, count, size, end = list[RerunSteps](), 0, 0, time.monotonic() + _HELD_SECONDS
-    for steps in () if is_last else blocks:
-        if steps.difference is not None:
-            raise _Astray
-        held.append(steps)
-        count, size = count + len(steps), size + sum(frame.nbytes for frame in steps.frames)
-        if count >= _HELD_STEPS or size >= _HELD_BYTES or time.monotonic() >= end:
-            break  # what was yielded cannot be taken back
+    held = list[RerunSteps]()
+    count = 0
+    size = 0
+    end = time.monotonic() + _HELD_SECONDS
+    if not is_last:
+        for steps in blocks:
+            if steps.difference is not None:
+                raise _Astray
+            held.append(steps)
+            count += len(steps)
+            size += sum(frame.nbytes for frame in steps.frames)
+            if count >= _HELD_STEPS or size >= _HELD_BYTES or time.monotonic() >= end:
+                break  # what was yielded cannot be taken back
     while held:
         yield held.pop(0)
     yield from blocks

@@ -53,7 +53,8 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
 
 def _watch_of(replay: TableReplay, state: int) -> Watch:
     """Return what to watch to see each change of a state's values, of one learner after the other."""
-    model, states = replay.learner.model, replay.learner.mdp.states
+    model = replay.learner.model
+    states = replay.learner.mdp.states
     offsets = zip(replay.learner.tables.offset, model.width, strict=True)
     cells = [offset + state * width + np.arange(width) for offset, width in offsets]
     return Watch(

@@ -185,11 +185,13 @@ def _by_reset(messages: Iterator[M]) -> Callable[[int], M | None]:
 
 def resets_back(recording: Recording, phase: str, time: int) -> Iterator[RecordedReset]:
     """Yield the resets up to a time, from the last to the first, reading no more than needed."""
-    width, stop = 1_000 * STEP_NANOSECONDS, time
+    width = 1_000 * STEP_NANOSECONDS
+    stop = time
     while stop >= 0:
         start = max(stop - width, 0)
         yield from reversed(list(resets_of(recording, phase, start, stop)))
-        stop, width = start - 1, 4 * width
+        stop = start - 1
+        width = 4 * width
 
 
 def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
@@ -224,7 +226,8 @@ def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
 
 def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Piece]:
     """Yield the pieces of one phase; one ends where steps of the other phase come between its own."""
-    table, known = recording.phase(phase).steps, environment_count(recording)
+    table = recording.phase(phase).steps
+    known = environment_count(recording)
     resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
     blocks = aligned(_blocks(recording, phase, start_time, stop_time), recording.environments)
@@ -234,7 +237,8 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
         rows = (whole for block in rows if len(whole := block[block["step"] < stop]))
     nothing = np.empty(0, table.row_dtype)
     for block in rows:
-        first, time = int(block["step"][0]), int(block["log_time"][0]) - STEP_NANOSECONDS
+        first = int(block["step"][0])
+        time = int(block["log_time"][0]) - STEP_NANOSECONDS
         early = []
         while waiting is not None and waiting.time < time and waiting.step <= first:
             early.append(waiting)
@@ -262,7 +266,8 @@ def _without_steps(phase: str, resets: Iterable[RecordedReset], nothing: Records
 
 def _blocks(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Records]:
     """Yield the steps of a phase in blocks, each without steps of the other phase in between."""
-    table, stop = recording.phase(phase).steps, FOREVER if stop_time is None else stop_time + 1
+    table = recording.phase(phase).steps
+    stop = FOREVER if stop_time is None else stop_time + 1
     # A block of actions alone may have more steps than fit into memory when they are whole.
     width = 1 if table.dtype is None else table.dtype.itemsize * recording.environments
     rows = max(_BLOCK_BYTES // width, 1) * recording.environments
@@ -306,5 +311,6 @@ def are_separate(recording: Recording) -> bool:
             is_continued = piece.rows["t"][0] > 0 and not any(r.step == piece.first for r in piece.resets)
             if (phase and is_continued) or changes == _PHASE_CHANGES:
                 return bool(is_continued)
-            phase, changes = piece.phase, changes + 1
+            phase = piece.phase
+            changes += 1
     return False

@@ -207,7 +207,8 @@ def _handed_on(node: ast.AST) -> set[str]:
 
 def _loaded(statement: ast.stmt, operation: str = "LOAD_") -> set[str]:
     """Return the global names that a statement uses, also in functions that it defines."""
-    todo, names = [compile(ast.Module([statement], []), "", "exec")], set()
+    todo = [compile(ast.Module([statement], []), "", "exec")]
+    names = set()
     for code in todo:
         todo += [constant for constant in code.co_consts if isinstance(constant, CodeType)]
         names |= {

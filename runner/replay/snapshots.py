@@ -64,7 +64,8 @@ class DerivedTables(Generic[S]):
         if not 0 <= table < len(tables) or tables[table].shape != values.shape:
             return  # it is archived as it is, but nothing can be derived from it
         if step != replay.step:
-            replay.step, self._known = step, False
+            replay.step = step
+            self._known = False
             self._given.clear()
         self._given.add(table)
         self._known |= len(self._given) == len(tables)

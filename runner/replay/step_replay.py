@@ -167,7 +167,8 @@ class StepReplay:
         while at < len(steps):
             segment = self.learner.segment_at(self.step)
             stop = min(len(steps), at + segment.stop - self.step)
-            learner, part = self.learner, slice(at, stop)
+            learner = self.learner
+            part = slice(at, stop)
             yield (learner.seed, learner.model, learner.tables, segment.rules, records[part]), part
             self.step += stop - at
             self._remembered = self.step

@@ -120,7 +120,8 @@ def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> Records:
             raise RecordingError(
                 f"{path}: steps of {schema.PHASE_NAMES[phase]} episode {episode:,} were lost."
             )
-        parts, states = [np.empty(0, recording.layout.rows(recorded.table.topic))], np.zeros(1, np.int64)
+        parts = [np.empty(0, recording.layout.rows(recorded.table.topic))]
+        states = np.zeros(1, np.int64)
         for steps in rerun_in_child(path, phase, [episode]):
             parts.append(whole_records(recording, steps))
             put_states(recording, parts[-1], states, [(start.row, start.reset) for start in steps.starts])
@@ -211,14 +212,17 @@ def recorded_frames(
         for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))
         if frame_place(frame)[0] == recorded.place
     )
-    frame, following = None, next(frames, None)
+    frame = None
+    following = next(frames, None)
     after_steps = (time + later for time in chain([earliest], times))
     for t, time in enumerate(after_steps if first else chain([earliest], after_steps), first):
         # After the reset there may be several frames, the last one shows the state; after a step one.
         while following is not None and following[0] < time:
-            frame, following = following[2], next(frames, None)
+            frame = following[2]
+            following = next(frames, None)
         if t and following is not None and following[0] == time and not following[1]:
-            frame, following = following[2], next(frames, None)
+            frame = following[2]
+            following = next(frames, None)
         if frame is None:
             raise RecordingError(f"{recording.path}: the first frame of {phase} episode {episode} is lost.")
         if t >= start:

@@ -129,12 +129,13 @@ class TableReplay(StepReplay):
             raise RecordingError(f"a replay at step {first} cannot go back to {stop}; start another.")
         if stop > max(self._recorded, first):
             raise self._missing(stop)
-        for block in self._recording.train.steps.blocks(first, stop) if stop > first else ():
-            for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
-                yield part
-                is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
-                if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
-                    self._checkpoints.save(self.step, self.learner.snapshot())
+        if stop > first:
+            for block in self._recording.train.steps.blocks(first, stop):
+                for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
+                    yield part
+                    is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
+                    if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
+                        self._checkpoints.save(self.step, self.learner.snapshot())
         self._checkpoints.prune()
         if self.step < stop:
             raise self._lost(stop)

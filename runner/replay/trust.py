@@ -317,7 +317,8 @@ def is_left_out(entry_point: str) -> bool:
 
 def why_not_imported(module: str, trust: bool) -> str:
     """Return why a module may not or cannot be imported; empty if it can be tried."""
-    path, root = module.partition(":")[0], top_package(module)
+    path = module.partition(":")[0]
+    root = top_package(module)
     if root == MAIN:
         return why_not_defined()
     if not trust and root not in packages() and path not in WRAPPERS:

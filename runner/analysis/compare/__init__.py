@@ -201,7 +201,9 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
     if moment.kind == "last":
         notes += uneven_ends(groups, metric, line)
     if moment.level is not None:
-        better, title, unit = False, f"{title}: first at {moment.level:g}", moment.axis.label
+        better = False
+        title = f"{title}: first at {moment.level:g}"
+        unit = moment.axis.label
         for label, values in present.items():
             reached = sum(value < statistics.NEVER for value in values.by_seed.values())
             notes.append(f"{label}: {reached} of {len(values.by_seed)} seeds reach it")

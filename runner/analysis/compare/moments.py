@@ -106,7 +106,8 @@ def window_notes(groups: Sequence[Group], metrics: Sequence[str], moment: Moment
         return
     windows: dict[str, list[str]] = {}
     for group in groups:
-        run, window = group.runs[0], ""
+        run = group.runs[0]
+        window = ""
         if log := run.config.get("log"):
             window = f"the last {log['episodes']:,} episodes (lengths) or {log['window']:,} steps (rewards)"
         elif run.training:
@@ -236,9 +237,11 @@ def value_of(
     points = {at: value for at, value in curve.items() if math.isfinite(value)}
     if not points:
         return None, f"has no {full_name(metric, line)}"
-    positions, values = list(points), list(points.values())
+    positions = list(points)
+    values = list(points.values())
     if moment.kind == "position":
-        value, at = points.get(moment.number), moment.number
+        value = points.get(moment.number)
+        at = moment.number
         if moment.axis is not EPISODES and positions[0] <= at <= positions[-1]:
             value = float(np.interp(at, positions, values))
         return value, f"has none after {moment.axis.moment(at)}"

@@ -156,7 +156,8 @@ def bootstrap_means(values: Floats) -> list[Estimate]:
 
 def bootstrap_ratio(numerator: Floats, denominator: Floats) -> Estimate:
     """Return the ratio of two means over the same seeds, [seeds], and its percentile bootstrap interval."""
-    n, value = len(numerator), float(numerator.mean() / denominator.mean()) if denominator.any() else np.nan
+    n = len(numerator)
+    value = float(numerator.mean() / denominator.mean()) if denominator.any() else np.nan
     if n < 2 or np.isnan(value):
         return Estimate(value)
     weights = _weights(n, RESAMPLES)

@@ -227,7 +227,8 @@ def _bounds(
                 f"normalise: the table has no row for {listed(lacking)}; it has {listed(list(table))}."
             )
         return {task: table[task] for task in tasks}
-    bounds, equal = {}, []
+    bounds = {}
+    equal = []
     for task in tasks:
         values = np.concatenate([by_task[task] for by_task in by_label.values()])
         low, high = float(values.min()), float(values.max())

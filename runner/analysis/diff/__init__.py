@@ -132,7 +132,8 @@ def diff(
     The first crossing of each target, metric to level, is reported. `first` compares only settings, and where
     and in what training first diverges, not the tables.
     """
-    digest, are_jobs = a.result.content_digest, _are_jobs(a, b)
+    digest = a.result.content_digest
+    are_jobs = _are_jobs(a, b)
     by_path: dict[str, list[Mapping[str, object]]] = {"config": [_settings(run) for run in (a, b)]}
     if not (first and are_jobs):
         by_path["provenance"] = [run.provenance for run in (a, b)]
@@ -178,7 +179,9 @@ def _branch_of_the_other(a: Recording, b: Recording) -> tuple[Cause, BranchOrigi
 
 def _not_compared(difference: RunDiff, a: Recording, b: Recording, first: bool) -> list[str]:
     """Return the titles of the sections that have nothing to compare, or that `first` leaves out."""
-    are_jobs, is_same, has_steps = _are_jobs(a, b), difference.same_content, can_compare_steps(a, b)
+    are_jobs = _are_jobs(a, b)
+    is_same = difference.same_content
+    has_steps = can_compare_steps(a, b)
     known = {
         "Training": is_same or has_steps,
         "Evaluation": is_same or (has_steps and not (are_jobs and first)),
@@ -195,7 +198,8 @@ def _diff_jobs(
     difference = replace(difference, notes=_notes(a, b))
     if difference.same_content:
         return difference
-    visits, relation = None, branch_relation(a, b)
+    visits = None
+    relation = branch_relation(a, b)
     if can_compare_steps(a, b):
         divergence = training_divergence(a, b)
         cause = None
@@ -362,7 +366,8 @@ def _settings(recording: Recording) -> dict[str, object]:
     """Return the configuration of a run, in which a branch has its origin as one text."""
     config = {key: value for key, value in recording.config.items() if key != "seeds"}
     config["seed"] = recording.seed
-    origin, loop = origin_in(recording.config), config.get("config")
+    origin = origin_in(recording.config)
+    loop = config.get("config")
     if branches := training_branches(recording.config):
         config["branches"] = ", then ".join(f"{branch.run} {branch}" for branch in branches)
     elif origin is not None and isinstance(loop, Mapping):

@@ -218,7 +218,8 @@ def _outcome_text(divergence: Divergence, a: Recording, b: Recording) -> str:
     if divergence.field in ("state", "next_state"):
         values = [states_in_words(run.mdp)[state] for run, state in zip((a, b), values, strict=True)]
     elif divergence.field == "rewards":
-        name, values = "reward", list(map(rewards_in_words, values))
+        name = "reward"
+        values = list(map(rewards_in_words, values))
     return f"{name} {values[0]} in A, {values[1]} in B"
 
 

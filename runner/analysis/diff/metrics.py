@@ -108,7 +108,8 @@ def _curves(recording: Recording) -> tuple[dict[str, dict[int, float]], dict[str
         series = read_series(recording, metrics=_OF_LOOPS)
         for name, line in lines_in([series]):
             if name in _OF_LOOPS:
-                full, points = full_name(name, line), points_of(series, name, line, aligned=False)
+                full = full_name(name, line)
+                points = points_of(series, name, line, aligned=False)
                 curves[full] = {int(at): value for at, value in points.items()}
                 if (end := series.recent.get(name, {}).get(line)) is not None:
                     recent[full] = end

@@ -167,7 +167,8 @@ def _code(files: Sequence[FileChange]) -> Section:
 
 def _environment(difference: RunDiff) -> Section:
     environment = difference.environment
-    sentences, grids = [], _changes_grid(environment.description)
+    sentences = []
+    grids = _changes_grid(environment.description)
     if environment.transitions:
         share = environment.transitions / environment.of
         sentences.append(
@@ -194,7 +195,9 @@ def _training(difference: RunDiff, most: int) -> Section:
 
 def _overlap_in_words(difference: RunDiff) -> list[str]:
     """Return how far training is the same, and how alike it visits states, if that is known."""
-    overlap, visits, sentences = difference.overlap, difference.visits, []
+    overlap = difference.overlap
+    visits = difference.visits
+    sentences = []
     if overlap is not None:
         share = overlap.equal_steps / overlap.compared_steps if overlap.compared_steps else math.nan
         sentences.append(
@@ -294,16 +297,17 @@ def _updates_in_words(cause: Cause | None) -> list[str]:
 def _q_rows(cause: Cause | None, most: int) -> list[Grid]:
     """Return the highest Q-values of both runs in the state in which the greedy actions differ."""
     grids = []
-    for row in () if cause is None else cause.rows:
-        orders = [sorted(range(len(values)), key=lambda j: -values[j]) for values in (row.a, row.b)]
-        shown = dict.fromkeys(j for order in orders for j in order[:most])
-        cells = []
-        for j in shown:
-            greedy = " and ".join(name for name, order in zip("AB", orders, strict=True) if j == order[0])
-            name = f"{row.actions[j]} (greedy in {greedy})" if greedy else row.actions[j]
-            cells.append((name, f"{row.a[j]:.6g}", f"{row.b[j]:.6g}"))
-        of = f", the highest of {len(row.actions)}" if len(row.actions) > len(shown) else ""
-        grids.append(Grid((f"Q-values of {spoken(row.agent)} there{of}", "A", "B"), cells))
+    if cause is not None:
+        for row in cause.rows:
+            orders = [sorted(range(len(values)), key=lambda j: -values[j]) for values in (row.a, row.b)]
+            shown = dict.fromkeys(j for order in orders for j in order[:most])
+            cells = []
+            for j in shown:
+                greedy = " and ".join(name for name, order in zip("AB", orders, strict=True) if j == order[0])
+                name = f"{row.actions[j]} (greedy in {greedy})" if greedy else row.actions[j]
+                cells.append((name, f"{row.a[j]:.6g}", f"{row.b[j]:.6g}"))
+            of = f", the highest of {len(row.actions)}" if len(row.actions) > len(shown) else ""
+            grids.append(Grid((f"Q-values of {spoken(row.agent)} there{of}", "A", "B"), cells))
     return grids
 
 

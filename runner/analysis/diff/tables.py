@@ -95,7 +95,8 @@ def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: Floats) -> list[CellDi
     least = np.partition(flat, -_MAX_CELLS)[-_MAX_CELLS] if flat.size > _MAX_CELLS else 0.0
     candidates = np.flatnonzero(flat >= least)
     order = candidates[np.argsort(-flat[candidates], kind="stable")][:_MAX_CELLS]
-    states, actions = states_in_words(mdp), own_actions_in_words(mdp, a.table, apart.shape[1])
+    states = states_in_words(mdp)
+    actions = own_actions_in_words(mdp, a.table, apart.shape[1])
     cells = []
     for cell in order.tolist():
         s, j = divmod(cell, apart.shape[1])

@@ -65,7 +65,8 @@ def _last_equal_snapshot(a: Recording, b: Recording, stop: int) -> int:
         if left.step != right.step or left.step > stop:
             break
         if left.step != step:  # only now it is known that all tables of the last moment are there
-            last, step = (step if equal else last), left.step
+            last = step if equal else last
+            step = left.step
         equal = equal and np.array_equal(left.values, right.values)
         if not equal:
             break
@@ -88,7 +89,8 @@ def _first_other_update(replays: Sequence[TableReplay], start: int, stop: int) -
             replay.rewind(start, contents)
             replay.advance(middle)
         if _are_equal(replays):
-            start, before = middle, [_copy(replay) for replay in replays]
+            start = middle
+            before = [_copy(replay) for replay in replays]
         else:
             stop = middle
     for replay, contents in zip(replays, before, strict=True):
