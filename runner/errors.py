@@ -106,8 +106,12 @@ class Diverged(RunnerError):
         episode: int | None = None,
         step: int | None = None,
     ) -> None:
-        self.topic, self.field, self.found, self.expected = topic, field, found, expected
-        self.episode, self.step = episode, step
+        self.topic = topic
+        self.field = field
+        self.found = found
+        self.expected = expected
+        self.episode = episode
+        self.step = step
         places = (("episode", episode), ("step", step))
         place = "".join(f", {name} {number}" for name, number in places if number is not None)
         super().__init__(f"{topic}{place}: {field}: found {found}, expected {expected}")

@@ -80,13 +80,15 @@ class Batches:
         if not self.shape.dtypes[topic].hasobject:
             yield from stored.stored(chunks)
         else:
-            messages, size = [], 0
+            messages = []
+            size = 0
             for time, payload in stored.messages(chunks=chunks):
                 messages.append((time, message_record(topic, time, payload)))
                 size += len(payload)
                 if len(messages) == _ROWS_AT_ONCE or size > _BYTES_AT_ONCE:
                     yield self._records_of(topic, messages)
-                    messages, size = [], 0
+                    messages = []
+                    size = 0
             if messages:
                 yield self._records_of(topic, messages)
 

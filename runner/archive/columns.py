@@ -69,9 +69,12 @@ class Shape:
     """
 
     def __init__(self, run: RunDescription, extras: Sequence[ExtraLayout] = ()) -> None:
-        self.run_id, self.learners, self.extras = run.run_id, run.agents, extras
+        self.run_id = run.run_id
+        self.learners = run.agents
+        self.extras = extras
         self._topics = run.topics
-        space, first = run.spaces["action"], 0
+        space = run.spaces["action"]
+        first = 0
         if not run.has_states:
             first = space.get("start", 0)
         is_discrete = space.get("type") == "Discrete"
@@ -181,7 +184,8 @@ class Shape:
         ]
 
     def _columns_of_field(self, message: MessageType, field: Field) -> list[ArchiveColumn]:
-        name, is_row = field.name, message in schema.NUMBERED_BY
+        name = field.name
+        is_row = message in schema.NUMBERED_BY
         if is_row and name in ("rewards", "returns"):
             return self._summed(name.removesuffix("s"), name)
         if is_row and name == "events":

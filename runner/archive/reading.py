@@ -188,7 +188,8 @@ def check_table(file: pq.ParquetFile, where: str, size: int, columns: pa.Schema,
     Raises:
         RecordingError: it has other columns or rows, or is made to exhaust the disk.
     """
-    about, found = file.metadata, file.schema_arrow.remove_metadata()
+    about = file.metadata
+    found = file.schema_arrow.remove_metadata()
     if not found.equals(columns):
         raise RecordingError(f"{where}: found columns\n{found}\nexpected\n{columns}")
     if about.num_rows != rows:

@@ -155,7 +155,8 @@ class _Restorer:
             return
         topics = {topic.phase: topic for topic in table.topics}
         phases = batch.column("phase")
-        names, codes = phases.dictionary.to_pylist(), numbers(phases.indices)
+        names = phases.dictionary.to_pylist()
+        codes = numbers(phases.indices)
         for code in np.unique(codes).tolist():
             if names[code] not in topics:
                 raise RecordingError(
@@ -217,7 +218,8 @@ class _Restorer:
             values = np.frombuffer(row["data"], "<f8").reshape(shape)
             tables.give(row["step"], row["table"], values)
         table = QTable(row["step"], row["episode"], row["agent"], row["table"], values)
-        topic, time = schema.Q_TABLE_TOPIC, row["position"] * STEP_NANOSECONDS
+        topic = schema.Q_TABLE_TOPIC
+        time = row["position"] * STEP_NANOSECONDS
         self._send_messages(topic, [time], [message_record(topic, time, encode_q_table(table))])
 
     def _compare(self) -> None:
@@ -226,7 +228,8 @@ class _Restorer:
         hashes |= {topic.name: digest.hexdigest() for topic, digest in self._undigested.items()}
         found = {name: Entry(count, hashes[name]) for name, count in self._counts.items() if count}
         for name in sorted(found.keys() | self._archive.manifest.topics.keys()):
-            restored, expected = found.get(name), self._archive.manifest.topics.get(name)
+            restored = found.get(name)
+            expected = self._archive.manifest.topics.get(name)
             if restored != expected:
                 raise RecordingError(
                     f"{self._where}: {name}: restored {_count(restored)}, expected {_count(expected)}."

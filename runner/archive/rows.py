@@ -35,7 +35,8 @@ def batch_of(
         RecordingError: a message cannot be decoded.
         ValueError: a value fits into no column.
     """
-    n, phases = len(records), PHASES if topic.phase in PHASES else (topic.phase,)
+    n = len(records)
+    phases = PHASES if topic.phase in PHASES else (topic.phase,)
     reads: dict[str, Callable[[Records], pa.Array]] = {
         "run_id": lambda _: _constant(0, n, (shape.run_id,)),
         "phase": lambda _: _constant(phases.index(topic.phase), n, phases),
@@ -69,7 +70,8 @@ def records_of(
     starts = np.array([start for start, _ in layouts], np.uint64)
     numbers_of_layouts = np.searchsorted(starts, times, "right") - 1
     for k in np.unique(numbers_of_layouts).tolist():
-        mine, own_topic = numbers_of_layouts == k, layouts[k][1]
+        mine = numbers_of_layouts == k
+        own_topic = layouts[k][1]
         rows = batch if mine.all() else batch.filter(pa.array(mine))
         dtype = shape.dtypes[own_topic]
         records = (

@@ -96,7 +96,8 @@ def _archive(run: Run, store: ArchiveStore, remove: bool, report: Report, dry_ru
     place, existing = store.place(run.run_id), store.manifest(run.run_id)
     is_new = existing is None
     with _undamaged(run) as recording:
-        size, done = recording.file.size, recording.done()
+        size = recording.file.size
+        done = recording.done()
         if dry_run or existing is None:
             with temporary_folder() if dry_run else store.writing(run.run_id) as folder:
                 manifest = write_archive(recording, folder, report)
@@ -126,7 +127,8 @@ def _archive(run: Run, store: ArchiveStore, remove: bool, report: Report, dry_ru
     run = run.update(archive=reference)
     if remove:
         run.recording.unlink()
-        contents, name = Store(run.folder.parent), run.folder.name
+        contents = Store(run.folder.parent)
+        name = run.folder.name
         if {f"{CONTENTS}{digest}" for digest in contents.of_run(name)} <= manifest.files.keys():
             contents.drop(name)
     return Archived(run, place, manifest, is_new, remove, size)

@@ -95,7 +95,8 @@ class ArchiveStore:
             return
         from filelock import FileLock, Timeout
 
-        final, partial = Path(self._path(run_id)), Path(self._path(PARTIAL, run_id))
+        final = Path(self._path(run_id))
+        partial = Path(self._path(PARTIAL, run_id))
         lock = partial.with_name(f"{run_id}.lock")
         try:
             partial.parent.mkdir(parents=True, exist_ok=True)

@@ -61,7 +61,8 @@ def stored(name: str, kind: pa.DataType, values_in: Callable[[Records], Array]) 
     def write(records: Records, column: pa.Array) -> None:
         values = values_in(records)
         if is_bytes:
-            start, size = column.offset * kind.byte_width, len(records) * kind.byte_width
+            start = column.offset * kind.byte_width
+            size = len(records) * kind.byte_width
             raw = np.frombuffer(column.buffers()[1], np.uint8)[start : start + size]
             values[...] = raw.view(values.dtype).reshape(values.shape)
         else:
@@ -109,11 +110,13 @@ class SpaceColumns:
     def __init__(
         self, description: Mapping[str, object], field: str, where: str, prefix: str = "", given: str = ""
     ) -> None:
-        self._description, self._where = description, where
+        self._description = description
+        self._where = where
         self._leaves = leaves_of(description, where)
         self.dtype: np.dtype[np.generic] = row_dtype(description)
         """The dtype of a value in records; a text is an object."""
-        prefix, parts = prefix or field, _parts(self._leaves)
+        prefix = prefix or field
+        parts = _parts(self._leaves)
         names = [
             "_".join([prefix, *(key.replace(".", "_") for key in leaf.path), *map(str, at or ())])
             for leaf, at in parts

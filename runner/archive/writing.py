@@ -89,7 +89,9 @@ class TableWriter:
             self._under_way.result()
         table = pa.Table.from_batches(self._waiting)
         self._under_way = self._thread.submit(self._writer.write_table, table, table.num_rows)
-        self._waiting, self._rows, self._bytes = [], 0, 0
+        self._waiting = []
+        self._rows = 0
+        self._bytes = 0
 
     def close(self) -> None:
         """Write what is left."""
@@ -158,7 +160,8 @@ class _ArchiveWriter:
                 )
 
     def _write_descriptions(self) -> None:
-        recording, attachments = self._recording, []
+        recording = self._recording
+        attachments = []
         for name, media_type, data in recording.file.attachments():
             if not is_inside(name):
                 raise RecordingError(
@@ -220,7 +223,8 @@ class _ArchiveWriter:
         self, tables: DerivedTables[tuple[int, QTable]], position: int, table: QTable
     ) -> pa.RecordBatch:
         """Return the row of a snapshot; of values that the steps before it give, only their hash."""
-        derived, data = tables.at(table.step, table.table), table.values.tobytes()
+        derived = tables.at(table.step, table.table)
+        data = table.values.tobytes()
         is_derived = derived is not None and derived.tobytes() == data
         if not is_derived:
             tables.give(table.step, table.table, table.values)

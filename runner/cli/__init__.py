@@ -147,7 +147,8 @@ class Failure(click.ClickException):
             super().__init__(full_message(error))
             self.exit_code = exit_code_of(error)  # type: ignore[misc]
         self.problems = error.problems if isinstance(error, ConfigError) else ()
-        self.run, self.as_json = run, click.get_current_context().meta[_AS_JSON]
+        self.run = run
+        self.as_json = click.get_current_context().meta[_AS_JSON]
 
     def show(self, file: IO[str] | None = None) -> None:
         """Print the message; each of several problems has a line, which begins with its place."""
@@ -173,7 +174,8 @@ def exit_code_of(error: RunnerError) -> int:
 
 def _of_the_system(error: Exception) -> RunnerError | None:
     """Return the error of our own for one of the system: a full disk, too little memory, too many files."""
-    number, limit = error.errno if isinstance(error, OSError) else None, ""
+    number = error.errno if isinstance(error, OSError) else None
+    limit = ""
     if number in _DISK_FULL and isinstance(error, OSError):
         return StorageError(f"{error.filename or 'stdout'}: {error.strerror}.")
     if number in (errno.EMFILE, errno.ENFILE):

@@ -38,16 +38,20 @@ class ShownEpisode:
 
     def __init__(self, recording: Recording, at: EpisodeRef, title: str) -> None:
         require_steps(recording, "show", may_redo=True)
-        self._recording, self._phase, self._number = recording, at.phase, at.number_in(recording)
+        self._recording = recording
+        self._phase = at.phase
+        self._number = at.number_in(recording)
         self._length = len(at.steps_in(recording, with_end=True))
-        self._first, self._title = at.t, title
+        self._first = at.t
+        self._title = title
 
     def steps(self) -> Iterator[dict[str, object]]:
         """Yield each step as JSON: with names where the environment's table has them.
 
         The first step of a loop's episode has the seed and the options of its reset.
         """
-        recording, agents = self._recording, self._recording.agents
+        recording = self._recording
+        agents = self._recording.agents
         describe = _named(recording) if recording.tabular else _valued(recording, self._phase)
         reset = reset_of(recording, self._phase, self._number)
         for row in islice(transitions_of(recording, self._phase, self._number), self._first, None):
@@ -95,11 +99,14 @@ def _state_drawer(recording: Recording) -> Callable[[Value | None], Text]:
         return lambda value: Text(
             "the first observation was lost\n" if value is None else f"{what}{value_in_words(value)}\n"
         )
-    mdp, first = recording.mdp, least_number(recording.spaces["observation"])
-    names, drawing = states_in_words(mdp), TextDrawing(mdp.scene) if mdp.scene is not None else None
+    mdp = recording.mdp
+    first = least_number(recording.spaces["observation"])
+    names = states_in_words(mdp)
+    drawing = TextDrawing(mdp.scene) if mdp.scene is not None else None
 
     def drawn(value: Value) -> Text:
-        state, text = int(value) - first, Text()
+        state = int(value) - first
+        text = Text()
         if drawing is not None and mdp.scene_cells is not None:
             text.append(drawing.draw(mdp.scene_cells[state].tolist(), mdp.carriers[state].tolist()))
             text.append(f"\n{drawing.legend}\n\n", style="dim")
@@ -117,7 +124,8 @@ def _named(recording: Recording) -> Callable[[Step], dict[str, object]]:
     def describe(row: Step) -> dict[str, object]:
         step = np.asarray(row).reshape(1)
         mdp.check_steps(step, str(recording.path), "recorded")
-        events, explored = int(events_of(mdp, step)[0]), int(row["explored"])
+        events = int(events_of(mdp, step)[0])
+        explored = int(row["explored"])
         description: dict[str, object] = {}
         for name, names in words.items():
             description |= {name: int(row[name]), f"{name}_in_words": names[int(row[name])]}

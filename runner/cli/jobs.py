@@ -37,7 +37,8 @@ def _do_job(context: click.Context, _parameter: click.Parameter, folder: Path | 
         raise click.BadParameter(
             f"found no {STATE_FILE} in {folder}, expected the folder of a job, such as recordings/.jobs/17."
         )
-    stdout, folder = sys.stdout, folder.resolve()
+    stdout = sys.stdout
+    folder = folder.resolve()
     spec = JobSpec(folder, read_job(folder), os.environ.get("RAY_ADDRESS"))
 
     def send(event: EventData) -> None:

@@ -35,7 +35,8 @@ def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], No
     first: list[tuple[float, int]] = []  # when new steps began, and the steps then
 
     def report(progress: Progress) -> None:
-        now, steps = time.monotonic(), progress.train_steps + progress.eval_steps
+        now = time.monotonic()
+        steps = progress.train_steps + progress.eval_steps
         if not first or steps == first[0][1]:  # of a resumed run: while what is recorded is retrained
             first[:] = [(now, steps)]
         seconds = now - first[0][0]

@@ -122,7 +122,8 @@ def command_of(view: View) -> Command:
             with stage_line("writing"), new_file(output, force) as path, path.open("wb") as stream:
                 answer.write(stream)
             data = answer.as_json() | {"files": files_written(output)}
-            page, notes = "", [path_and_size(output)]
+            page = ""
+            notes = [path_and_size(output)]
             if is_page or answer.contents:
                 page = f"{output}: {answer.contents or size(output.stat().st_size)}"
                 notes = [f"Note: {limit}." for limit in answer.limits]
@@ -131,7 +132,8 @@ def command_of(view: View) -> Command:
 
     declared = {"subject": named, **{name: _declared(name, each, view) for name, each in view.inputs.items()}}
     if view.file_ending:
-        help_text, metavar = f"{view.file_help} FILE `-` is stdout.", f"FILE{view.file_ending}"
+        help_text = f"{view.file_help} FILE `-` is stdout."
+        metavar = f"FILE{view.file_ending}"
         output = option(*view.file_flags, type=FILE, metavar=metavar, help=help_text)
         declared |= {"output": html_option if is_page else output, "force": force_option}
     return Command(view.name, call, declared, forms=view.forms, help=view.help)

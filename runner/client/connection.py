@@ -55,7 +55,8 @@ class ServerError(RunnerError):
         super().__init__(message)
         if 400 <= status < 500 and status not in _NOT_THE_REQUEST:
             self.exit_code = RunnerError.exit_code  # the request was wrong, not the server
-        self.status, self.retry_seconds = status, retry_seconds
+        self.status = status
+        self.retry_seconds = retry_seconds
 
 
 class ServerUnavailable(ServerError):
@@ -70,13 +71,15 @@ class Backoff:
     """
 
     def __init__(self, timeout: float, log: Callable[[str], object] = lambda _: None) -> None:
-        self._timeout, self._log = timeout, log
+        self._timeout = timeout
+        self._log = log
         self.reset()
 
     def reset(self) -> None:
         """Start again: the server is available."""
         self._end: float | None = None
-        self._pause, self._logged = FIRST_PAUSE, ""
+        self._pause = FIRST_PAUSE
+        self._logged = ""
 
     def wait(self, error: ServerError) -> None:
         """Pause after an error; raise it when the time is up."""
@@ -114,7 +117,9 @@ class Connection:
         log: Callable[[str], object] = lambda _: None,
     ) -> None:
         self.url = checked_url(url)
-        self._retry_timeout, self._log, self._has_token = retry_timeout, log, bool(token)
+        self._retry_timeout = retry_timeout
+        self._log = log
+        self._has_token = bool(token)
         require("httpx2", extra="service", purpose="speaking to a server")
         import httpx2
 

@@ -268,7 +268,8 @@ def watch(client: Connection, number: int) -> Iterator[JobEvent]:
         ServerError: there is no such job, or the server refuses.
         ServerUnavailable: the server did not respond in time.
     """
-    last, backoff = "", client.backoff()
+    last = ""
+    backoff = client.backoff()
     while True:
         try:
             with client.stream(f"/jobs/{number}/events", {"Last-Event-ID": last}) as response:

@@ -96,7 +96,9 @@ class Follower:
     """
 
     def __init__(self, client: Client, run: Run, size: Callable[[], int]) -> None:
-        self._client, self._run, self._size = client, run, size
+        self._client = client
+        self._run = run
+        self._size = size
         self._over = threading.Event()
         self._upload_id = secrets.token_hex(32)
         _write_push_file(run, _Push(client.url, self._upload_id))

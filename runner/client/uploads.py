@@ -80,7 +80,10 @@ def _send(
     server: Connection, upload_id: str, source: Json, path: Path, what: str, report: Report
 ) -> UploadStatus:
     """Upload a file until it is stored; what fails for now is repeated."""
-    furthest, pause, backoff, is_new = -1, POLL_SECONDS / 16, server.backoff(), True
+    furthest = -1
+    pause = POLL_SECONDS / 16
+    backoff = server.backoff()
+    is_new = True
     while True:
         try:
             upload = put_upload(server, upload_id, **source)
@@ -91,7 +94,8 @@ def _send(
                     raise ServerError(f"{server.url}: refused {what}: {upload.problem}")
                 # By an earlier push, or because its file has changed since it began.
                 server.request("DELETE", f"/uploads/{upload_id}")
-                upload_id, is_new = source["digest"], True
+                upload_id = source["digest"]
+                is_new = True
                 continue
             is_new = False
             while upload.state == "receiving":

@@ -99,7 +99,8 @@ def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
         ) from None
     except yaml.reader.ReaderError as error:
         before = text[: error.position]
-        line, column = before.count("\n") + 1, error.position - before.rfind("\n")
+        line = before.count("\n") + 1
+        column = error.position - before.rfind("\n")
         place = Place(source, line, column) if lines else Place(source)
         raise ConfigError(f"{place}: cannot be read as YAML: the character U+{error.character:04X}") from None
     return Document(value, builder.places, builder.problems)

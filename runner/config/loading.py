@@ -68,7 +68,8 @@ def from_text(text: str, source: str, overrides: Sequence[str] = ()) -> Experime
     Raises:
         ConfigError: as for `load`.
     """
-    stem, document = FilePath(source).stem, read_yaml(text, source)
+    stem = FilePath(source).stem
+    document = read_yaml(text, source)
     if document.value is None and not document.problems:
         raise ConfigError(f"{source}:1:1: the file is empty, expected at least `episodes`")
     if isinstance(document.value, Mapping) and {"base", "parameters"} <= document.value.keys():
@@ -115,7 +116,8 @@ def recorded_packing(config: JsonView) -> Packing:
     Raises:
         ConfigError: the configuration has values that are not possible.
     """
-    chosen, names = config.get("recording"), [option.name for option in fields(Packing)]
+    chosen = config.get("recording")
+    names = [option.name for option in fields(Packing)]
     parts = {key: chosen[key] for key in names if key in chosen} if isinstance(chosen, Mapping) else {}
     return packing_from(parts).packing
 
@@ -146,7 +148,8 @@ def read_text(file: FilePath) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        before, byte = content[: error.start], content[error.start]
+        before = content[: error.start]
+        byte = content[error.start]
         place = Place(str(file), before.count(b"\n") + 1, error.start - before.rfind(b"\n"))
         raise ConfigError(f"{place}: found the byte 0x{byte:02x}, expected text in UTF-8") from None
 
@@ -161,7 +164,8 @@ def experiment_in(
         )
         raise refuse([*document.problems, problem], document)
     override(document, overrides)
-    file, problems = None, document.problems
+    file = None
+    problems = document.problems
     try:
         file = ExperimentFile.model_validate(dict(document.value))
     except ValidationError as error:
@@ -286,7 +290,8 @@ def _with(value: object, path: Path, new: object) -> Any:
     """Return `value` with `new` at `path`; only mappings and lists on the path are copied."""
     if not path:
         return new
-    key, below = path[0], path[1:]
+    key = path[0]
+    below = path[1:]
     if isinstance(value, list | tuple) and (at := position_in(value, key)) is not None:
         return [*value[:at], _with(value[at], below, new), *value[at + 1 :]]
     mapping = dict(value) if isinstance(value, Mapping) else {}

@@ -136,7 +136,8 @@ def _problem(path: Path, detail: ErrorDetails, value: object, schema: Schema | N
     if detail["type"] == "missing":
         if not isinstance(path[-1], int):
             return Problem(path, f"missing, expected {expected(here)}")
-        path, here = path[:-1], around
+        path = path[:-1]
+        here = around
     value = value_at(value, path)
     hint = nearest(value, choices_of(here)) if isinstance(value, str) else ""
     return Problem(path, f"found {found(value)}, expected {expected(here)}{'.' if hint else ''}{hint}")

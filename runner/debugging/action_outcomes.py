@@ -179,7 +179,9 @@ class WhatIf(Answer):
         ]
         for row in self.actions:
             i, j = divmod(row.action, len(columns))
-            x, y, colour = _HEAD[0] + j * _CELL[0], _HEAD[1] + i * _CELL[1], ramp_colour(levels[row.action])
+            x = _HEAD[0] + j * _CELL[0]
+            y = _HEAD[1] + i * _CELL[1]
+            colour = ramp_colour(levels[row.action])
             edge = ' stroke="currentColor" stroke-width="4"' if row.is_recorded else ""
             values = " / ".join(number(value, 1) for value in shown[row.action])
             cell = (

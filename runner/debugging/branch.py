@@ -252,7 +252,9 @@ def default_name(recording: Recording) -> str:
 
 def _outcome(recording: Recording, phase: str, episode: int, otherwise: str) -> BranchOutcome:
     """Return where an episode led; `otherwise` is its end if it has none."""
-    returns, length, end = [0.0] * len(recording.agents), 0, otherwise
+    returns = [0.0] * len(recording.agents)
+    length = 0
+    end = otherwise
     for step in transitions_of(recording, phase, episode):
         length += 1
         returns = [sum(pair) for pair in zip(returns, map(float, step["rewards"]), strict=True)]
@@ -285,7 +287,9 @@ class _Player:
     is_recorded_action: bool
 
     def __init__(self, recording: Recording, folder: Path, task: EpisodeBranch) -> None:
-        self._recording, self._folder, self._task = recording, folder, task
+        self._recording = recording
+        self._folder = folder
+        self._task = task
         self._at = task.at.resolved(recording)
         self.phase, self.episode = self._at.phase, self._at.number_in(recording)
         self._function: Policy | None = policy_named(task.policy) if ":" in task.policy else None
@@ -296,7 +300,8 @@ class _Player:
         env, task, recording = stepper.env, self._task, self._recording
         maker = recording.phase(self.phase).maker_of()
         assert maker is not None  # or `why_not_rerun` gave a reason
-        self._stepper, self._actions = stepper, actions
+        self._stepper = stepper
+        self._actions = actions
         self._space = copy.deepcopy(stepper.action_space)
         self._space.seed(task.seed)
         names: Names = {agent: recording.phase(self.phase).action_names(agent) for agent in recording.agents}
@@ -332,7 +337,9 @@ class _Player:
 
     def play(self) -> str:
         """Take the action, and play on; return why that stopped before the end, empty if it did not."""
-        task, action, reported = self._task, self._action, time.monotonic()
+        task = self._task
+        action = self._action
+        reported = time.monotonic()
         for count in range(1, task.max_steps + 1):
             try:
                 observation, _, terminated, truncated, _ = self.rec.step(action)

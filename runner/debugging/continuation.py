@@ -25,7 +25,9 @@ class Continuation:
     def __init__(
         self, learner: Learner, step: Records, trained_episode: int, trained_step: int, is_trial: bool
     ) -> None:
-        self._learner, self._step, self._is_trial = learner, step, is_trial
+        self._learner = learner
+        self._step = step
+        self._is_trial = is_trial
         self._trained = trained_episode, trained_step
         learner.begin_evaluation()
         rules = learner.segment_at(trained_step).rules
@@ -61,7 +63,8 @@ class Continuation:
     def policy(self) -> Floats:
         """The probability of each joint action in each state, [S, J], with the epsilon of the moment."""
         learner, epsilon = self._learner, self.epsilon
-        width, policy = learner.model.width, learner.policy
+        width = learner.model.width
+        policy = learner.policy
         if isinstance(policy, np.ndarray):
             own = [np.eye(n)[learner.tables.greedy[i]] for i, n in enumerate(width)]
         else:
@@ -101,9 +104,12 @@ class Continuation:
     def _train(
         self, action: int | None, cursor: Records, tally: Tally, steps: Records, ends: kernel.Ends
     ) -> tuple[int, int]:
-        learner, rules, tables = self._learner, self._rules, self._learner.tables
+        learner = self._learner
+        rules = self._rules
+        tables = self._learner.tables
         if action is not None:  # greedy agents that prefer it take it
-            state, own = int(self._step["state"]), learner.model.own_action[action]
+            state = int(self._step["state"])
+            own = learner.model.own_action[action]
             rules = rules._replace(epsilon=compile_schedule(0.0), epsilon_exploits=False)
             tables = tables._replace(greedy=tables.greedy.copy(), extra=tables.extra.copy())
             tables.greedy[:, state] = own
@@ -119,8 +125,10 @@ class Continuation:
     def _evaluate(
         self, action: int | None, cursor: Records, tally: Tally, steps: Records, ends: kernel.Ends
     ) -> tuple[int, int]:
-        learner, policy = self._learner, self._learner.trial_actions
-        state, until = int(self._step["state"]), int(self._step["episode"]) + 1
+        learner = self._learner
+        policy = self._learner.trial_actions
+        state = int(self._step["state"])
+        until = int(self._step["episode"]) + 1
         if action is not None:
             policy = policy.copy()
             policy[state] = action

@@ -166,7 +166,9 @@ def answer(
     stop: Stop = lambda: False,
 ) -> Explanation:
     """Return the explanation of a question, trained by some workers; see `explain`."""
-    began, mixing, folder = time.monotonic(), question.mixing, question.recordings
+    began = time.monotonic()
+    mixing = question.mixing
+    folder = question.recordings
     own = folder / FOLDER / question.name
     busy = ExplanationBusy("another process computes the same explanation; try again when it has finished.")
     lock = acquired(own / LOCK, busy)
@@ -237,10 +239,8 @@ def _resolved(
     if isinstance(source, Mapping):
         source = from_mapping(source)
     if isinstance(source, str | os.PathLike):
-        path, experiments = (
-            Path(source),
-            [name for name, each in shipped().items() if each.kind == "experiment"],
-        )
+        path = Path(source)
+        experiments = [name for name, each in shipped().items() if each.kind == "experiment"]
         if path.suffix in (".yaml", ".yml") or os.fspath(source) in experiments:
             source = load(path)
         else:

@@ -203,7 +203,8 @@ def sections(explanation: Explanation) -> list[Section]:
 
 def _settings_section(explanation: Explanation) -> Section:
     has_shares = any(setting.share is not None for setting in explanation.settings)
-    is_clear, rows = explanation.difference.excludes_zero, []
+    is_clear = explanation.difference.excludes_zero
+    rows = []
     for setting in explanation.settings:
         cells = [setting.name, setting.a, setting.b]
         if has_shares and setting.share is not None:
@@ -267,7 +268,8 @@ def shown_mixtures(explanation: Explanation) -> list[Mixture]:
 
 
 def _mixtures_section(explanation: Explanation) -> Section:
-    names, mixtures = [setting.name for setting in explanation.settings], shown_mixtures(explanation)
+    names = [setting.name for setting in explanation.settings]
+    mixtures = shown_mixtures(explanation)
     rows = []
     for one in mixtures:
         sides = ("B" if name in one.settings else "A" for name in names)
@@ -312,7 +314,8 @@ def drawn_sections(explanation: Explanation) -> list[Section]:
 
 def _figures(explanation: Explanation) -> list[Figure]:
     """Return shares, clear interactions, and mixtures by their value."""
-    names, result = [setting.name for setting in explanation.settings], []
+    names = [setting.name for setting in explanation.settings]
+    result = []
     shares = [(each.name, each.share) for each in explanation.settings if each.share is not None]
     if shares:
         title = f"Share of each setting in the difference of {explanation.metric}"

@@ -167,7 +167,8 @@ class JobParser(Parser[Series]):
 
     def applied(self, kind: str, operation: Operation, *parts: Series) -> Series:
         """Return the term of an operation on one or two terms."""
-        function, values = self.operations[operation], [part.evaluate for part in parts]
+        function = self.operations[operation]
+        values = [part.evaluate for part in parts]
         return Series(kind, lambda columns: function(*(value(columns) for value in values)))
 
     def number(self, node: ast.expr) -> Series:
@@ -181,7 +182,8 @@ class JobParser(Parser[Series]):
             row = self.term(node.args[0])
             if row.kind != _ROW:
                 raise self.error(node.args[0], f"found one value, expected {name}(q[STATE]), or several.")
-            choose, text = self.operations[name], self.text_of(node)
+            choose = self.operations[name]
+            text = self.text_of(node)
             highest = Series(NUMBER, lambda columns: choose.reduce(row.evaluate(columns), axis=1), text=text)
             return self._shown.setdefault(text, highest)
         return super().call(node, name)
@@ -219,7 +221,8 @@ class JobParser(Parser[Series]):
             base_text = self.text_of(base)
             hint = nearest(base_text, NAMES)
             raise self.error(base, f"found {base_text[:60]}, expected one of {', '.join(NAMES)}.{hint}")
-        name, agent = base.id, head.attr if isinstance(head, ast.Attribute) else None
+        name = base.id
+        agent = head.attr if isinstance(head, ast.Attribute) else None
         self._check_algorithm(base, name)
         learner = self._learner(head, name, agent)
         index: list[ast.expr] = []

@@ -134,7 +134,9 @@ def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: 
 def _changes(a: JsonView, b: JsonView, prefix: str = "") -> Iterator[Change]:
     """Yield the settings that differ; sections in which values can be mixed one by one are entered."""
     for key in dict.fromkeys([*a, *b]):
-        path, left, right = f"{prefix}{key}", a.get(key), b.get(key)
+        path = f"{prefix}{key}"
+        left = a.get(key)
+        right = b.get(key)
         if left == right:
             continue
         if (

@@ -51,7 +51,9 @@ def first_step(
     Raises:
         KeyboardInterrupt: `stop` returned True.
     """
-    bit, setting, folder = 1 << number, mixing.factors[number].name, recordings / UNLISTED
+    bit = 1 << number
+    setting = mixing.factors[number].name
+    folder = recordings / UNLISTED
     tag = TAG.format(name)
     made = {identity_of(run.file.config, run.seed): run for run in list_runs(folder) if tag in run.tags}
     pairs = [(0, bit, f"Changing {setting} alone in A")]
@@ -73,7 +75,8 @@ def first_step(
                     title = re.sub(r"[^A-Za-z0-9_.]+", "-", f"{word}-{setting}")[:100]
                     labels = Labels(tags=(tag,))
                     run = new_run(folder, job.config.to_mapping(), seed, title, labels=labels)
-                    done, total = part * episodes, 2 * episodes
+                    done = part * episodes
+                    total = 2 * episodes
                     run = run_job(job, run, lambda now: report(done + now.episode, total), stop)  # noqa: B023
                     if run.status != "finished":
                         _discard(run)
@@ -102,11 +105,13 @@ def _difference(before: Run, after: Run, setting: str, what: str) -> FirstStep |
         if not can_compare_steps(a, b):
             sentence = f"{what} changes the states or actions, so that no steps can be compared."
             return FirstStep(setting, a.run_id, b.run_id, None, None, None, (sentence,))
-        divergence, sentences = training_divergence(a, b), []
+        divergence = training_divergence(a, b)
+        sentences = []
         if divergence is not None and divergence.a_step is not None and divergence.b_step is not None:
             cause = find_cause(divergence, a, b)
             sentences.append(f"Training diverges {where_in_words(divergence)}: {cause.text}.")
-            update, place = cause.update, (divergence.step, divergence.episode, divergence.t)
+            update = cause.update
+            place = (divergence.step, divergence.episode, divergence.t)
         elif a.agents == b.agents:  # the first update that differs though all steps are the same
             steps = min(recording.train.steps.count() for recording in (a, b))
             update = replay_to(a, b, steps)[1]

@@ -52,15 +52,20 @@ class Game:
     """The values of mixtures, measured when they are needed: settings are players, mixtures coalitions."""
 
     def __init__(self, mixtures: Mixtures, metric: str) -> None:
-        self.mixing, self.metric, self._mixtures = mixtures.mixing, metric, mixtures
+        self.mixing = mixtures.mixing
+        self.metric = metric
+        self._mixtures = mixtures
         self._count = len(self.mixing.factors)
 
     def plan(self) -> SamplingPlan:
         """Return what will be trained."""
-        count, mixtures, seeds = self._count, self._mixtures, len(self._mixtures.seeds)
+        count = self._count
+        mixtures = self._mixtures
+        seeds = len(self._mixtures.seeds)
         least, most = mixture_bounds(count)
         known = mixtures.known(range(least)) if least == most else mixtures.in_file
-        run_seconds, workers = mixtures.seconds, max(1, mixtures.workers.idle)
+        run_seconds = mixtures.seconds
+        workers = max(1, mixtures.workers.idle)
         left = (number * seeds - known for number in (least, most))
         times = [_START_SECONDS + runs * run_seconds / workers if runs > 0 else 0.0 for runs in left]
         return SamplingPlan(count, least, most, seeds, known, run_seconds, workers, times[0], times[1])
@@ -138,7 +143,8 @@ def settings_of(game: Game, players: Sequence[int]) -> tuple[Setting, ...]:
         values = game.values(coalitions(players))
         bits = [1 << j for j in range(len(players))]
         own = shapley_values(values)
-        alone, last = values[bits] - values[0], values[-1] - values[[len(values) - 1 - bit for bit in bits]]
+        alone = values[bits] - values[0]
+        last = values[-1] - values[[len(values) - 1 - bit for bit in bits]]
         rows = zip(*map(bootstrap_means, (own, alone, last)), strict=True)
         shares = dict(zip(players, rows, strict=True))
     order = sorted(shares, key=lambda i: -abs(shares[i][0].value))

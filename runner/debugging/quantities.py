@@ -179,12 +179,13 @@ class JobColumns:
 
     def _count_visits(self, recording: Recording, stop: int) -> None:
         expected = 0
-        for block in recording.train.steps.blocks(0, stop) if stop else ():
-            first = int(block["step"][0])
-            check_lost(recording, expected, first)
-            expected = first + len(block)
-            for each in self._visits:
-                self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
+        if stop:
+            for block in recording.train.steps.blocks(0, stop):
+                first = int(block["step"][0])
+                check_lost(recording, expected, first)
+                expected = first + len(block)
+                for each in self._visits:
+                    self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
         check_lost(recording, expected, stop)
 
     def _visited(self, quantity: Quantity, steps: Records) -> Flags:

@@ -46,7 +46,8 @@ def _effect(values: Floats, settings: Sequence[int]) -> Floats:
         beyond = np.diff(beyond, axis=count - 1 - i)
     beyond = beyond.reshape(-1, values.shape[1])
     sizes = np.bitwise_count(np.arange(len(beyond)))
-    n, factorial = count + 1 - len(settings), math.factorial
+    n = count + 1 - len(settings)
+    factorial = math.factorial
     # The share of the orders of n settings in which s given ones come before a given one.
     weights = np.array([factorial(s) * factorial(n - s - 1) / factorial(n) for s in range(n)])
     averaged: Floats = weights[sizes] @ beyond
@@ -59,18 +60,21 @@ def minimal_set(items: Sequence[T], holds: Callable[[Sequence[T]], bool]) -> lis
     Delta debugging (A. Zeller and R. Hildebrandt, "Simplifying and isolating failure-inducing input", 2002).
     `holds` takes some of the items, in their order; it is so of all of them, and not of none.
     """
-    left, parts = list(items), 2
+    left = list(items)
+    parts = 2
     while len(left) > 1:
         chunks = [chunk.tolist() for chunk in np.array_split(np.arange(len(left)), parts)]
         subsets = [[left[k] for k in chunk] for chunk in chunks]
         smaller = next((subset for subset in subsets if holds(subset)), None)
         if smaller is not None:
-            left, parts = smaller, 2
+            left = smaller
+            parts = 2
             continue
         rests = [[item for k, item in enumerate(left) if k not in chunk] for chunk in chunks]
         smaller = next((rest for rest in rests if parts > 2 and holds(rest)), None)
         if smaller is not None:
-            left, parts = smaller, max(parts - 1, 2)
+            left = smaller
+            parts = max(parts - 1, 2)
         elif parts < len(left):
             parts = min(2 * parts, len(left))
         else:

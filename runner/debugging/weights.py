@@ -67,7 +67,8 @@ def weights_of(recording: Recording, cell: Cell, stop: int, limit: int, report: 
         StorageError: the temporary file cannot be written.
     """
     replay = TableReplay(recording)
-    learner, model = replay.learner, replay.learner.model
+    learner = replay.learner
+    model = replay.learner.model
     tables = learner.algorithm.tables if learner.algorithm.is_double else ("q",)
     initial_values = np.stack([replay.named_tables[cell.learner][name].reshape(-1) for name in tables])
     advice = "set TMPDIR to a folder with more space"
@@ -91,7 +92,9 @@ def weights_of(recording: Recording, cell: Cell, stop: int, limit: int, report: 
             np.zeros((episode // stretch + 1, 2)),
         )
         ledger.weights[:, cell.state * model.width[cell.learner] + cell.action] = 1 / len(tables)
-        counted, largest, shares = 0, np.empty(0, SHARE), np.empty(min(stop, STEPS_AT_ONCE), SHARE)
+        counted = 0
+        largest = np.empty(0, SHARE)
+        shares = np.empty(min(stop, STEPS_AT_ONCE), SHARE)
         for start in reversed(range(0, stop, STEPS_AT_ONCE)):
             updates = np.empty(min(STEPS_AT_ONCE, stop - start), UPDATE)
             spool.seek(start * UPDATE.itemsize)

@@ -121,12 +121,16 @@ class _Branches:
         )
         require_steps(recording, "branch")
         at = EpisodeRef.parse(reference).resolved(recording)
-        self._recording, self._at, self._mdp = recording, at, recording.mdp
+        self._recording = recording
+        self._at = at
+        self._mdp = recording.mdp
         self._number = at.number_in(recording)
         self._read_episode()
-        trained_episode, trained_step = at.episode, int(self._step["step"])
+        trained_episode = at.episode
+        trained_step = int(self._step["step"])
         if at.after is not None:
-            trained_episode, trained_step = at.after, at.evaluation_in(recording).train_step
+            trained_episode = at.after
+            trained_step = at.evaluation_in(recording).train_step
         self._tables = TableReplay(recording, trained_step)
         self._playing = Continuation(
             self._tables.learner, self._step, trained_episode, trained_step, at.after is not None
@@ -134,9 +138,14 @@ class _Branches:
 
     def _read_episode(self) -> None:
         """Read the step, what came before it, and where the episode led."""
-        recording, phase, episode, t = self._recording, self._at.phase, self._number, self._at.t
+        recording = self._recording
+        phase = self._at.phase
+        episode = self._number
+        t = self._at.t
         length = len(self._at.steps_in(recording))
-        self._returns, self._succeeded, done = np.zeros(len(recording.agents)), False, 0
+        self._returns = np.zeros(len(recording.agents))
+        self._succeeded = False
+        done = 0
         returns = self._returns
         for block in episode_blocks(recording, phase, episode):
             self._mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[phase])
@@ -165,7 +174,9 @@ class _Branches:
 
     def _play(self, action: int) -> tuple[Records, Outcome]:
         """Return the steps from an action on, and where the whole episode leads."""
-        recording, phase, t = self._recording, self._at.phase, self._at.t
+        recording = self._recording
+        phase = self._at.phase
+        t = self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
         blocks = [
             blank_records(topic, recording.layout.message(topic), count).view(np.recarray)
@@ -187,7 +198,8 @@ class _Branches:
         """Return where each of some joint actions leads."""
         recording, mdp, playing = self._recording, self._mdp, self._playing
         state, recorded = int(self._step["state"]), int(self._step["action"])
-        names, probabilities = actions_in_words(mdp), playing.policy
+        names = actions_in_words(mdp)
+        probabilities = playing.policy
         learned = self._learned(state)
         values, optimal = self._exact_values(state, probabilities)
         worth = list(map(sum, learned)) if playing.discount >= 1 else values.sum(axis=1).tolist()
@@ -234,7 +246,9 @@ class _Branches:
 
     def _exact_values(self, state: int, policy: Floats) -> tuple[Floats, Floats]:
         """Return the values of each joint action under the policy, [J, learners], and the optimum, [J]."""
-        mdp, learners, discount = self._mdp, len(self._recording.agents), self._playing.discount
+        mdp = self._mdp
+        learners = len(self._recording.agents)
+        discount = self._playing.discount
         if discount >= 1:
             return np.full((mdp.joint_actions, learners), np.nan), np.full(mdp.joint_actions, np.nan)
         own = policy_values(mdp, policy, learners, discount)

@@ -189,8 +189,9 @@ def when(
                 f"found first step {start:,} and last step {stop - 1:,}, expected them in order."
             )
         columns = JobColumns(recording, list(parser.quantities), max(start - 1, 0))
-        for block in recording.train.steps.blocks(start - 1, start) if start else ():
-            deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
+        if start:
+            for block in recording.train.steps.blocks(start - 1, start):
+                deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
         terms = parsed.terms
         with np.errstate(all="ignore"):
             held_before = bool(_values(parsed.condition, columns.last)[0])
@@ -231,7 +232,8 @@ def _search(
     moments: list[WhenMoment] = []
     count = 0
     steps = 0
-    holds, expected = False, start
+    holds = False
+    expected = start
     limit = 2 * min(intervals, MAX_INTERVALS, MAX_VALUES // (2 * max(1, len(expression.terms))))
     for block in recording.train.steps.blocks(start, stop):
         first = int(block["step"][0])
@@ -244,7 +246,8 @@ def _search(
             changed = np.flatnonzero(held[1:] != held[:-1])
             if not len(changed):
                 continue
-            numbers, begins = block["step"][places[changed]], held[1:][changed]
+            numbers = block["step"][places[changed]]
+            begins = held[1:][changed]
             count += int(np.count_nonzero(begins))
             steps += int(numbers[~begins].sum()) - int(numbers[begins].sum())
             listed = changed[: limit - len(moments) if every else 1].tolist()

@@ -146,7 +146,8 @@ def _cell(
     at: EpisodeRef | None,
 ) -> Cell:
     """Return the place of the value of a state and an action, by default those of a step."""
-    mdp, is_joint = recording.mdp, len(recording.agents) < len(recording.mdp.agents)
+    mdp = recording.mdp
+    is_joint = len(recording.agents) < len(recording.mdp.agents)
     if state is None or action is None:
         taken = _step_at(recording, at)
         own = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]

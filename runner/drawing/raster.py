@@ -123,7 +123,8 @@ class SceneRaster:
         width, height = np.ceil(scaled.max(axis=0) + radius - corner).astype(int).tolist()
         large = Image.new("L", (width * _FINE, height * _FINE))
         points = [tuple(point) for point in ((scaled - corner) * _FINE).tolist()]
-        pen, ink = ImageDraw.Draw(large), round(255 * svg.TRAIL_OPACITY)
+        pen = ImageDraw.Draw(large)
+        ink = round(255 * svg.TRAIL_OPACITY)
         pen.line(points, fill=ink, width=round(2 * radius * _FINE))
         for point in points:
             pen.circle(point, radius * _FINE, fill=ink)
@@ -157,7 +158,8 @@ def font(size: int, bold: bool = False) -> FreeTypeFont:
 
 def shortened(text: str, width: float, size: int, bold: bool = False) -> str:
     """Return a text that is at most `width` pixels wide, its end replaced by an ellipsis if it is longer."""
-    drawn, text = font(size, bold), text[: int(width)]
+    drawn = font(size, bold)
+    text = text[: int(width)]
     if drawn.getlength(text) <= width:
         return text
     while text and drawn.getlength(f"{text}…") > width:

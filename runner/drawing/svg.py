@@ -213,7 +213,8 @@ class SvgDrawing:
         """Return a tinted cell with a letter: hazards have a strong tint, goals a flag."""
         row, column = mark["cell"]
         x, y = corner(self._scene, row * self._scene["columns"] + column)
-        colour, kind = mark["colour"], mark.get("kind")
+        colour = mark["colour"]
+        kind = mark.get("kind")
         tint = "g-hazard" if kind == "hazard" else "g-tint"
         return (
             f'<rect class="{tint}" x="{x + 2}" y="{y + 2}" width="{CELL - 4}" height="{CELL - 4}" '

@@ -62,7 +62,8 @@ def _shape(scene: SceneDescription, drawing: SvgDrawing, move: Move, width: floa
         )
     end_x, end_y = (value + CELL / 2 for value in corner(scene, move.stop))
     length = math.hypot(end_x - x, end_y - y)
-    half, head = width / 2, min(width / 2 + 10, length / 3)
+    half = width / 2
+    head = min(width / 2 + 10, length / 3)
     outline = (
         f"M18 {-half:.1f}H{length - 18 - head:.1f}v{-_HEAD}L{length - 18:.1f} 0"
         f"L{length - 18 - head:.1f} {half + _HEAD:.1f}V{half:.1f}H18Z"

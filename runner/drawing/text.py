@@ -27,7 +27,8 @@ class TextDrawing:
     """Draws states of one scene."""
 
     def __init__(self, scene: SceneDescription) -> None:
-        self._rows, self._columns = scene["rows"], scene["columns"]
+        self._rows = scene["rows"]
+        self._columns = scene["columns"]
         self._walls = {frozenset((tuple(one), tuple(other))) for one, other in scene["walls"]}
         self._landmarks = {tuple(mark["cell"]): mark for mark in scene["landmarks"]}
         self._things = scene["things"]

@@ -146,7 +146,8 @@ class MultiAgent:
         arguments: Mapping[str, object] | None = None,
     ) -> None:
         self.env = env
-        self.creator, self.arguments = creator, arguments
+        self.creator = creator
+        self.arguments = arguments
         self.unwrapped = env.unwrapped
         agents = self.unwrapped.possible_agents
         self.possible_agents = sorted(agents, key=lambda agent: (isinstance(agent, str), agent))

@@ -190,16 +190,20 @@ def _transitions_from_p(
     p: Mapping[int, Mapping[int, list[tuple[float, int, ArrayLike, bool]]]],
 ) -> Transitions:
     """Return arrays from Gymnasium's `P[state][action] = [(probability, next state, reward, terminated)]`."""
-    states, actions = len(p), len(p[0])
+    states = len(p)
+    actions = len(p[0])
     most = max(len(outcomes) for row in p.values() for outcomes in row.values())
     shape = (states, actions, most)
-    next_state, probability = np.zeros(shape, np.int32), np.zeros(shape)
-    rewards, terminated = np.zeros((*shape, 1)), np.zeros(shape, np.bool_)
+    next_state = np.zeros(shape, np.int32)
+    probability = np.zeros(shape)
+    rewards = np.zeros((*shape, 1))
+    terminated = np.zeros(shape, np.bool_)
     for s, row in p.items():
         for a, outcomes in row.items():
             for k, (chance, successor, reward, over) in enumerate(outcomes):
                 next_state[s, a, k], probability[s, a, k] = successor, chance
-                rewards[s, a, k, 0], terminated[s, a, k] = float(np.sum(reward)), over
+                rewards[s, a, k, 0] = float(np.sum(reward))
+                terminated[s, a, k] = over
     return {
         "next_state": next_state,
         "probability": probability,

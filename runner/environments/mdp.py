@@ -304,7 +304,8 @@ def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
         array = getattr(mdp, name)
         is_valid = isinstance(array, np.ndarray) and array.dtype == kind
         yield f"{name} must be an array of {np.dtype(kind)}", is_valid, array
-    shape, size = mdp.next_state.shape, sum(array.nbytes for array in mdp.arrays().values())
+    shape = mdp.next_state.shape
+    size = sum(array.nbytes for array in mdp.arrays().values())
     limit = f"its arrays may take {MAX_ARRAYS_BYTES:,} bytes, to be recorded"
     yield limit, size <= MAX_ARRAYS_BYTES, f"{size:,}"
     three = mdp.next_state.ndim == 3 and mdp.next_state.size > 0

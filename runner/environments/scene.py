@@ -97,7 +97,8 @@ def scene_mistake(
         checked = msgspec.convert(json.loads(json.dumps(dict(scene))), SceneDescription)
     except (msgspec.ValidationError, TypeError, ValueError, RecursionError) as error:
         return f"the scene: {mistake_in_words(error, scene)}"
-    things, last_cell = len(checked["things"]), checked["rows"] * checked["columns"] - 1
+    things = len(checked["things"])
+    last_cell = checked["rows"] * checked["columns"] - 1
     return (
         _content_mistake(checked)
         or _array_mistake("cells", cells, np.int16, (states, things), (0, last_cell))

@@ -80,7 +80,9 @@ def _taxi(env_id: str, base: Any, arrays: Transitions) -> GridWorld:
     carriers = np.full(cells.shape, -1, np.int8)
     carriers[aboard, 1] = 0
     after = passenger[arrays["next_state"]]
-    before, pickup, drop_off = passenger[:, None, None], _action(arrays, 4), _action(arrays, 5)
+    before = passenger[:, None, None]
+    pickup = _action(arrays, 4)
+    drop_off = _action(arrays, 5)
     stayed = after == before
     return GridWorld(
         scene=_scene(

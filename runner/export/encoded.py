@@ -102,7 +102,8 @@ class Thumbnails:
 def thumbnails(path: Path, phase: str, episode: int, frames: int) -> Thumbnails:
     """Return pictures of the first frames of an episode."""
     require("PIL.Image", extra="plots", purpose="the pictures of a report")
-    result, every = Thumbnails(), -(-frames // MAX_PICTURES)
+    result = Thumbnails()
+    every = -(-frames // MAX_PICTURES)
     latest = b""
     try:
         with closing(encoded_pictures(path, phase, episode)) as pictures:

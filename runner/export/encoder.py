@@ -94,7 +94,8 @@ class Encoder:
         """Frames that were added."""
         self.size = 0, 0
         """Width and height in pixels, known after the first frame."""
-        self._form, self._rate = form, Fraction(fps).limit_denominator(1000)
+        self._form = form
+        self._rate = Fraction(fps).limit_denominator(1000)
         try:
             av.codec.Codec(form.codec, "w")
         except av.codec.codec.UnknownCodecError as error:
@@ -130,7 +131,8 @@ class Encoder:
         """Add a frame."""
         if self._stream is None:
             self._open(frame.width, frame.height)
-        frame.pts, frame.time_base = self.frames, 1 / self._rate
+        frame.pts = self.frames
+        frame.time_base = 1 / self._rate
         self.frames += 1
         self._container.mux(self._stream.encode(frame))
 

@@ -107,7 +107,8 @@ def write_grid(
         film = stack.enter_context(encoder(path, fps))
         for _ in range(max(one.frames for one in films)):
             for place, frames in enumerate(decoded):
-                top, left = place // columns * height, place % columns * each_width
+                top = place // columns * height
+                left = place % columns * each_width
                 for frame in islice(frames, 1):
                     canvas[top : top + frame.shape[0], left : left + frame.shape[1]] = frame
             film.add(canvas)
@@ -132,7 +133,8 @@ def captioned(shot: Shot, width: int | None) -> Iterator[Pixels]:
             size = _size(picture.pixels.shape[1], picture.pixels.shape[0], width)
             frame_width = max(size[0], _LEAST_WIDTH)
             text = 17 if frame_width >= 400 else 12
-            line, inner = round(1.4 * text), frame_width - 2 * _MARGIN
+            line = round(1.4 * text)
+            inner = frame_width - 2 * _MARGIN
             heading = wrapped(shot.heading, inner, text, 2, bold=True)
             top = line * len(heading) + _MARGIN
             height = top + size[1] + _LINES * line + _MARGIN

@@ -105,7 +105,8 @@ def report(
     from runner.export.reports.rendering import framed
     from runner.export.reports.report import render_report
 
-    paths, style = [at_hand(run).recording for run in runs], CurveStyle(lines, smooth, log_x, log_y)
+    paths = [at_hand(run).recording for run in runs]
+    style = CurveStyle(lines, smooth, log_x, log_y)
     page, _ = render_report(paths, axis=axis_of(axis), style=style)
     page = page.replace("</head>", f"{_FRAME_STYLE}</head>", 1)
     title = ", ".join(f"{run.name}, run {run.run_id}" for run in runs)
@@ -144,7 +145,8 @@ def plot(
     from runner.export.plots.image import write_image
     from runner.export.plots.style import CurveStyle
 
-    style, over = CurveStyle(lines, smooth, log_x, log_y), axis_of(axis)
+    style = CurveStyle(lines, smooth, log_x, log_y)
+    over = axis_of(axis)
     series = series_of((at_hand(run).recording for run in runs), over)
     groups = groups_of(series)
     buffer = io.BytesIO()

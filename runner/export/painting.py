@@ -58,7 +58,8 @@ def paint_recorded(recording: Recording, phase: str, episode: int, seen: Iterato
     for frame in recorded_frames(recording, phase, episode, steps=steps):
         if shown is None or frame is not last:
             where = f"{recording.path}: the frame at {frame['log_time']} ns"
-            last, shown = frame, _like(np.asarray(decoded(frame["data"], where)), shown)
+            last = frame
+            shown = _like(np.asarray(decoded(frame["data"], where)), shown)
         yield shown
 
 
@@ -116,13 +117,16 @@ def redrawn(
     blocks: Any = rerun_in_child(
         recording.path, phase, episodes, render=True, trust=trust, draw_from=draw_from
     )
-    waiting, episode, t = iter(episodes), episodes[0], draw_from
+    waiting = iter(episodes)
+    episode = episodes[0]
+    t = draw_from
     with closing(blocks):
         for steps in blocks:
             differs = steps.difference
             first = [start.frame for start in steps.starts if start.frame is not None and not draw_from]
             if first:
-                episode, t = next(waiting), 0
+                episode = next(waiting)
+                t = 0
             frames = [*first, *steps.frames]
             if differs is not None:  # the last of them is not a picture of what was recorded
                 frames = frames[:-1]
@@ -140,7 +144,8 @@ def redrawn(
 
 def paint_observation(recording: Recording, seen: Iterator[Seen]) -> Painted:
     """Show the image in each observation; if the first was lost, the second in its place."""
-    values, lost = Values(recording), 0
+    values = Values(recording)
+    lost = 0
     for observation, _ in seen:
         if observation is None:
             lost = 1

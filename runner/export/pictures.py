@@ -95,7 +95,8 @@ def moments_of(
 
     `seen` are the steps of the episode as `observations_of` yields them, if they are read already.
     """
-    describe, steps = describer(recording, phase), len(recording.phase(phase).episode(episode))
+    describe = describer(recording, phase)
+    steps = len(recording.phase(phase).episode(episode))
     returns = np.zeros(len(recording.agents))
     unpaid = tuple(returns.tolist())
     for t, (observation, step) in enumerate(seen or observations_of(recording, phase, episode)):
@@ -226,7 +227,9 @@ def paint(
             return Painting(source, "", has_failed, _continued(next(redrawn), redrawn))
         except CannotRedo as error:
             redrawn.close()
-            source, reason, has_failed = source_of_recorded(recording, phase, episode), str(error), True
+            source = source_of_recorded(recording, phase, episode)
+            reason = str(error)
+            has_failed = True
     seen = seen or observations_of(recording, phase, episode, first)
     match source:
         case PictureSource.SCENE:

@@ -63,7 +63,8 @@ class Measures:
 
 def measures(recording: Recording) -> Iterator[Measures]:
     """Yield reports of training, evaluations, their exact metrics, and the values that a loop logged."""
-    agents, exact_values = recording.agents, {f"exact/{name}": field for name, field in _EXACT.items()}
+    agents = recording.agents
+    exact_values = {f"exact/{name}": field for name, field in _EXACT.items()}
     for phase in PHASES:
         for row in recording.phase(phase).metrics.decoded():
             values = _named(row, {name: name for name in _TRAINING}, agents)
@@ -81,7 +82,8 @@ def measures(recording: Recording) -> Iterator[Measures]:
         yield _measures("eval", row, _named(row, exact_values, agents))
     for scalar in recording.table(SCALAR_TOPIC).decoded():
         if math.isfinite(scalar["value"]):
-            position, step = scalar["log_time"] // STEP_NANOSECONDS, training_steps_before(scalar)
+            position = scalar["log_time"] // STEP_NANOSECONDS
+            step = training_steps_before(scalar)
             values = {f"logged/{scalar['name']}": scalar["value"]}
             yield Measures(scalar["phase"], position, step, scalar["episode"], values)
 

@@ -119,7 +119,8 @@ def _with_episodes(
 ) -> Iterator[pa.RecordBatch]:
     """Yield extras with the places of their steps, whose table has this schema."""
     for batch in batches:
-        steps, numbers = recording.phase(batch["phase"][0].as_py()).steps, batch["step"].to_numpy()
+        steps = recording.phase(batch["phase"][0].as_py()).steps
+        numbers = batch["step"].to_numpy()
         names = [name for name in _OF_STEP if name in (steps.row_dtype.names or ())]
         first, last = (batch["position"][k].as_py() * STEP_NANOSECONDS for k in (0, -1))
         blocks = steps.rows(range(first, last + 1))

@@ -32,7 +32,9 @@ def write_events(recording: Recording, folder: Path) -> int:
     from tensorboardX.proto.summary_pb2 import Summary
     from tensorboardX.record_writer import RecordWriter
 
-    began, at, count = recording.created.timestamp(), times(recording), 0
+    began = recording.created.timestamp()
+    at = times(recording)
+    count = 0
     writer = RecordWriter(str(folder / f"events.out.tfevents.{int(began)}.{recording.run_id}"))
     try:
         writer.write(Event(wall_time=began, file_version="brain.Event:2").SerializeToString())

@@ -33,7 +33,9 @@ def thumbnail(recording: Recording, phase: str, episode: int, title: str) -> str
             WIDTH, HEIGHT, title, f'<text {where} font-size="13" fill="#808080">no steps</text>'
         )
     drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
-    states, rewards, count = [], [np.zeros(1)], 0
+    states = []
+    rewards = [np.zeros(1)]
+    count = 0
     for rows in tables.episode(episode).rows(0):
         rewards.append(rows["rewards"].sum(axis=1))
         if drawing is not None:
@@ -53,7 +55,8 @@ def _curve(values: Sequence[float], title: str) -> str:
     """Return a curve without axes."""
     finite = [value for value in values if np.isfinite(value)]
     low, high = min(finite, default=0.0), max(finite, default=0.0)
-    across, up = WIDTH / max(1, len(values) - 1), (HEIGHT - 20) / ((high - low) or 1.0)
+    across = WIDTH / max(1, len(values) - 1)
+    up = (HEIGHT - 20) / ((high - low) or 1.0)
     points = " ".join(
         f"{k * across:.1f},{HEIGHT - 10 - (value - low) * up:.1f}"
         for k, value in enumerate(values)

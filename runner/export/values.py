@@ -109,7 +109,8 @@ def observations_of(recording: Recording, phase: str, episode: int, start: int =
     first = max(0, start - 1)
     for t, step in enumerate(transitions_of(recording, phase, episode, first), first):
         if recording.tabular:
-            where, name = str(recording.path), schema.PHASE_NAMES[phase]
+            where = str(recording.path)
+            name = schema.PHASE_NAMES[phase]
             recording.mdp.check_steps(np.asarray(step).reshape(1), where, name)
         if start == 0 and t == 0 and recording.has_states:
             yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None

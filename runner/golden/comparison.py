@@ -243,7 +243,8 @@ def error_rates(scores: Sequence[float], margin: float, error_rate: float) -> tu
 
     Both are shares of samples of as many scores, drawn from these with a fixed seed.
     """
-    random, values = np.random.default_rng(0), np.unique(scores)
+    random = np.random.default_rng(0)
+    values = np.unique(scores)
     golden, new = random.choice(scores, (2, _SAMPLES, len(scores)))
     if len(values) == 2:
         loss = margin / float(values[1] - values[0])

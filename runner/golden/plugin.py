@@ -86,7 +86,10 @@ class Golden:
         tell: Callable[[str], None],
     ) -> None:
         self.recordings = recordings
-        self._folder, self._test, self._pages, self._is_update = folder, test, pages, is_update
+        self._folder = folder
+        self._test = test
+        self._pages = pages
+        self._is_update = is_update
         self._tell = tell
 
     def same_bytes(self, run: Run, name: str = "") -> None:

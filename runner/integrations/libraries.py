@@ -68,7 +68,8 @@ class Callback:
         options_of(recordings, options, valid=CallbackOptions.__annotations__)
         if not is_whole(checkpoint_every, 0, 2**62):
             raise ConfigError(f"checkpoint_every: found {checkpoint_every!r}, expected a whole number from 0")
-        self._recordings, self._checkpoint_every = recordings, checkpoint_every
+        self._recordings = recordings
+        self._checkpoint_every = checkpoint_every
         self._options: Arguments = {name: value for name, value in options.items() if value is not None}
         if make := checked_make(options.get("make")):
             self._options["make"] = make

@@ -118,7 +118,8 @@ class Recording(Callback, BaseCallback):  # type: ignore[misc]
                     "found arguments of Recording for environments that runner.record records, expected "
                     "checkpoint_every at most: give the others to runner.record"
                 )
-            self._envs, self._is_own = base, False
+            self._envs = base
+            self._is_own = False
             return
         earlier = RecordedVecEnv.replacing(base)
         if earlier is not None:

@@ -89,13 +89,15 @@ class ScriptRun:
         self._options = {"on_error": "warn"} | options
         self.settings: Json = {}
         """The script's settings, which may be changed until the recording begins."""
-        self.name, self.takes_writers = name, takes_writers
+        self.name = name
+        self.takes_writers = takes_writers
         self.closed = False
         self.has_writer: bool | None = None
         """Whether a `SummaryWriter` writes into the run; None where none is expected."""
         self.log_last: Callable[[], None] = lambda: None
         """Logs what is known at the end only; called before the run is closed."""
-        self._recordings, self._has_environment = recordings, has_environment
+        self._recordings = recordings
+        self._has_environment = has_environment
         self._tags = tuple(tag for tag in tags if is_tag(tag))
         if left_out := [tag for tag in tags if not is_tag(tag)]:
             warn_user(f"tags: {', '.join(map(repr, left_out))} cannot be tags of a run, and are left out.")
@@ -104,7 +106,8 @@ class ScriptRun:
         self.calls: int | None = None
         """The number of calls so far, where the script's tracker counts them; None where it does not."""
         self._waiting: list[tuple[str, object, int | None, int | None]] = []
-        self._since, self._waiting_bytes = 0.0, 0
+        self._since = 0.0
+        self._waiting_bytes = 0
         self._loop: Loop | None = None
         self._is_own = False
         """Whether this run made the loop, and closes it."""
@@ -192,10 +195,13 @@ class ScriptRun:
         """Let values wait for the next recording: this one failed, or was ended."""
         self._loop = None
         self._step = None
-        self._has_joined, self._since, self._waiting_bytes = not self._is_own, 0.0, 0
+        self._has_joined = not self._is_own
+        self._since = 0.0
+        self._waiting_bytes = 0
         if self._is_own:
             self._release()
-            self._is_own, self._has_environment = False, False
+            self._is_own = False
+            self._has_environment = False
             self.run_id, before = self._new_run_id(), self.run_id
             self.warn_once(f"run {before} has ended: further values go into run {self.run_id}.")
         update_hooks()

@@ -77,7 +77,8 @@ def logs(convert: Callable[..., object], arguments: str, **layout: object) -> Ca
         chosen = {key: by_name.get(key, default) for key, default in layout.items()}
         self.script.log(name, Media(convert, value, **chosen), step)
 
-    method.__name__, method.__doc__ = arguments, f"Log a value; takes {', '.join(names)}."
+    method.__name__ = arguments
+    method.__doc__ = f"Log a value; takes {', '.join(names)}."
     return forgiving(method)
 
 

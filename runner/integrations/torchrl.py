@@ -158,7 +158,8 @@ def _record_batch(rec: RecordedBatches, data: Any, carrier: Any, env: Any) -> No
     """Record the steps of a batch, [*environments, time]; the carrier has the observations that follow."""
     number = env.batch_size.numel()
     data = data.reshape(number, -1).transpose(0, 1)
-    after, done = data["next"], data["next", "done"]
+    after = data["next"]
+    done = data["next", "done"]
     keys = list(env.observation_spec.keys(include_nested=True, leaves_only=True))
     finals = after.select(*keys)
     last = finals[-1:]

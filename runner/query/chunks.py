@@ -93,7 +93,8 @@ class Relation(ds.Dataset):  # type: ignore[misc]
     def __init__(
         self, columns: pa.Schema, read: Callable[[pa.Schema, Condition], Iterator[pa.RecordBatch]]
     ) -> None:
-        self._columns, self._read = columns, read
+        self._columns = columns
+        self._read = read
 
     @property
     def schema(self) -> pa.Schema:
@@ -102,7 +103,8 @@ class Relation(ds.Dataset):  # type: ignore[misc]
 
     def scanner(self, columns: Sequence[str] | None = None, filter: Any = None, **_: object) -> Any:  # noqa: A002
         """Return what DuckDB uses of a scanner, which would read ahead in threads of its own."""
-        names, condition = columns or self._columns.names, Condition(filter, self._columns)
+        names = columns or self._columns.names
+        condition = Condition(filter, self._columns)
         shown = _selected(self._columns, lambda name: name in names)
         read = _selected(self._columns, lambda name: name in names or condition.mentions(name))
         batches = self._read(read, condition)
@@ -181,7 +183,8 @@ def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -
     """Return what is known of the chunks of a topic."""
     starts, ends = _times_of(chunks)
     ranges = {"position": (starts // STEP_NANOSECONDS, ends // STEP_NANOSECONDS)}
-    topic, same = chunks.topic, {"run": (recording.run_id, recording.run_id)}
+    topic = chunks.topic
+    same = {"run": (recording.run_id, recording.run_id)}
     if topic.phase in schema.PHASES:
         same["phase"] = (topic.phase, topic.phase)
     if topic.message in schema.NUMBERED_BY and chunks.dtype is not None:
@@ -232,7 +235,8 @@ def _batches_of_archive(
     rows = archive.count(*table.topics)
     if not rows:
         return
-    run_id, where = archive.run_id, f"{store.place(archive.run_id)}/{table.name}"
+    run_id = archive.run_id
+    where = f"{store.place(archive.run_id)}/{table.name}"
     places = {name: k for k, name in enumerate(table.columns.names) if name in _COMPARED}
     try:
         with (

@@ -235,9 +235,12 @@ class EpisodeParser(Parser[Part]):
 
     def named(self, node: ast.expr) -> Part:
         """Return the column that a node names: `next_observation[2]` is next_observation_2."""
-        text, columns = self.text_of(node)[:60], self.facts.columns(self._is_inside)
+        text = self.text_of(node)[:60]
+        columns = self.facts.columns(self._is_inside)
         if (column := columns.get(spelt(text))) is None:
-            hint, more, reason = nearest(text, [*columns, *AGGREGATES]), "", f"no {text}; {_OTHERS}"
+            hint = nearest(text, [*columns, *AGGREGATES])
+            more = ""
+            reason = f"no {text}; {_OTHERS}"
             if not self._is_inside:
                 more = ", any(), count(), then()"
                 if spelt(text) in self.facts.columns(True):

@@ -106,12 +106,10 @@ class EpisodeIndex:
         The files, by their age, are cut where a name says so. Thus a pack is made once, and a new file, which
         comes last, changes none. It is named by its files and their times. Packs of other files are removed.
         """
-        kind, folder, chosen, loose = (
-            kind_of(next(iter(files))),
-            self.folder / "packs",
-            list[Path](),
-            set(files),
-        )
+        kind = kind_of(next(iter(files)))
+        folder = self.folder / "packs"
+        chosen = list[Path]()
+        loose = set(files)
         alike = sorted((p.stat().st_mtime_ns, p) for p in self._files.values() if kind_of(p) == kind)
         cuts = [k for k, (_, p) in enumerate(alike, 1) if not int(p.stem[-2 * _HEX : -_HEX], 16) % _PACKED]
         groups = [alike[start:stop] for start, stop in pairwise([0, *cuts])]
@@ -142,7 +140,8 @@ class EpisodeIndex:
         _check(row, runs)
         run = at_hand(listed_run(Path(row["root"], row["entry"]), row["id"]))
         with open_recording(run.recording) as recording:
-            shape, unknown = Batches(recording).shape, Evaluation(-1, 0, -1, -1)
+            shape = Batches(recording).shape
+            unknown = Evaluation(-1, 0, -1, -1)
             evaluations = pa.Table.from_pylist(list(map(vars, (unknown, *evaluations_of(recording)))))
             actions = _names_of_actions(shape, recording)
         connection = self._database.connection
@@ -213,7 +212,8 @@ def register_steps(connection: Any, steps: Relation, extras: Relation | None) ->
     An extra that a step lacks is NULL, a flag false.
     """
     connection.register("own_steps", steps)
-    columns, joined = list(steps.schema), ""
+    columns = list(steps.schema)
+    joined = ""
     if extras is not None and "step" in steps.schema.names:
         connection.register("extras", extras)
         named = f"SELECT phase, step, COLUMNS('^{layout.EXTRA_PREFIX}') FROM extras"
@@ -282,7 +282,9 @@ def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
 
 def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, Sequence[str]]:
     """Return the names of actions by number, by the column of steps."""
-    train, space, agents = recording.train, recording.spaces.get("action", {}), recording.agents
+    train = recording.train
+    space = recording.spaces.get("action", {})
+    agents = recording.agents
     if shape.mdp is not None:
         own = zip(shape.own_actions, action_names(shape.mdp) or (), strict=False)
         return {"action": train.action_names(), **dict(own)}

@@ -196,9 +196,11 @@ def find(
         raise RunnerError(f"limit: found {limit!r}, expected a whole number from 1, or None for all.")
     if phase not in (None, *PHASES):
         raise RunnerError(f"phase: found {phase!r}, expected train or eval.")
-    chosen, condition = parse(runs), expression.strip()
+    chosen = parse(runs)
+    condition = expression.strip()
     if are_words(condition):
-        words, condition = parse(condition).condition, "True"
+        words = parse(condition).condition
+        condition = "True"
         chosen = chosen.also(words) if words is not None else chosen
     for _ in range(2):
         search = _Search(SelectedRuns(recordings, chosen, report), memory)
@@ -365,7 +367,8 @@ def _hit(run: IndexRow, row: Json, marks: Sequence[Mark]) -> Hit:
 
 def _parsed(facts: Facts, condition: str, sort: str, reads_steps: bool) -> _Question:
     parser = EpisodeParser(condition, facts, reads_steps)
-    where, key = parser.whole().sql, "0"
+    where = parser.whole().sql
+    key = "0"
     if sort:
         sorting = EpisodeParser(sort, facts, reads_steps, parser.aggregates, parser.windows)
         key = sorting.whole(NUMBER).sql

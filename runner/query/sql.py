@@ -69,7 +69,10 @@ class Database:
     ) -> None:
         duckdb = require("duckdb", extra="sql", purpose=f"`{name}`")
         self._errors = (duckdb.Error, pa.ArrowException, RuntimeError)
-        self._name, self._runs, self._seconds, self._memory = name, runs, seconds, memory
+        self._name = name
+        self._runs = runs
+        self._seconds = seconds
+        self._memory = memory
         self._deadline = time.monotonic() + (seconds or threading.TIMEOUT_MAX)
         config = {**_SETTINGS, **settings, "memory_limit": f"{memory}MB"}
         self.connection = duckdb.connect(":memory:", config=config)
@@ -117,7 +120,8 @@ class QueryResult:
     """The rows of a query, which are read once: as batches, a table, or a frame."""
 
     def __init__(self, query: str, runs: SelectedRuns, seconds: float | None, memory: int) -> None:
-        self._runs, self._database = runs, Database("sql", runs, memory, seconds)
+        self._runs = runs
+        self._database = Database("sql", runs, memory, seconds)
         try:
             self._reader = self._database.call(self._begin, query)
         except BaseException:

@@ -75,9 +75,11 @@ class SelectedRuns:
     def __init__(self, recordings: Recordings, chosen: Filter, report: Tell) -> None:
         if not isinstance(recordings, list | tuple):
             recordings = [recordings_folder(recordings)]
-        self._roots, self._chosen = recordings, chosen
+        self._roots = recordings
+        self._chosen = chosen
         self.rows = look(recordings, lambda index: index.select(chosen, columns=_ROW))
-        self._report, self._reported = report, time.monotonic()
+        self._report = report
+        self._reported = time.monotonic()
         self._read_runs: set[str] = set()
         self._read_rows = 0
         self.left_out: dict[str, dict[str, str]] = {}
@@ -173,7 +175,8 @@ class SelectedRuns:
         """Return the view of a table, with the columns of all of these runs."""
         from runner.query.chunks import Relation, opened_tables  # imports pandas
 
-        kinds, rows = {"run": pa.string()}, []
+        kinds = {"run": pa.string()}
+        rows = []
         for row in among:
             with self.reading(name, row) as run, opened_tables(run) as tables:
                 table = tables.shape.tables.get(TABLES[name])
@@ -225,7 +228,8 @@ def _batches_of(
     tables: RunTables, file: str, own_names: Mapping[str, str], needed: pa.Schema, condition: Condition
 ) -> Iterator[pa.RecordBatch]:
     table = tables.shape.tables[file]
-    names, run_id = [own_names[name] for name in needed.names], pa.scalar(tables.shape.run_id)
+    names = [own_names[name] for name in needed.names]
+    run_id = pa.scalar(tables.shape.run_id)
     stored = [name for name in names if name in table.columns.names]
     unknown = {*names} - {*stored, "run"} if file == layout.STEPS else set[str]()
     masks = {name: mask for name, mask in tables.shape.event_masks.items() if name in unknown}

@@ -220,16 +220,19 @@ def collect(
         first = "" if script is None else _within(root, script)
         return ([first] if first else []) + [path for path in _modules(root) if path != first]
 
-    repository, problems = Repository(folder), []
+    repository = Repository(folder)
+    problems = []
     try:
         repository = read_repository(folder, used, on_commit=lambda found: on_commit(_place_in_git(found)))
         problems += repository.problems + ([] if repository.commit else ["there is no commit yet"])
     except NotRecorded as reason:
         problems.append(str(reason))
-    root, sources = repository.root.resolve(), _Sources()
+    root = repository.root.resolve()
+    sources = _Sources()
     outputs = "" if recordings is None else _within(root, recordings)
     untracked = [path for path in repository.untracked if not (outputs and path.startswith(f"{outputs}/"))]
-    paths, others = used(root), [path for path in untracked if Path(path).suffix in _SOURCES]
+    paths = used(root)
+    others = [path for path in untracked if Path(path).suffix in _SOURCES]
     changed = [path for path in repository.changed if Path(path).suffix in _SOURCES or is_secret_file(path)]
     if script is not None and paths:
         sources.add_file(root, paths[0])

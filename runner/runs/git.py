@@ -179,7 +179,9 @@ class _Git:
     """Runs git in a folder, up to a deadline."""
 
     def __init__(self, program: str, folder: Path, deadline: float, seconds: float) -> None:
-        self._program, self._deadline, self._seconds = program, deadline, seconds
+        self._program = program
+        self._deadline = deadline
+        self._seconds = seconds
         self.folder = folder
         self.settings = list(_SETTINGS)
         self.message = ""

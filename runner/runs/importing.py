@@ -99,9 +99,11 @@ def import_recording(
         record = exported if details is None else details
         facts = checked_facts(opened, record)
         contents = [checkpoint.digest for checkpoint in read_checkpoints(opened, recordings)]
-    own_labels, marks = record.get("labels"), marks_from(record.get("marks"))
+    own_labels = record.get("labels")
+    marks = marks_from(record.get("marks"))
     labels = labels_from(own_labels) if isinstance(own_labels, dict) else Labels()
-    digest, anonymous = content_of(recording), exported.get("anonymous") is True
+    digest = content_of(recording)
+    anonymous = exported.get("anonymous") is True
     if as_new:
         facts["run_id"] = new_run_id(recordings)
     target = recordings / facts["run_id"]
@@ -111,7 +113,8 @@ def import_recording(
     existing = None if as_new else _existing_run(target)
     preview = existing if existing is not None and PREVIEW in existing.facts else None
     if preview is not None:
-        existing, labels = None, _merged(preview.labels, labels)
+        existing = None
+        labels = _merged(preview.labels, labels)
         marks = read_marks(preview.folder).merged(marks.marks, marks.removed)
     if existing is not None and _has_content(existing, digest):
         merge_marks(existing, marks)
@@ -150,7 +153,8 @@ def run_facts(recording: Recording, details: JsonView) -> Json:
     where they are of the right type. Only the recording can say that the run finished.
     """
     facts = recorded_facts(recording)
-    summary, given = dict(facts["summary"]), details.get("summary")
+    summary = dict(facts["summary"])
+    given = details.get("summary")
     given = given if isinstance(given, dict) else {}
     seconds, error = given.get("seconds"), given.get("error")
     if is_number(seconds) and 0 <= seconds < 1e12:

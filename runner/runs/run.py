@@ -337,7 +337,8 @@ def new_run_id(recordings: Path) -> str:
 
 
 def _random_id() -> str:
-    number, letters = secrets.randbelow(len(_ID_ALPHABET) ** _ID_LENGTH), []
+    number = secrets.randbelow(len(_ID_ALPHABET) ** _ID_LENGTH)
+    letters = []
     for _ in range(_ID_LENGTH):
         number, letter = divmod(number, len(_ID_ALPHABET))
         letters.append(_ID_ALPHABET[letter])
@@ -440,7 +441,8 @@ def label(
 
 def command_for(run: Run, verb: str, *options: str) -> str:
     """Return the command line of a verb for a run, with --recordings if its folder is not the default."""
-    words, root = ["dualtaxi", verb, run.run_id, *options], run.folder.parent
+    words = ["dualtaxi", verb, run.run_id, *options]
+    root = run.folder.parent
     if root.absolute() != recordings_folder().absolute():
         words += ["--recordings", shlex.quote(os.fspath(root))]
     return " ".join(words)

@@ -137,7 +137,8 @@ class Store:
 
     def only_of(self, runs: Iterable[str]) -> dict[str, int]:
         """Return the contents that only these runs refer to, with their bytes."""
-        leaving, known = set(runs), set(self.runs())
+        leaving = set(runs)
+        known = set(self.runs())
         staying = {digest for run in known - leaving for digest in self.of_run(run)}
         own = {digest for run in known & leaving for digest in self.of_run(run)}
         return {digest: self._size(digest) for digest in sorted(own - staying)}
@@ -180,7 +181,8 @@ def _is_old(path: Path) -> bool:
 
 def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> tuple[str, int]:
     """Write a new file, and sync it; return its digest and size."""
-    digest, size = blake3(), 0
+    digest = blake3()
+    size = 0
     with path.open("xb") as stream:
         for piece in pieces:
             stream.write(piece)

@@ -73,7 +73,8 @@ def mark(folder: Path, environment: EnvironmentMaker | JsonView | None) -> None:
     if environment is None or _marks_nothing or (key := _key(True)) is None:
         return
     text = _canonical(environment)
-    before, digest = mark_of(folder), hashlib.sha256(text.encode()).hexdigest()
+    before = mark_of(folder)
+    digest = hashlib.sha256(text.encode()).hexdigest()
     if digest in before.environments:
         return
     folders, script = _own_places(text)

@@ -181,7 +181,10 @@ class Computation:
     def __init__(
         self, cache: ResponseCache, processes: ProcessPool, spooling: CapacityLimiter, request: Request
     ) -> None:
-        self._cache, self._processes, self._spooling, self._request = cache, processes, spooling, request
+        self._cache = cache
+        self._processes = processes
+        self._spooling = spooling
+        self._request = request
 
     async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
         """Return the result of a function.

@@ -90,7 +90,8 @@ def what_if_page(path: Path, at: EpisodeRef, action: str | None, start: int, ste
     It is the branch of `action`, None for the recorded one.
     """
     with open_recording(path) as recording:
-        found, base = what_if(recording, at=at), f"/runs/{recording.run_id}/"
+        found = what_if(recording, at=at)
+        base = f"/runs/{recording.run_id}/"
         number = next(row.action for row in found.actions if row.is_recorded)
         if action is not None:
             number = joint_action(recording.mdp, action)
@@ -161,7 +162,8 @@ def maps(path: Path, state: Sequence[str] = ()) -> bytes:
     with open_recording(path) as recording:
         form, number = "", 0
         if recording.tabular and svg.drawing_of(recording.mdp) is not None:
-            problem, number = "", start_of(recording, EpisodeRef.parse(TYPICAL))
+            problem = ""
+            number = start_of(recording, EpisodeRef.parse(TYPICAL))
             try:
                 number = state_of(recording.mdp, ", ".join(state)) if state else number
             except ConfigError:
@@ -199,11 +201,14 @@ def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
 
 def pictures(path: Path) -> bytes:
     """Return the last pictures and films that were logged under a name, the newest first, as HTML."""
-    figures, size = list[Figure](), 0
+    figures = list[Figure]()
+    size = 0
     with open_recording(path) as recording:
         images = recording.table(schema.IMAGE_TOPIC)
         for image in images.newest():
-            name, data, step = image["frame_id"], image["data"], image["log_time"] // schema.STEP_NANOSECONDS
+            name = image["frame_id"]
+            data = image["data"]
+            step = image["log_time"] // schema.STEP_NANOSECONDS
             size += len(data)
             if len(figures) == MAX_PICTURES or size > MAX_PICTURE_BYTES:
                 break

@@ -61,8 +61,11 @@ class Guard:
         sessions: Sessions,
         refusal: Callable[[Request, RunnerError], Response],
     ) -> None:
-        self._app, self._settings = app, settings
-        self._tokens, self._sessions, self._refusal = tokens, sessions, refusal
+        self._app = app
+        self._settings = settings
+        self._tokens = tokens
+        self._sessions = sessions
+        self._refusal = refusal
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -148,7 +151,8 @@ class Guard:
         """Return the response to a request that is refused; a browser is redirected to the login."""
         is_login_needed = status_of(error) == HTTPStatus.UNAUTHORIZED and request.method == "GET"
         if is_login_needed and requests_page(request):
-            path, query = request.scope["path"], request.scope["query_string"].decode("latin-1")
+            path = request.scope["path"]
+            query = request.scope["query_string"].decode("latin-1")
             target = f"{path}?{query}" if query else path
             return RedirectResponse(f"/login?{urlencode({'next': target})}", HTTPStatus.SEE_OTHER)
         return self._refusal(request, error)
@@ -158,8 +162,12 @@ class Body:
     """The body of a request, within limits of size and pace."""
 
     def __init__(self, receive: Receive, max_bytes: int, idle_seconds: float) -> None:
-        self._receive, self._max_bytes, self._idle = receive, max_bytes, idle_seconds
-        self._began, self._length, self._more = time.monotonic(), 0, True
+        self._receive = receive
+        self._max_bytes = max_bytes
+        self._idle = idle_seconds
+        self._began = time.monotonic()
+        self._length = 0
+        self._more = True
 
     async def receive(self) -> Message:
         """Return its next part; after its end there is no limit on waiting.

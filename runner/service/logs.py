@@ -77,7 +77,8 @@ def logged_to(stream: TextIO, for_people: bool = False) -> Iterator[None]:
     handler.setFormatter(TextFormatter() if for_people else JsonFormatter())
     for name in _LOGGERS:
         logger = logging.getLogger(name)
-        logger.handlers, logger.propagate = [handler], False
+        logger.handlers = [handler]
+        logger.propagate = False
         logger.setLevel(logging.WARNING if for_people else logging.INFO)
     listener = _Listener(lines, _DescriptorHandler(stream.fileno()))
     listener.start()
@@ -163,7 +164,9 @@ class AccessLog:
         if scope["type"] != "http" or not LOG.isEnabledFor(logging.INFO):
             await self._app(scope, receive, send)
             return
-        began, status, size = time.perf_counter(), 0, 0
+        began = time.perf_counter()
+        status = 0
+        size = 0
 
         async def count(message: Message) -> None:
             nonlocal status, size

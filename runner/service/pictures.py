@@ -125,7 +125,8 @@ class PictureStream:
         if isinstance(made, str):
             self._note = made
         else:
-            self._has_ended, self._problem = True, str(made or "")
+            self._has_ended = True
+            self._problem = str(made or "")
         return None
 
     def _work(self, make: Make, start: int) -> None:

@@ -111,7 +111,9 @@ class ProcessPool:
         keep_seconds: float = 0.0,
         max_waiting: int = 32,
     ) -> None:
-        self._seconds, self._memory_bytes, self._keep_seconds = seconds, memory_bytes, keep_seconds
+        self._seconds = seconds
+        self._memory_bytes = memory_bytes
+        self._keep_seconds = keep_seconds
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # it would print to the service's stdout
         self._context = process_context(PRELOADED)
         self._threads = ThreadPoolExecutor(processes, "processes")
@@ -149,7 +151,8 @@ class ProcessPool:
 
         Arguments and errors are as for `submit`; by default it has the time of the pool.
         """
-        doing, limit = _Doing(), seconds or self._seconds
+        doing = _Doing()
+        limit = seconds or self._seconds
         future = self._submit(lambda child: doing.by(child).call(function, limit, *args))
         waiting = asyncio.wrap_future(future)
         try:

@@ -83,7 +83,8 @@ async def find_page(request: Request, search: SearchOf) -> Response:
 
             asked = search.model_dump()
             answer = await _answer(request, computed.find, *asked.values())
-            found, kept = TypeAdapter(Found).validate_json(answer), link("", asked).removeprefix("?")
+            found = TypeAdapter(Found).validate_json(answer)
+            kept = link("", asked).removeprefix("?")
             shown |= {"found": found, "links": [link(hit.replay, {"found": kept}) for hit in found.hits]}
     except RunnerError as error:
         shown["problem"] = error

@@ -35,7 +35,8 @@ class ResponseCache:
     """Response bodies by key; the least recently used ones are dropped beyond a number of bytes."""
 
     def __init__(self, max_bytes: int) -> None:
-        self._max_bytes, self._bytes = max_bytes, 0
+        self._max_bytes = max_bytes
+        self._bytes = 0
         self._responses: OrderedDict[Hashable, _Response] = OrderedDict()
         self._pending: dict[Hashable, _Pending] = {}
 

@@ -74,7 +74,8 @@ def sweep_importance(name: str, recordings: Path, digest: str) -> bytes:
 
 def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
     """Return the charts of a sweep as HTML: its parameters, and learning curves of some of its trials."""
-    results, sections = _results(name, recordings, digest), []
+    results = _results(name, recordings, digest)
+    sections = []
     with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
         sections.append(parameters_section(picture_of(results)))
     try:

@@ -101,9 +101,11 @@ class _RecordsFile(Generic[Record]):
             version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
             if version != self._version:
                 entries = read_object(self.path, _MAX_FILE_BYTES)[self._key]
-                self._records, self._version = self._adapter.validate_python(entries), version
+                self._records = self._adapter.validate_python(entries)
+                self._version = version
         except FileNotFoundError:
-            self._records, self._version = (), None
+            self._records = ()
+            self._version = None
         except OSError as error:
             raise StorageError(f"{self.path}: cannot be read ({error.strerror}).") from error
         except (ValueError, KeyError):
@@ -218,7 +220,8 @@ class Sessions:
 
     def _current(self, sessions: tuple[LoginSession, ...]) -> list[LoginSession]:
         """Return the sessions that have not ended and whose token exists."""
-        ids, now = {token.id for token in self._tokens.all()}, time.time()
+        ids = {token.id for token in self._tokens.all()}
+        now = time.time()
         return [session for session in sessions if session.token_id in ids and session.expires > now]
 
 

@@ -99,7 +99,9 @@ class Uploads:
     def __init__(
         self, recordings: Path, limits: ServiceLimits, on_verified: Callable[[Upload], object]
     ) -> None:
-        self._recordings, self._limits, self._on_verified = recordings, limits, on_verified
+        self._recordings = recordings
+        self._limits = limits
+        self._on_verified = on_verified
         self._folder = recordings / FOLDER
         self._lock = threading.RLock()
         """Held while uploads change, not while they are read: the server's event loop must not wait."""
@@ -241,7 +243,8 @@ class Uploads:
 
     def _require_room(self, upload: Upload, more: int) -> None:
         """Refuse an upload if there is no room for more of its bytes."""
-        end, limit = upload.offset + more, self._limits.upload_bytes
+        end = upload.offset + more
+        limit = self._limits.upload_bytes
         limit = limit if upload.size is None else min(limit, upload.size)
         if end > limit:
             raise UploadTooLarge(f"found {end:,} bytes, expected at most {limit:,}.")
@@ -266,7 +269,8 @@ class Uploads:
         over = 0
         for upload in self.all():
             over += upload.is_over
-            body, changed = self._body(upload), 0.0
+            body = self._body(upload)
+            changed = 0.0
             with contextlib.suppress(OSError):
                 changed = (body.with_name(STATE_FILE) if upload.is_over else body).stat().st_mtime
             is_old = time.time() - changed > IDLE_SECONDS or (upload.is_over and over > self._limits.uploads)
@@ -325,7 +329,8 @@ def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
         # must not look like that of a recording that is too large.
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    source, lock = upload.source, FileLock(body.with_name("verifying.lock"))
+    source = upload.source
+    lock = FileLock(body.with_name("verifying.lock"))
     with storage_errors(body), lock:  # the process of a server that was killed may still have it
         if hash_of(body)[1] != source.digest:
             raise RecordingError("found another digest than sent: bytes changed on the way; send it again.")

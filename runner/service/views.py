@@ -54,7 +54,8 @@ def _add_routes(view: View) -> None:
             return Response(body, media_type=media_type)
 
         answer.__annotations__["given"] = Annotated[given_type, Query()]
-        path, description = f"/{view.name}{ending}", f"As `dualtaxi {view.name}` returns it."
+        path = f"/{view.name}{ending}"
+        description = f"As `dualtaxi {view.name}` returns it."
         described = {"name": path[1:], "summary": summary, "description": description} | options
         api.get(f"/runs/{{run}}{path}", tags=["reading"], **described)(answer)
 
@@ -172,7 +173,8 @@ def _type_of(view: View) -> type[BaseModel]:
             limits["allow_inf_nan"] = False
         default: Any = ... if given.required else given.default
         if given.multiple:
-            kind, default = tuple[kind, ...], ()
+            kind = tuple[kind, ...]
+            default = ()
         return kind, Field(default, alias=given.name, description=given.help, **limits)
 
     fields: Any = _NAMES.get(view.subject, {}) | {name: declared(each) for name, each in view.inputs.items()}

@@ -91,8 +91,10 @@ def picture_of(results: Results) -> ChartPicture:
     drawn = tuple(itertools.compress(results.ranking, is_drawn.tolist()))
     if not drawn:
         raise RunnerError(_nothing_to_draw(results))
-    parameters, objective = results.sweep.file.parameters, results.sweep.objective
-    values, ranges = figures[is_drawn, 0], figures[is_drawn, 1:]
+    parameters = results.sweep.file.parameters
+    objective = results.sweep.objective
+    values = figures[is_drawn, 0]
+    ranges = figures[is_drawn, 1:]
     at = f"first at {objective.level:g}, episodes" if objective.at == "first_over" else objective.at
     return ChartPicture(
         trials=drawn,
@@ -162,7 +164,8 @@ def sweep_sheet(title: str, picture: ChartPicture, groups: Sequence[Group], pane
     parameters = [parameter_chart(picture, axis) for axis in picture.axes]
     columns = 2 if len(parameters) in (2, 4) else min(3, len(parameters))
     row_height = max(chart.height for chart in parameters)
-    parallel, curves = parallel_chart(picture), panel_chart(panel, len(groups))
+    parallel = parallel_chart(picture)
+    curves = panel_chart(panel, len(groups))
     notes = [(line, palette.INK) for line in textwrap.wrap(picture.footnote, _MAX_NOTE_LENGTH)]
     for number, group in enumerate(groups):
         lines = textwrap.wrap(group.label, _MAX_NOTE_LENGTH, subsequent_indent="    ")
@@ -248,10 +251,8 @@ def _trial_line(chart: Chart, heights: Values, colour: str, width: float, opacit
 def _label_column(chart: Chart, column: int, axis: ParameterAxis) -> None:
     """Write the choices, or the lowest and the highest value, next to an axis of parallel coordinates."""
     if axis.choices:
-        ends, texts = (
-            np.arange(len(axis.choices), dtype=np.float64),
-            [textwrap.shorten(choice, 18) for choice in axis.choices],
-        )
+        ends = np.arange(len(axis.choices), dtype=np.float64)
+        texts = [textwrap.shorten(choice, 18) for choice in axis.choices]
     else:
         ends = np.array([np.nanmin(axis.values), np.nanmax(axis.values)])
         texts = [f"{end:,.4g}" for end in ends]

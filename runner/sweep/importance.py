@@ -91,7 +91,8 @@ def effects_of_grid(
     The interval is over resampled seeds.
     """
     shape = tuple(map(count_of, parameters.values()))
-    names, rng = list(parameters), np.random.default_rng(0)
+    names = list(parameters)
+    rng = np.random.default_rng(0)
 
     def shares_of(points: Iterable[Floats]) -> dict[tuple[str, ...], float]:
         shares = shares_of_variance(np.array(list(map(np.median, points))).reshape(shape))
@@ -129,10 +130,11 @@ def _effects(
 ) -> list[Effect]:
     """Return each exact share, or the median of those resampled, with its interval, the largest first."""
     effects = []
-    for parameters in resampled[0] if resampled else ():
-        shares = [each[parameters] for each in resampled]
-        low, middle, high = np.quantile(shares, [0.025, 0.5, 0.975]).tolist()
-        effects.append(Effect(parameters, exact[parameters] if exact else middle, low, high))
+    if resampled:
+        for parameters in resampled[0]:
+            shares = [each[parameters] for each in resampled]
+            low, middle, high = np.quantile(shares, [0.025, 0.5, 0.975]).tolist()
+            effects.append(Effect(parameters, exact[parameters] if exact else middle, low, high))
     return sorted(effects, key=lambda effect: -effect.share)
 
 

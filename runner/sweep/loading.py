@@ -129,7 +129,8 @@ def _base(
         within = read_yaml(text, str(path))
     else:
         within = _part(document, "base")
-    seeds, places = file.model_dump(mode="json")["seeds"], _places(document.places, "recording")
+    seeds = file.model_dump(mode="json")["seeds"]
+    places = _places(document.places, "recording")
     recorded = {key: Document(value, _places(places, key)) for key, value in file.recording.items()}
     put(
         within,

@@ -58,12 +58,13 @@ class Workers(ABC, Generic[T, R]):
     def collect(self, seconds: float) -> list[tuple[T, R | None]]:
         """Wait up to this time for tasks to end; return them with their results (None if the worker died)."""
         done: list[tuple[T, R | None]] = []
-        for key in self._ready(seconds) if self._busy else ():
-            worker, task = self._busy.pop(key)
-            result = self._result(worker, key)
-            done.append((task, result))
-            if result is not None:
-                self._idle.append(worker)
+        if self._busy:
+            for key in self._ready(seconds):
+                worker, task = self._busy.pop(key)
+                result = self._result(worker, key)
+                done.append((task, result))
+                if result is not None:
+                    self._idle.append(worker)
         return done
 
     @abstractmethod

@@ -30,7 +30,8 @@ Curve = dict[int, float]
 
 def curve_of(recording: Recording, metric: str) -> Curve:
     """Return the finite readings of a metric at the evaluations of a recording."""
-    agents, events = recording.agents, recording.environment["event_names"]
+    agents = recording.agents
+    events = recording.environment["event_names"]
     exact = {
         measures["evaluation"]: measures for measures in recording.table(schema.OPTIMALITY_TOPIC).decoded()
     }

@@ -101,7 +101,8 @@ def require_disk(plan: Plan, done: int, recordings: Path) -> None:
     Raises:
         StorageError: there is too little space.
     """
-    needed, free = max(0, plan.runs - done) * plan.bytes_per_run, free_bytes(recordings)
+    needed = max(0, plan.runs - done) * plan.bytes_per_run
+    free = free_bytes(recordings)
     if needed > free:
         raise StorageError(
             f"{recordings}: {plan.runs - done:,} runs need about {size(needed)}, and {size(free)} are free: "

@@ -149,7 +149,8 @@ def yaml_of(sweep: Sweep, trial: Trial) -> str:
 
     Its runs record steps, so that they can be replayed.
     """
-    name, seeds = f"{sweep.name}_best", fresh_seeds(sweep.seeds)
+    name = f"{sweep.name}_best"
+    seeds = fresh_seeds(sweep.seeds)
     config = sweep.config(trial.values | {"name": name, "recording.steps": "all", "seeds": seeds})
     result = f"{objective_text(trial.value)}, the median over {len(trial.results)} seeds"
     return (

@@ -130,7 +130,9 @@ class _Runner:
 
     def run(self, batch: list[Trial]) -> None:
         """Finish every queued run, or, when stopped, only those in progress."""
-        began, before, status = time.monotonic(), self.status.seconds, self.status
+        began = time.monotonic()
+        before = self.status.seconds
+        status = self.status
         while status.running or (self._waiting and not status.stopped):
             if not status.stopped and self.stop():
                 status.stopped = INTERRUPTED

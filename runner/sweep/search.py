@@ -37,7 +37,9 @@ class Search:
 
     def __init__(self, sweep: Sweep) -> None:
         self._optuna = require_optuna()
-        self._sweep, self._file = sweep, (file := sweep.file)
+        self._sweep = sweep
+        file = sweep.file
+        self._file = file
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
         sampler = file.searched.sampler(self._optuna.samplers, file.batch, file.search_seed % 2**32)
         self._study = self._optuna.create_study(sampler=sampler, direction=file.objective.direction)
@@ -68,7 +70,8 @@ class Search:
 
     def tell(self, number: int, value: float | None, pruned: bool, curve: Mapping[int, float]) -> None:
         """Report the result of a trial: its value and whether it was pruned; None if it failed."""
-        trial, states = self._asked_trials[number], self._optuna.trial.TrialState
+        trial = self._asked_trials[number]
+        states = self._optuna.trial.TrialState
         if value is None:
             self._study.tell(trial, state=states.FAIL)
             return

@@ -99,7 +99,8 @@ def run_task(task: Task, stop: Callable[[], bool]) -> Result:
 
 def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
     """Run a task in a temporary folder of this machine; then move its files into the recordings."""
-    target, prefix = Path(task.recordings) / task.run_id, f"dualtaxi-sweep-{task.run_id}-"
+    target = Path(task.recordings) / task.run_id
+    prefix = f"dualtaxi-sweep-{task.run_id}-"
     for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):  # by a worker that was killed
         shutil.rmtree(left, ignore_errors=True)
     with storage_errors(target), tempfile.TemporaryDirectory(prefix=prefix) as folder:
@@ -188,7 +189,8 @@ class _Pruner:
     """Stops a run once it falls behind the bounds of its task."""
 
     def __init__(self, task: Task, mdp: Mdp, stop: Callable[[], bool]) -> None:
-        self._task, self._stop = task, stop
+        self._task = task
+        self._stop = stop
         joint = task.config["tables"] == "joint" and len(mdp.agents) > 1
         self._agents = ("agency",) if joint else mdp.agents
         self._events = mdp.event_names

@@ -131,7 +131,8 @@ class JobResults:
     """
 
     def __init__(self, sweep: Sweep, recordings: Path) -> None:
-        self._sweep, self._recordings = sweep, recordings
+        self._sweep = sweep
+        self._recordings = recordings
         self._runs = state.runs_of(sweep.name, recordings)
         self._failures = state.failures_of(sweep.name, recordings)
         self._results = {

@@ -39,7 +39,8 @@ def run_whole_sweep(
     """
     with state.locked(sweep.name, recordings):
         state.require_startable(sweep, recordings, resume, accept_changes)
-        plan, before = plan_of(sweep), len(state.runs_of(sweep.name, recordings))
+        plan = plan_of(sweep)
+        before = len(state.runs_of(sweep.name, recordings))
         require_disk(plan, before, recordings)
         planned(plan, before)
         pool: Workers[Task, Result]

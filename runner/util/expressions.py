@@ -157,7 +157,8 @@ class Parser(ABC, Generic[Part]):
 
     def _lines(self, start: int, length: int) -> str:
         first = max(0, start - _AROUND)
-        shown, marks = self.text[first : start + _AROUND], "^" * min(length, _AROUND)
+        shown = self.text[first : start + _AROUND]
+        marks = "^" * min(length, _AROUND)
         return f"\n  {shown}\n  {' ' * (start - first)}{marks}"
 
     def text_of(self, node: ast.expr) -> str:

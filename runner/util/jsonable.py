@@ -102,15 +102,20 @@ def _exact(value: Any) -> Any:
     content: object
     if kind in _COLLECTIONS:
         parts = value if kind is tuple else sorted(value, key=repr)
-        tag, content = _COLLECTIONS[kind], [_exact(part) for part in parts]
+        tag = _COLLECTIONS[kind]
+        content = [_exact(part) for part in parts]
     elif kind is dict:
-        tag, content = "$dict", [[_exact(key), _exact(part)] for key, part in value.items()]
+        tag = "$dict"
+        content = [[_exact(key), _exact(part)] for key, part in value.items()]
     elif kind is float:
-        tag, content = "$float", repr(value)
+        tag = "$float"
+        content = repr(value)
     elif (kind is np.ndarray or isinstance(value, np.generic)) and value.dtype.kind in "biuf":
-        tag, content = "$array" if kind is np.ndarray else "$number", packed(value)
+        tag = "$array" if kind is np.ndarray else "$number"
+        content = packed(value)
     else:
-        tag, content = _INEXACT, as_json(value)
+        tag = _INEXACT
+        content = as_json(value)
     return {tag: content}
 
 
@@ -166,7 +171,8 @@ class _Conversion:
     """One conversion, bounded: a graph of few objects can stand for endless JSON."""
 
     def __init__(self, packs: bool) -> None:
-        self._packs, self._left = packs, MAX_VALUES
+        self._packs = packs
+        self._left = MAX_VALUES
         self._path: set[int] = set()
 
     def of(self, value: Any) -> Any:

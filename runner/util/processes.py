@@ -102,7 +102,8 @@ def starting_processes(with_main: bool = True, hash_seed: int | None = None) -> 
     """
     with _starting:
         variables = {_SAFE_PATH: "1"} | ({} if hash_seed is None else {_HASH_SEED: str(hash_seed)})
-        main, path = sys.modules["__main__"], sys.path
+        main = sys.modules["__main__"]
+        path = sys.path
         before = {name: os.environ.get(name) for name in variables}
         os.environ.update(variables)
         sys.path = _without_current_folder(path)

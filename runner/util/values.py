@@ -118,7 +118,8 @@ def is_too_deep(value: object, depth: int = 0) -> bool:
             elif isinstance(item, list):
                 inner += item
         parts = (item for item in inner if item.__class__ not in _PLAIN)
-        level, depth = [item for item in parts if isinstance(item, Mapping | list)], depth + 1
+        level = [item for item in parts if isinstance(item, Mapping | list)]
+        depth += 1
     return False
 
 

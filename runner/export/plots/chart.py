@@ -190,7 +190,8 @@ class Chart(Canvas):
 
     def __init__(self, x: Scale, y: Scale, width: float, height: float, title: str) -> None:
         super().__init__(width, height, title)
-        self.x, self.y = x, y
+        self.x = x
+        self.y = y
 
     def frame(self, title: str, title_y: float, x_label: str = "", y_labels: Sequence[str] = ()) -> None:
         """Draw the title, the axes without ticks, and their labels."""

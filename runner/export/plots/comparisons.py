@@ -120,7 +120,8 @@ def letter(number: int) -> str:
 
 
 def _draw_group(chart: Chart, group: GroupResult, row: int, number: int) -> None:
-    colour, height = series_colour(number), chart.y.at(row)
+    colour = series_colour(number)
+    height = chart.y.at(row)
     values = np.array([value for value in group.values if math.isfinite(value)])
     spread = np.linspace(-1, 1, len(values)) if len(values) > 1 else np.zeros(len(values))
     chart.markers(values, row + _SPREAD * spread, colour, 0, 1.2, opacity=0.45)
@@ -136,5 +137,6 @@ def draw_estimate(chart: Chart, estimate: Estimate, row: int, number: int, radiu
     if math.isfinite(estimate.low):
         ends = [(chart.x.at(end), chart.y.at(row)) for end in (estimate.low, estimate.high)]
         chart.shape(ends, stroke=series_colour(number), width=radius + 0.4)
-    value, at = np.array([estimate.value]), np.array([float(row)])
+    value = np.array([estimate.value])
+    at = np.array([float(row)])
     chart.markers(value, at, series_colour(number), series_marker(number), radius, edge=palette.INK)

@@ -72,7 +72,8 @@ def curves_sheet(groups: Sequence[Group], panels: Sequence[Panel], style: CurveS
     sheet = Canvas(width, head + HEIGHT * rows + 8 + 10 * len(notes), f"Metrics over {groups[0].axis.title}")
     sheet.text(10, 20, sheet.title, size=13, bold=True)
     for number, group in enumerate(groups):
-        colour, y = series_colour(number), 36.0 + 14 * number
+        colour = series_colour(number)
+        y = 36.0 + 14 * number
         sheet.shape([(12, y - 3), (36, y - 3)], stroke=colour, width=1.5, is_curve=True)
         key = np.array([[24, y - 3]])
         sheet.marks.append(Markers(key, series_marker(number), 2, colour, colour, 1.0))
@@ -109,7 +110,8 @@ def footnote(groups: Sequence[Group], panels: Sequence[Panel], style: CurveStyle
 
 def panel_chart(panel: Panel, groups: int, style: CurveStyle = PLAIN) -> Chart:
     """Return the chart of a metric: curves of groups of runs over their axis."""
-    is_shares, style = panel.metric == SHARES, style_of(panel, style)
+    is_shares = panel.metric == SHARES
+    style = style_of(panel, style)
     x = _x_scale(panel, style, 461.0 if is_shares else 280.0)
     y = _y_scale(panel, style)
     width = 2 * WIDTH if is_shares else WIDTH
@@ -191,9 +193,10 @@ def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, style: Cu
     if (curve.high > curve.low)[shown].any():
         low = np.maximum(curve.low[shown], chart.y.low) if style.log_y else curve.low[shown]
         chart.band(curve.places[shown], low, curve.high[shown], colour, opacity=0.2)
-    for run in curve.runs if style.lines and len(curve.runs) > 1 else ():
-        is_visible = visible(curve.places, run, style)
-        chart.line(curve.places[is_visible], run[is_visible], colour, line, width=0.6, opacity=0.5)
+    if style.lines and len(curve.runs) > 1:
+        for run in curve.runs:
+            is_visible = visible(curve.places, run, style)
+            chart.line(curve.places[is_visible], run[is_visible], colour, line, width=0.6, opacity=0.5)
     if style.smooth:
         chart.line(curve.places[shown], curve.middle[shown], colour, line, width=0.8, opacity=0.35)
     values = _shown(panel, curve, style)

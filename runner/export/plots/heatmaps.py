@@ -54,13 +54,15 @@ def heatmap_chart(histogram: ValueCounts) -> Chart:
     rows = counts.shape[1]
     names = [shortened(name, _MAX_LETTERS) for name in histogram.names]
     left = max(56.0, 16 + _LETTER * max(map(len, names), default=0))
-    axis, x = axis_of(histogram.axis), Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
+    axis = axis_of(histogram.axis)
+    x = Scale(0.0, histogram.edges[-1], left, WIDTH - 16)
     low, high = (0.0, float(rows)) if histogram.names else (histogram.values[0], histogram.values[-1])
     y = Scale(low, high, HEIGHT - 34, 34.0)
     title = title_of(histogram)
     chart = Chart(x, y, WIDTH, HEIGHT, f"{title} over {axis.title}, {histogram.unit}")
     edges = np.arange(rows + 1.0) if histogram.names else np.array(histogram.values)
-    lines, columns = y(edges), x(np.array(histogram.edges))
+    lines = y(edges)
+    columns = x(np.array(histogram.edges))
     levels = np.ceil(shares / (shares.max() or 1.0) * (palette.LEVELS - 1)).astype(int)
     for level in np.unique(levels[levels > 0]).tolist():
         k, j = np.nonzero(levels == level)

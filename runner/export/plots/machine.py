@@ -37,7 +37,8 @@ class _Panel(NamedTuple):
 
 def machine_facts(clock: Clock, host: HostMetrics | None) -> dict[str, str]:
     """Return the facts of a run's time and of its machine, by name."""
-    sessions, rate = len(clock.earlier), clock.steps_a_second
+    sessions = len(clock.earlier)
+    rate = clock.steps_a_second
     facts = {
         "Time": humanize.duration(clock.duration) + (f", in {sessions} sessions" if sessions > 1 else ""),
         "Steps a second, mean": humanize.UNKNOWN if rate is None else f"{rate:,.0f}",
@@ -71,7 +72,8 @@ def _host_panels(host: HostMetrics) -> list[_Panel]:
     ]
     gpus = [f"GPU {k}" for k in range(host.gpus)]
     if gpus:
-        use, memory = of["gpu_percent"].T, of["gpu_memory_bytes"].T / _GB
+        use = of["gpu_percent"].T
+        memory = of["gpu_memory_bytes"].T / _GB
         panels += [
             _Panel("GPU", "percent", dict(zip(gpus, use, strict=True)), 100.0),
             _Panel("GPU memory", "GB", dict(zip(gpus, memory, strict=True))),
@@ -100,7 +102,8 @@ def _plot(panel: _Panel, seconds: Values, duration: float) -> Figure:
     chart.frame(panel.title, 25.0 if len(usable) == 1 else 14.0, unit, [panel.unit])
     for number, values in enumerate(usable.values()):
         is_known = ~np.isnan(values)
-        places, shown = seconds[is_known] / divisor, values[is_known]
+        places = seconds[is_known] / divisor
+        shown = values[is_known]
         chart.line(places, shown, series_colour(number), number)
         if len(places) < 3:  # a line through one point is invisible
             chart.markers(places, shown, series_colour(number), series_marker(number), 1.7)

@@ -37,7 +37,9 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.x_ticks()
     for row, (name, each) in enumerate(rows):
-        middle, zero, end = chart.y.at(row), x.at(0), x.at(each.value)
+        middle = chart.y.at(row)
+        zero = x.at(0)
+        end = x.at(each.value)
         corners = [(zero, middle - 6), (end, middle - 6), (end, middle + 6), (zero, middle + 6)]
         chart.shape(corners, fill=series_colour(0), opacity=0.75 if each.excludes_zero else 0.3)
         if math.isfinite(each.low):
@@ -52,14 +54,16 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
 def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn]) -> Chart:
     """Return each mixture as a column: its values and their mean, and below a dot for what is changed."""
     values = np.array([value for one in columns for value in one.values])
-    bottom, last = 170.0, 184.0 + 16 * len(names)
+    bottom = 170.0
+    last = 184.0 + 16 * len(names)
     x = Scale(-0.6, len(columns) - 0.4, _NAMES, _WIDTH - 10)
     chart = Chart(x, Scale.around(values, bottom, 24.0), _WIDTH, last + 4, title)
     chart.y_ticks()
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.shape([(x.start, 24), (x.start, bottom), (x.end, bottom)], stroke=palette.INK)
     for column, one in enumerate(columns):
-        own, colour = np.array(one.values), series_colour(1 if one.is_marked else 0)
+        own = np.array(one.values)
+        colour = series_colour(1 if one.is_marked else 0)
         spread = np.linspace(-0.18, 0.18, len(own)) if len(own) > 1 else np.zeros(1)
         chart.markers(column + spread, own, colour, 0, 1.3, opacity=0.5)
         chart.line(np.array([column - 0.32, column + 0.32]), np.full(2, own.mean()), colour, width=2.2)

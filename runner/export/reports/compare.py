@@ -65,7 +65,8 @@ def _figures(metric: MetricResult, labels: list[str]) -> Iterator[Figure]:
         return
     yield Figure(intervals_svg(metric, labels), "Values")
     if len(metric.thresholds) > 1:
-        title, is_lower_better = f"{metric.title}: performance profile", metric.higher_is_better is False
+        title = f"{metric.title}: performance profile"
+        is_lower_better = metric.higher_is_better is False
         chart = profile_chart(
             "", title, metric.unit, metric.thresholds, metric.groups, labels, is_lower_better
         )

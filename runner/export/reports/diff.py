@@ -122,7 +122,8 @@ def _map(mdp: Mdp, distances: Floats, agent: str) -> Iterator[Figure]:
     drawing = svg.drawing_of(mdp)
     if drawing is None or len(drawing.movers) not in (1, 2) or not distances.max() > 0:
         return
-    state, movers = int(distances.argmax()), drawing.movers
+    state = int(distances.argmax())
+    movers = drawing.movers
     states = np.flatnonzero(situation(mdp, state, movers))
     values = on_grid(mdp, states, movers, distances[states])
     bounds = (0.0, float(np.nanmax(values)))

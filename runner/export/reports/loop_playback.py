@@ -87,11 +87,9 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     in_words = step_actions_in_words(recording, at.phase)
     agents = recording.agents if len(recording.agents) > 1 else ("",)
     before = np.zeros(len(recording.agents))
-    rewards, numbers, log_times = (
-        [np.empty((0, len(before)))],
-        [np.empty(0, np.int64)],
-        [np.empty(0, np.int64)],
-    )
+    rewards = [np.empty((0, len(before)))]
+    numbers = [np.empty(0, np.int64)]
+    log_times = [np.empty(0, np.int64)]
     actions: list[dict[str, str]] = []
     observations: list[list[Column]] = []
     reset = reset_of(recording, at.phase, number)
@@ -192,7 +190,10 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
     """Return what is shown of the observations, and a sentence on each thing that is not."""
     agents = recording.agents if len(recording.agents) > 1 else ()
     leaves = leaves_of(recording.spaces["observation"], f"{recording.path}: the observation space")
-    shown, notes, unseen, known = [], [], 0, observation_names(recording)
+    shown = []
+    notes = []
+    unseen = 0
+    known = observation_names(recording)
     left = max(MAX_SERIES // len(agents), _LEAST_SERIES) if agents else MAX_SERIES
     budget: defaultdict[str, int] = defaultdict(lambda: left)
     for leaf in leaves:
@@ -202,7 +203,8 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         if leaf.dtype is None:
             shown.append(_ShownPart(agent, (name,), leaf.path, is_text=True))
             continue
-        shape, count = leaf.dtype.shape, math.prod(leaf.dtype.shape)
+        shape = leaf.dtype.shape
+        count = math.prod(leaf.dtype.shape)
         if len(shape) > 1 and count > left:
             what = "an image" if is_image(leaf) else "an array"
             notes.append(f"{' '.join(filter(None, (agent, name))) or 'observation'}: {what}, {_sizes(shape)}")

@@ -106,16 +106,18 @@ def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state
     drawing = drawing_of(mdp)
     if drawing is None or mdp.scene is None or not stages:
         return []
-    rows, things = [], [mdp.scene["things"][mover] for mover in drawing.movers]
-    for learner, name in enumerate(learners) if len(things) == 2 else ():
-        whose = "" if len(learners) == 1 else f" of {spoken(name)}"
-        one, other = (thing["label"] for thing in things)
-        explanation = (
-            f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all "
-            "actions have the same value."
-        )
-        title = f"Highest Q-value{whose} for every pair of places"
-        rows.append(_row(title, explanation, mdp, stages, state, drawing.movers, learner))
+    rows = []
+    things = [mdp.scene["things"][mover] for mover in drawing.movers]
+    if len(things) == 2:
+        for learner, name in enumerate(learners):
+            whose = "" if len(learners) == 1 else f" of {spoken(name)}"
+            one, other = (thing["label"] for thing in things)
+            explanation = (
+                f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all "
+                "actions have the same value."
+            )
+            title = f"Highest Q-value{whose} for every pair of places"
+            rows.append(_row(title, explanation, mdp, stages, state, drawing.movers, learner))
     explanation = "Arrow: the greedy action in that cell. Grey: all actions have the same value there."
     for mover, thing in zip(drawing.movers, things, strict=True):
         agent = mdp.agents.index(thing["agent"]) if thing.get("agent") in mdp.agents else 0

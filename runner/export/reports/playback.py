@@ -77,7 +77,8 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
 
     Its description says so if not all steps are there.
     """
-    names_text, title = " and ".join(names), playback.title
+    names_text = " and ".join(names)
+    title = playback.title
     shown = len(playback.reward)
     part = "" if shown == playback.length else f" Shown are the first {shown:,} steps."
     return replace(
@@ -101,7 +102,9 @@ def tabular_playback(
     Of all its `steps`, which the environment can have, at most `limit` are shown, from step `first` on; the
     values are those of the steps shown. `ended` is a key of `ENDINGS`.
     """
-    mdp, agents, drawing = recording.mdp, recording.agents, svg.drawing_of(recording.mdp)
+    mdp = recording.mdp
+    agents = recording.agents
+    drawing = svg.drawing_of(recording.mdp)
     shown = steps[first : first + limit]
     distinct, state_of = np.unique(np.append(shown["state"], shown["next_state"][-1]), return_inverse=True)
     grid = None
@@ -110,7 +113,8 @@ def tabular_playback(
             drawing.places(mdp, distinct).reshape(len(distinct), -1).tolist(), state_of.tolist()
         )
     states = [str(word) for word in states_in_words(mdp)[distinct]]
-    named, actions = agent_actions_in_words(mdp), shown["action"].tolist()
+    named = agent_actions_in_words(mdp)
+    actions = shown["action"].tolist()
     taken = [actions] * len(values)
     if len(values) > 1:  # each learner has a table of its own actions
         taken = [list(own) for own in zip(*(agent_actions(mdp, action) for action in actions), strict=True)]

@@ -81,7 +81,9 @@ def render_report(
     curves = curves_section(groups, style, legend if len(legend) > 1 else [])
     articles = [run.article for run in runs]
     first, *others = articles[0].parts
-    lead, sections, source = articles[0].sentences, [first, curves, *others], "recording"
+    lead = articles[0].sentences
+    sections = [first, curves, *others]
+    source = "recording"
     if len(runs) > 1:
         headings = tuple(dict.fromkeys(heading for run in runs for heading in run.row))
         rows = [tuple(run.row.get(heading, UNKNOWN) for heading in headings) for run in runs]
@@ -89,7 +91,9 @@ def render_report(
         summary = Section(
             "Summary", ["The last evaluation of each run."], [Grid(headings, rows, links=links)]
         )
-        lead, sections, source = [], [summary, curves, *articles], "recordings"
+        lead = []
+        sections = [summary, curves, *articles]
+        source = "recordings"
     ids = ", ".join(f"run {run.row['run']}" for run in runs)
     notes = [note for run in runs for note in run.notes]
     page = render(
@@ -144,13 +148,15 @@ def _run(recording: Recording, chosen: Sequence[EpisodeRef], progress: Tell) -> 
     }
     if last is not None:
         row |= {heading: texts[0] for heading, texts in metric_columns([last], is_narrow=True).items()}
-    title, lead = f"{recording.title} ({recording.run_id})", " ".join(_lead(recording, last))
+    title = f"{recording.title} ({recording.run_id})"
+    lead = " ".join(_lead(recording, last))
     return ReportedRun(Section(title, [lead], parts=sections, is_article=True), row, notes)
 
 
 def _lead(recording: Recording, last: EvaluationRecord | None) -> Iterator[str]:
     """Yield what a run is, and what it achieved at last, a sentence each."""
-    config, recent = recording.config, recording.train.recent_means()
+    config = recording.config
+    recent = recording.train.recent_means()
     environment = recording.environment["env_id"].rpartition(":")[2]
     if not has_environment(config):
         yield f"Logged values, recorded by {config['made_by']}."
@@ -190,7 +196,8 @@ def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[Episod
     """
     if not recording.has_actions:
         return {}
-    last, ended = last_whole_evaluation(recording), recording.train.episodes.count()
+    last = last_whole_evaluation(recording)
+    ended = recording.train.episodes.count()
     reasons = [(at.resolved(recording), "chosen") for at in chosen]
     if last is not None:
         worst, typical, best = ranked_trials(recording, last)
@@ -221,13 +228,19 @@ def _player(recording: Recording, episodes: Mapping[EpisodeRef, list[str]], prog
                 raise
     if not shown:
         return None
-    picture, key, is_broad, first, scene = "", "", False, shown[0][1], recording.environment["scene"]
+    picture = ""
+    key = ""
+    is_broad = False
+    first = shown[0][1]
+    scene = recording.environment["scene"]
     if first.grid is not None and scene is not None:
         drawing = svg.SvgDrawing(scene)
         places = np.array(first.grid.places, np.int16)[first.grid.at[:1]].reshape(1, -1, 3)
         picture = drawing.frame(places[0], "The grid at the step shown below it", places, style="")
-        key, is_broad = drawing.key(), drawing.width > svg.BROAD
-    data, has_frames = [], False
+        key = drawing.key()
+        is_broad = drawing.width > svg.BROAD
+    data = []
+    has_frames = False
     for i, (at, episode) in enumerate(shown, 1):
         own = Thumbnails()
         if episode.grid is None:

@@ -49,7 +49,9 @@ class GridLabels:
         learners: Sequence[str],
         value_range: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        self.mdp, self.scene, self.learners = mdp, scene, tuple(learners)
+        self.mdp = mdp
+        self.scene = scene
+        self.learners = tuple(learners)
         self.texts: list[str] = []
         self._colours: list[str] = []
         self._masks = np.unique(np.append(mdp.events, np.uint32(0)))
@@ -63,7 +65,8 @@ class GridLabels:
         self._t = self._add([*(f"t = {k}" for k in range(self._longest)), f"t ≥ {self._longest}"])
         self._rewards: list[tuple[int, int, Floats]] = []
         """Learner, first label, and the rewards it can get, ascending."""
-        rewards, is_alone = mdp.rewards_of(len(learners)), len(learners) == 1
+        rewards = mdp.rewards_of(len(learners))
+        is_alone = len(learners) == 1
         for i, learner in enumerate(learners):
             distinct = np.unique(rewards[..., i])
             if len(distinct) <= MAX_REWARDS:
@@ -80,8 +83,9 @@ class GridLabels:
         self.stops = np.full((len(mdp.agents), max(mdp.action_counts) + 1), -1)
         """[agents, own actions + 1]: the letter of an action such as a pickup; -1 for a move or none."""
         for agent, names in enumerate(numbered_actions(mdp)):
-            for own in scene.stops if scene else ():
-                self.stops[agent, own] = self._add([names[own][0].upper()], palette.agent(agent))
+            if scene:
+                for own in scene.stops:
+                    self.stops[agent, own] = self._add([names[own][0].upper()], palette.agent(agent))
         self._add_levels(*value_range)
 
     def track(self) -> Track:
@@ -107,7 +111,9 @@ class GridLabels:
         scene = self.scene
         assert scene is not None
         rises = [MOVER_LABEL_Y] * len(scene.movers) + [PASSENGER_LABEL_Y] * len(scene.passengers)
-        y, left, right = scene.rows + STATUS_Y, 0.25 * scene.columns, 0.65 * scene.columns
+        y = scene.rows + STATUS_Y
+        left = 0.25 * scene.columns
+        right = 0.65 * scene.columns
         rewards = ((right, y + STATUS_LINE * k) for k in range(len(self._rewards)))
         status = repeated(pairs([(left, y), *rewards]), len(scene.points))
         return np.concatenate((scene.points + pairs((0, rise) for rise in rises), status), axis=1)

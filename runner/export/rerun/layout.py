@@ -81,7 +81,8 @@ def _alone(run: Writer) -> rrb.Container:
 
 def _compared(jobs: Sequence[Writer]) -> rrb.Container:
     """Return the arrangement of several jobs: side by side, above the lines of all."""
-    last, plots = max(job.last for job in jobs), []
+    last = max(job.last for job in jobs)
+    plots = []
     for title in dict.fromkeys(PLOTS.values()):
         if shown := [job.views[OVERVIEW, title] for job in jobs if (OVERVIEW, title) in job.views]:
             entities = [entity for _, of_job in shown for entity in of_job]
@@ -98,7 +99,8 @@ def _compared(jobs: Sequence[Writer]) -> rrb.Container:
 
 def _group(run: Writer, *groups: str) -> list[rrb.View]:
     """Return the views of groups, as many as are shown."""
-    views, titles = [], [*PLOTS.values()]
+    views = []
+    titles = [*PLOTS.values()]
     for group in groups:
         of_group = [(view, entities) for view, entities in run.views.values() if view.group == group]
         of_group.sort(key=lambda shown: titles.index(shown[0].name) if shown[0].name in titles else 0)

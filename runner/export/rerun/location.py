@@ -37,7 +37,8 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
             return Location(_default_time(recording, request), request)
         require_steps(recording, "look at")
         step = step.resolved(recording)
-        number, episode = step.episode, (step.episode, step.episode + 1)
+        number = step.episode
+        episode = (step.episode, step.episode + 1)
         added: dict[str, Any] = {"episodes": (*request.episodes, episode)}
         if step.after is not None:
             where = str(recording.path)

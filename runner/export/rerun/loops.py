@@ -66,7 +66,9 @@ class LoopTracks:
 
     def __init__(self, writer: Writer, phase: str) -> None:
         recording = self._recording = writer.recording
-        self._writer, self._phase, self._of_phase = writer, phase, recording.phase(phase)
+        self._writer = writer
+        self._phase = phase
+        self._of_phase = recording.phase(phase)
         if len(recording.agents) > 1:
             agents = enumerate(recording.agents)
             self._members = [Member(i, entity_name(a), i, _numbers(recording, a), a) for i, a in agents]
@@ -88,7 +90,8 @@ class LoopTracks:
                     if member.column == 0:  # agents have one length
                         named = member._replace(name="") if member.agent else member
                         yield self._line(named, "length", times, own["length"][:, np.newaxis])
-        recording, is_each_step = self._recording, frames_every(self._recording) == 1
+        recording = self._recording
+        is_each_step = frames_every(self._recording) == 1
         for frame in self._of_phase.frames.decoded():
             environment, _ = frame_place(frame)
             later = recording.environments - 1 - environment
@@ -127,7 +130,8 @@ class LoopTracks:
             numbers[~is_given] = np.nan
             yield self._line(member, quantity, times, numbers, [*names_in(name, values.shape[1:])])
             return
-        entity, title = _entity(self._phase, member.name, quantity), f"{member.name} {name}".strip()
+        entity = _entity(self._phase, member.name, quantity)
+        title = f"{member.name} {name}".strip()
         texts = TrackView("texts", title, rrb.TextDocumentView)
         bars = TrackView("bars", title, rrb.BarChartView)
         for step, value in zip(times["step"][is_given].tolist(), values.data[is_given], strict=True):
@@ -148,7 +152,8 @@ class LoopTracks:
         entity = _entity(self._phase, member.name, quantity)
         if entity in self._writer.entities:
             return Track(entity, times, scalars(values))
-        colours, lines = phase_colours(self._phase, len(names)), names
+        colours = phase_colours(self._phase, len(names))
+        lines = names
         if len(names) == 1:
             lines = [f"{self._phase} {member.name}".strip()]
             if member.name:
@@ -158,39 +163,46 @@ class LoopTracks:
         is_discrete = quantity == "action" and names == ["action"]
         if is_discrete:  # lines between such numbers mean nothing
             style = rr.SeriesPoints(names=lines, colors=colours, marker_sizes=[1.5])
-        tab, title = OVERVIEW, quantity.removeprefix("extra/")
+        tab = OVERVIEW
+        title = quantity.removeprefix("extra/")
         actions = self._of_phase.action_names(member.agent) if quantity == "action" else ()
         if 0 < len(actions) <= FEW:
             space = self._recording.spaces["action"]
             least = least_number(space["spaces"][member.agent] if member.agent else space)
             title = f"action: {', '.join(f'{i} {name}' for i, name in enumerate(actions, least))}"
         if member.name and len(names) > 1:
-            tab, title = title.capitalize(), f"{member.name} {title}"
+            tab = title.capitalize()
+            title = f"{member.name} {title}"
         view = TrackView(tab, title.replace("_", " "), has_focus=title not in ("return", "length"))
         return Track(entity, times, scalars(values), [style], view if member.number < MAX_MEMBERS else None)
 
     def drawn(self) -> Iterator[Track]:
         """Yield pictures of episodes that the environment draws, as far as it does what was recorded."""
-        recording, phase, selection = self._recording, self._phase, self._writer.selection
-        trust, episodes = selection.trust, selection.drawn.get(phase, ())
+        recording = self._recording
+        phase = self._phase
+        selection = self._writer.selection
+        trust = selection.trust
+        episodes = selection.drawn.get(phase, ())
         sources = {number: pictures.source_of(recording, phase, trust, number) for number in episodes}
         notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
         redrawable = pictures.PictureSource.REDRAWN
         chosen = [number for number, (source, _) in sources.items() if source is redrawable]
         number = 0
         try:
-            for number, t, pixels in redrawn(recording, phase, chosen, trust) if chosen else ():
-                if t == 0:
-                    after = [
-                        time // schema.STEP_NANOSECONDS for time in log_times_of(recording, phase, number)
-                    ]
-                    times, place = [after[0] - 1, *after], self._of_phase.episode(number).place
-                    count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
-                    self._writer.stage(f"drawing {phase} episode {count}")
-                if self._is_later(place, times[t]):
-                    yield self._frame(place, times[t], _picture(encoded_picture(pixels)))
-                if t == len(after):  # nothing is shown until the next picture
-                    yield self._frame(place, times[t] + recording.environments, rr.Clear(recursive=False))
+            if chosen:
+                for number, t, pixels in redrawn(recording, phase, chosen, trust):
+                    if t == 0:
+                        after = [
+                            time // schema.STEP_NANOSECONDS for time in log_times_of(recording, phase, number)
+                        ]
+                        times = [after[0] - 1, *after]
+                        place = self._of_phase.episode(number).place
+                        count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
+                        self._writer.stage(f"drawing {phase} episode {count}")
+                    if self._is_later(place, times[t]):
+                        yield self._frame(place, times[t], _picture(encoded_picture(pixels)))
+                    if t == len(after):  # nothing is shown until the next picture
+                        yield self._frame(place, times[t] + recording.environments, rr.Clear(recursive=False))
         except CannotRedo as error:
             notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
         for note in notes:
@@ -223,7 +235,8 @@ def logged_tracks(recording: Recording) -> Iterator[Track]:
             view = TrackView("picture", name, rrb.Spatial2DView)
             yield Track(f"picture/{name}", view=view, row=(time_of(image), _picture(data)))
     for time, array in recording.table(schema.ARRAY_TOPIC).parsed(decode_array):
-        name, tensor = entity_name(array.name), rr.Tensor(np.atleast_1d(array.values))
+        name = entity_name(array.name)
+        tensor = rr.Tensor(np.atleast_1d(array.values))
         view = TrackView("array", name, rrb.TensorView)
         yield Track(f"array/{name}", view=view, row=(time // schema.STEP_NANOSECONDS, tensor))
     for text in recording.table(schema.LOG_TOPIC).decoded():
@@ -233,8 +246,10 @@ def logged_tracks(recording: Recording) -> Iterator[Track]:
         names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
         for name in dict.fromkeys(names.tolist()):
             own = rows[names == name]
-            times, view = times_of(own["log_time"], episode=own["episode"]), name.replace("_", " ")
-            values, style = scalars(own["value"][:, np.newaxis]), [series_lines([name])]
+            times = times_of(own["log_time"], episode=own["episode"])
+            view = name.replace("_", " ")
+            values = scalars(own["value"][:, np.newaxis])
+            style = [series_lines([name])]
             yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
 
 
@@ -246,16 +261,17 @@ def _numbers(recording: Recording, agent: str = "") -> dict[str, list[str]]:
     """Return the names of the numbers of a step, of one agent or of all, that are drawn as lines."""
     numbers = {}
     has_grid = recording.tabular and recording.mdp.scene is not None
-    for quantity in () if has_grid or recording.train.steps.dtype is None else OBSERVED:
-        known = observation_names(recording) if quantity == "observation" else ()
-        names = [
-            name
-            for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
-            if not agent or leaf.path[0] == agent
-            for name in number_names(leaf, quantity, bool(agent), known)
-        ]
-        if 0 < len(names) <= MAX_LINES:
-            numbers[quantity] = names
+    if not (has_grid or recording.train.steps.dtype is None):
+        for quantity in OBSERVED:
+            known = observation_names(recording) if quantity == "observation" else ()
+            names = [
+                name
+                for leaf in leaves_of(recording.spaces[quantity], f"the {quantity} space")
+                if not agent or leaf.path[0] == agent
+                for name in number_names(leaf, quantity, bool(agent), known)
+            ]
+            if 0 < len(names) <= MAX_LINES:
+                numbers[quantity] = names
     return numbers
 
 

@@ -61,7 +61,8 @@ Without names it is one line for the phase, or one for each learner.
 
 def metric_tracks(run: Writer) -> Iterator[Track]:
     """Yield the tracks of all metrics of a job."""
-    recording, evaluations = run.recording, run.recording.eval.all_metrics()
+    recording = run.recording
+    evaluations = run.recording.eval.all_metrics()
     reports = sorted([*recording.train.all_metrics(), *evaluations], key=lambda row: int(row["log_time"]))
     learners = [spoken(name) for name in recording.agents]
     lines = _reported_lines(reports, evaluations, list(recording.mdp.event_names))
@@ -73,7 +74,8 @@ def metric_tracks(run: Writer) -> Iterator[Track]:
         colours = phase_colours(phase, len(names), run.tint)
         if name in SCHEDULES:
             number = SCHEDULES.index(name)
-            names, colours = [spoken(name)], [line_colours(1 + len(SCHEDULES), run.tint)[1 + number]]
+            names = [spoken(name)]
+            colours = [line_colours(1 + len(SCHEDULES), run.tint)[1 + number]]
             width = 3.0 - number  # visible on top of each other where their values are equal
         elif name == "filled_percent":
             names = learners if len(learners) > 1 else ["filled"]
@@ -117,10 +119,11 @@ def _reported_lines(
 ) -> Iterator[Lines]:
     """Yield what reports state of training, and the results of evaluations."""
     for phase, rows in zip(_FIELDS, (reports, evaluations), strict=True):
-        for name, field in _FIELDS[phase].items() if rows else ():
-            values = _numbers(rows, field)
-            if not np.isnan(values).all():
-                yield f"{phase}/metrics/{name}", _times(rows), values, ()
+        if rows:
+            for name, field in _FIELDS[phase].items():
+                values = _numbers(rows, field)
+                if not np.isnan(values).all():
+                    yield f"{phase}/metrics/{name}", _times(rows), values, ()
     counts = [dict(zip(row["rewards"], row["reward_counts"], strict=True)) for row in reports]
     if rewards := sorted({reward for row in counts for reward in row}):
         shares = [[100.0 * row.get(r, 0) / max(sum(row.values()), 1) for r in rewards] for row in counts]
@@ -152,7 +155,8 @@ def _episode_lines(
                 np.add.at(sums, np.searchsorted(ends, block["last_step"].astype(np.int64) + 1), values)
     some = np.flatnonzero(sums[:-1, -1])
     if len(some):
-        means, times = sums[some] / sums[some, -1:], _times([reports[k] for k in some.tolist()])
+        means = sums[some] / sums[some, -1:]
+        times = _times([reports[k] for k in some.tolist()])
         _, penalties, returns, happened = np.split(means, (1, 2, 2 + len(learners)), axis=1)
         yield "train/metrics/mean_penalties", times, penalties, ()
         yield "train/metrics/mean_return", times, returns, ()

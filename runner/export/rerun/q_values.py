@@ -88,7 +88,8 @@ class ValueReader:
 
     def _with_values(self, batch: Batch, trained: Ints, stride: int) -> Batch:
         """Return a batch with values, and with maps where anything but the movers changes."""
-        steps, context = batch.records, self._context[batch.records["state"]]
+        steps = batch.records
+        context = self._context[batch.records["state"]]
         is_new = batch.starts(self._last[0]) | (np.diff(context, prepend=self._last[1]) != 0)
         is_new |= steps["t"] == 0
         self._last = int(batch.times["step"][-1]), int(context[-1])
@@ -127,7 +128,8 @@ class ValueTracks:
 
     def __init__(self, phase: str, labels: GridLabels) -> None:
         self._phase, self._labels, mdp = phase, labels, labels.mdp
-        agents, self._own_actions = len(mdp.agents), mdp.own_actions
+        agents = len(mdp.agents)
+        self._own_actions = mdp.own_actions
         self._agent = np.repeat(np.arange(agents), mdp.action_counts)
         """[values]: the agent of each value."""
         self._first = np.cumsum((0, *mdp.action_counts[:-1]))
@@ -136,9 +138,12 @@ class ValueTracks:
         """[values]: the row of each value in the table, from top to bottom."""
         self._points = pairs((x, row - LABEL_RISE) for x in (NUMBER_X, GREEDY_X, CHOSEN_X) for row in y)
         """The points of each action's number, then of its mark as greedy, then of its mark as chosen."""
-        words, lines, colours = [], [], agent_colours(range(agents))
+        words = []
+        lines = []
+        colours = agent_colours(range(agents))
         for i, names in enumerate(numbered_actions(mdp)):
-            agent, rows = spoken(mdp.agents[i]), y[self._agent == i]
+            agent = spoken(mdp.agents[i])
+            rows = y[self._agent == i]
             words.append((NAME_X, rows[0] - 1.15, agent.upper(), colours[i]))
             words += [(NAME_X, row, name, GREY) for row, name in zip(rows, names, strict=True)]
             lines += [f"{agent} {name}" for name in names]
@@ -191,11 +196,16 @@ class MapTracks:
     """Makes a learner's map in one phase: the greatest value and the greedy moves of every placement."""
 
     def __init__(self, phase: str, labels: GridLabels, placements: Placements, learner: int) -> None:
-        scene, mdp, name = placements.scene, labels.mdp, labels.learners[learner]
-        self._learner, self._path, self._placements = learner, f"{phase}/map/{name}", placements
+        scene = placements.scene
+        mdp = labels.mdp
+        name = labels.learners[learner]
+        self._learner = learner
+        self._path = f"{phase}/map/{name}"
+        self._placements = placements
         is_joint = len(labels.learners) != len(mdp.agents)
         agents = [*range(len(mdp.agents))] if is_joint else [learner]
-        movers, agent_name = scene.agents, mdp.agents[agents[0]]
+        movers = scene.agents
+        agent_name = mdp.agents[agents[0]]
         self._order = placements.order(movers.index(agent_name) if agent_name in movers else 0)
         row, column = np.divmod(np.arange(len(self._order)), placements.width)
         centres = np.stack((column + 0.5, row + 0.5), axis=1).astype(np.float32)
@@ -237,13 +247,16 @@ class MapTracks:
 
     def of(self, batch: Batch) -> Iterator[Track]:
         """Yield where each step of a batch is in the map, and the maps that there are."""
-        state, path, placements = batch.records["state"], self._path, self._placements
+        state = batch.records["state"]
+        path = self._path
+        placements = self._placements
         here = self._here.take(state, axis=0)[:, None]
         boxes = columns(rr.Boxes2D, centers=here, half_sizes=np.full_like(here, 0.5))
         yield Track(f"{path}/here", batch.times, boxes)
         if not (n := len(batch.map_rows)):
             return
-        times, maps = batch.at(batch.map_rows), (batch.value_maps, batch.greedy_maps)
+        times = batch.at(batch.map_rows)
+        maps = (batch.value_maps, batch.greedy_maps)
         values, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
         with np.errstate(all="ignore"):
             low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)

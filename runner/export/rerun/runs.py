@@ -40,8 +40,11 @@ class RunReader:
     """Reads a run as tracks: an overview, of which all views of a job follow, then its steps."""
 
     def __init__(self, writer: Writer) -> None:
-        recording, spans = writer.recording, writer.selection.by_phase
-        self.writer, self._recording, self._is_job = writer, recording, recording.has_tables
+        recording = writer.recording
+        spans = writer.selection.by_phase
+        self.writer = writer
+        self._recording = recording
+        self._is_job = recording.has_tables
         scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
         self._makers: dict[str, list[Any]] = {
             phase: [] if self._is_job else [LoopTracks(writer, phase)] for phase in spans
@@ -112,7 +115,8 @@ class RunReader:
 
     def _batches(self, phase: str, values: ValueReader | None) -> Iterator[Batch]:
         """Yield the steps of a phase after checking them, at most a batch of each environment at a time."""
-        recording, train = self._recording, episodes_of(self._recording, "train")
+        recording = self._recording
+        train = episodes_of(self._recording, "train")
         plan = recording.config["evaluation"] if self._is_job else None
         trials = int(plan["trials"]) if plan else 2**63 - 1
         for steps in self._blocks(phase):
@@ -132,7 +136,8 @@ class RunReader:
 
     def _blocks(self, phase: str) -> Iterator[Records]:
         """Yield the steps of a phase in blocks of bounded size; values that vary in size as they are read."""
-        table, spans = self._recording.phase(phase).steps, self.writer.selection.by_phase[phase]
+        table = self._recording.phase(phase).steps
+        spans = self.writer.selection.by_phase[phase]
         limit = min(MAX_ROWS * self._recording.environments, _BATCH_BYTES // table.row_dtype.itemsize)
         blocks = map(taken, chain.from_iterable(map(table.numbered, spans)))
         parts = ([block] for block in blocks) if table.dtype is None else [blocks]
@@ -140,7 +145,8 @@ class RunReader:
 
     def _notice(self, x: float, y: float) -> Iterator[Track]:
         """Yield a notice on the grid for the times of which no steps were exported."""
-        last, entity = self.writer.last, "notice/text"
+        last = self.writer.last
+        entity = "notice/text"
         gaps = np.array([0, *sorted(self._edges), last + 1]).reshape(-1, 2)
         gaps = gaps[gaps[:, 0].clip(min=1) < gaps[:, 1]]
         if len(gaps):

@@ -116,7 +116,8 @@ class Placements:
         rows, columns = (scene.rows, scene.columns) if len(scene.movers) == 2 else (1, 1)
         self._shape = rows, scene.rows, columns, scene.columns
         """Rows of blocks, of cells in a block; columns of them."""
-        self.height, self.width = rows * scene.rows, columns * scene.columns
+        self.height = rows * scene.rows
+        self.width = columns * scene.columns
         cells = scene.cells[:, scene.movers]
         row, column = np.divmod(cells[:, 0], scene.columns)
         block_row, block_column = np.divmod(cells[:, 1:].sum(axis=1), scene.columns)
@@ -157,7 +158,8 @@ def background(scene: Scene, view: TrackView) -> Iterator[Track]:
         square = [(0.25, 0.25), (0.75, 0.25), (0.75, 0.75), (0.25, 0.75), (0.25, 0.25), (0.75, 0.75)]
         corners = np.array([mark["cell"][::-1] for mark in marks], np.float64)
         colours = [palette.rgb(mark["colour"]) for mark in marks]
-        tints, names = [(*colour, 110) for colour in colours], [mark["name"] for mark in marks]
+        tints = [(*colour, 110) for colour in colours]
+        names = [mark["name"] for mark in marks]
         cells = list(corners[:, None] + square)
         parts["landmarks"] = rr.LineStrips2D(cells, colors=tints, radii=0.23, draw_order=5)
         parts["names"] = labels_alone(

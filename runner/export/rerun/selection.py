@@ -121,7 +121,8 @@ def select(recording: Recording, request: Request) -> Selection:
     Raises:
         NotInRecording: an episode or an evaluation does not exist.
     """
-    selection, is_job = Selection(trust=request.trust, warnings=shortcomings(recording)), recording.has_tables
+    selection = Selection(trust=request.trust, warnings=shortcomings(recording))
+    is_job = recording.has_tables
     if is_job and request.frames:
         selection.warnings.append("--frames draws loops only: the run was trained here.")
     if is_job and drawing_of(recording.mdp) is None:
@@ -171,15 +172,19 @@ def select(recording: Recording, request: Request) -> Selection:
 
 def episodes_of(recording: Recording, phase: str) -> SelectedEpisodes:
     """Return the episodes of a phase that have steps."""
-    own, n = recording.phase(phase), recording.environments
-    total, records = own.steps.count() if own.steps else 0, own.episodes.array()
+    own = recording.phase(phase)
+    n = recording.environments
+    total = own.steps.count() if own.steps else 0
+    records = own.episodes.array()
     begin, last = (records[name].astype(np.int64) for name in ("first_step", "last_step"))
     if n > 1:  # from the beginning of a round to the end of one
-        place, there = records["environment"].astype(np.int64), last < total
+        place = records["environment"].astype(np.int64)
+        there = last < total
         return SelectedEpisodes((begin - place)[there], (last - place + n)[there], int(there.sum()))
     first = np.zeros(own.episodes.count() + 1, np.int64)
     number = records["episode"].astype(np.int64).clip(max=len(first) - 2)
-    first[number], first[number + 1] = begin, last + 1
+    first[number] = begin
+    first[number + 1] = last + 1
     # Steps of episodes that were lost in a repair count as those of the first episode after them.
     first = np.maximum.accumulate(first)
     first = first[first <= total]
@@ -298,7 +303,8 @@ def _select_drawn(
     recording: Recording, request: Request, selection: Selection, asked: Mapping[str, Ints]
 ) -> None:
     """Choose the episodes that are drawn: those asked for, by default a few of each environment."""
-    n, total = recording.environments, 0
+    n = recording.environments
+    total = 0
     shown = min(n, MAX_MEMBERS)
     for phase in schema.PHASES:
         if not recording.phase(phase).steps:
@@ -308,9 +314,10 @@ def _select_drawn(
         places = np.zeros(len(lengths))
         if n > 1:
             places = recording.phase(phase).episodes.array(0, len(lengths))["environment"]
-        for environment in range(shown) if request.is_default else ():
-            own = np.flatnonzero(places == environment)
-            numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
+        if request.is_default:
+            for environment in range(shown):
+                own = np.flatnonzero(places == environment)
+                numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)
     drawn = sum(map(len, selection.drawn.values()))

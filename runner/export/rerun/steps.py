@@ -75,7 +75,8 @@ class Batch(NamedTuple):
 
     def edges(self) -> set[int]:
         """Return the first steps of stretches of time without gaps, and the steps after their last ones."""
-        steps, starts = self.times["step"], self.starts()
+        steps = self.times["step"]
+        starts = self.starts()
         return {*steps[starts].tolist(), *(steps[np.append(starts[1:], True)] + 1).tolist()}
 
 
@@ -83,7 +84,8 @@ class StepTracks:
     """Makes the tracks of a phase: the grid, or without a scene states and actions as lines."""
 
     def __init__(self, phase: str, title: str, labels: GridLabels) -> None:
-        self._phase, self._labels = phase, labels
+        self._phase = phase
+        self._labels = labels
         self._states = states_in_words(labels.mdp)
         self._entry = cache(partial(_entry, labels.mdp))
         self._before: Ints | None = None
@@ -94,7 +96,8 @@ class StepTracks:
             colours = agent_colours(range(len(scene.movers)))
             shapes = zip(scene.shapes, scene.owners, strict=True)
             fills = [palette.rgb(shape.colour or palette.agent(owner)) for shape, owner in shapes]
-            radii, faded = [shape.radius for shape in scene.shapes], [(*colour, 120) for colour in colours]
+            radii = [shape.radius for shape in scene.shapes]
+            faded = [(*colour, 120) for colour in colours]
             parts["grid/things"] = [
                 labels_alone(draw_order=50.0),
                 rr.Boxes2D.from_fields(radii=radii, colors=fills, draw_order=40.0),
@@ -129,8 +132,11 @@ class StepTracks:
         The movers, passengers and texts of a step are points of one entity, with their arrows and trails,
         because a row costs more than its content.
         """
-        records, labels, path = batch.records, self._labels, f"{self._phase}/grid"
-        state, texts = records["state"], labels.of_steps(records, events)
+        records = batch.records
+        labels = self._labels
+        path = f"{self._phase}/grid"
+        state = records["state"]
+        texts = labels.of_steps(records, events)
         origins = scene.mover_points.take(state, axis=0)
         moved = scene.mover_points.take(records["next_state"], axis=0) - origins
         vectors = np.where(moved.any(axis=2, keepdims=True), moved, scene.moves[records["action"]])
@@ -181,7 +187,9 @@ class StepTracks:
 
     def _events(self, batch: Batch, events: NDArray[np.uint32]) -> Iterator[Track]:
         """Yield the text log: beginnings and ends of episodes, pickups, collisions; not illegal actions."""
-        mdp, records, entity = self._labels.mdp, batch.records, f"{self._phase}/events"
+        mdp = self._labels.mdp
+        records = batch.records
+        entity = f"{self._phase}/events"
         if len(begins := np.flatnonzero(records["t"] == 0)):
             kind = "episode" if self._phase == "train" else "trial"
             states = zip(batch.number[begins], self._states[records["state"][begins]], strict=True)

@@ -38,7 +38,8 @@ def export(
             for run, recording, selection in zip(runs, recordings, selections, strict=True)
         ]
         for i, writer in enumerate(writers if len(runs) > 1 else ()):
-            writer.root, writer.tint = f"/{runs[i].run_id}", palette.COMPARED[i % len(palette.COMPARED)]
+            writer.root = f"/{runs[i].run_id}"
+            writer.tint = palette.COMPARED[i % len(palette.COMPARED)]
         stream.send_recording_name(" and ".join(writer.title for writer in writers))
         readers = [RunReader(writer) for writer in writers]
         for reader in readers:

@@ -71,8 +71,11 @@ class Tracked(Tracker):
     _shape = "wandb"
 
     def __init__(self, script: ScriptRun, own_id: str | None, is_disabled: bool) -> None:
-        self.script, self._id, self._is_disabled = script, own_id, is_disabled
-        self.config, self.summary = Config(script, self.configure), Summary()
+        self.script = script
+        self._id = own_id
+        self._is_disabled = is_disabled
+        self.config = Config(script, self.configure)
+        self.summary = Summary()
         script.log_last = self._log_summary
         self.step = 0
         """The number of calls of `log` that were committed."""

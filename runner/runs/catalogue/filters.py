@@ -201,7 +201,8 @@ class FilterParser(Parser[FilterPart]):
             return self._matching(right, term, pattern if is_tags else f"*{pattern}*")
         if isinstance(left, ast.Constant):
             left, operator, right = right, _FLIPPED.get(operator, operator), left
-        term, value = self.term(left), right.value if isinstance(right, ast.Constant) else right
+        term = self.term(left)
+        value = right.value if isinstance(right, ast.Constant) else right
         column = term.column
         if operator is ast.Is:
             if column is None or value is not None:
@@ -297,7 +298,8 @@ class FilterParser(Parser[FilterPart]):
 
 def _new_form(field: str, operator: str | None, value: str) -> str:
     """Return a term in Lucene's syntax as an expression."""
-    kind, text = _column(field).kind, value if value.startswith('"') else f'"{value or "VALUE"}"'
+    kind = _column(field).kind
+    text = value if value.startswith('"') else f'"{value or "VALUE"}"'
     if value == "*":
         return f"{field} is not None"
     if value in ("[", "{"):

@@ -135,7 +135,9 @@ class State(NamedTuple):
 
 def _state_of(root: str, entry: str) -> State | None:
     """Return the state of a run's files; None if there are none."""
-    marks, changed, size = [], 0, None
+    marks = []
+    changed = 0
+    size = None
     for name in _RUN_FILES:
         try:
             facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes three times as long

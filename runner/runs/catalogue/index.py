@@ -100,7 +100,8 @@ class CatalogueIndex:
         ordered = _ordered(*order, _NEWEST)
         if chosen.condition is None:  # counted in an index of SQLite, without reading the rows
             part = Sql(f"{ordered.text} LIMIT ? OFFSET ?", (*ordered.values, limit, offset))
-            places, total = self._query("root, entry", chosen, part).fetchall(), self.count(chosen)
+            places = self._query("root, entry", chosen, part).fetchall()
+            total = self.count(chosen)
         else:  # a filter may be slow: it is evaluated once for each row
             places = self._query("root, entry", chosen, ordered).fetchall()
             places, total = places[offset : offset + limit], len(places)
@@ -136,9 +137,11 @@ class CatalogueIndex:
         Args:
             digests: the contents; all by default, or if they are very many.
         """
-        recorded, values = f"digest IS NOT NULL AND root {self._is_here}", [*self.roots]
+        recorded = f"digest IS NOT NULL AND root {self._is_here}"
+        values = [*self.roots]
         if digests is not None and len(digests) <= _MAX_VALUES:
-            recorded, values = f"{recorded} AND digest {_AMONG}", [*values, json.dumps(digests)]
+            recorded = f"{recorded} AND digest {_AMONG}"
+            values = [*values, json.dumps(digests)]
         several = f"SELECT digest FROM runs WHERE {recorded} GROUP BY digest HAVING COUNT(*) > 1"
         repeated = [digest for (digest,) in self._database.execute(several, values)]
         if not repeated:
@@ -177,7 +180,8 @@ class CatalogueIndex:
             "SELECT id, name, status, success_percent, mean_return, parent, origin FROM runs "
             f"WHERE id IN tree AND {among} ORDER BY created LIMIT {MAX_TREE}"
         )
-        by_id, below = dict[str, IndexRow](), dict[str, list[str]]()
+        by_id = dict[str, IndexRow]()
+        below = dict[str, list[str]]()
         for row in _as_rows(self._database.execute(descendants, (top, *self.roots, *self.roots))):
             if row["id"] not in by_id:
                 by_id[row["id"]] = row
@@ -327,7 +331,8 @@ def _look(
     quick: bool,
     rebuild: bool,
 ) -> Result:
-    folders, index = Folders(database, roots, quick), CatalogueIndex(database, roots)
+    folders = Folders(database, roots, quick)
+    index = CatalogueIndex(database, roots)
     if rebuild:
         folders.expire()
     before = pragma(database, "data_version")

@@ -181,9 +181,10 @@ def clean(root: Path, removed: Collection[str] = ()) -> None:
     Args:
         removed: the ids of the runs that were removed.
     """
-    for index in (cache_folder() / EPISODES).glob("*.parquet") if removed else ():
-        if index.name.partition("-")[0] in removed:
-            index.unlink(missing_ok=True)
+    if removed:
+        for index in (cache_folder() / EPISODES).glob("*.parquet"):
+            if index.name.partition("-")[0] in removed:
+                index.unlink(missing_ok=True)
     for stray in strays(root):
         with contextlib.suppress(OSError):
             if time.time() - stray.stat().st_mtime > _STRAY_SECONDS:
@@ -220,7 +221,8 @@ def unwanted(index: CatalogueIndex, criteria: Criteria, now: float) -> tuple[lis
         chosen = chosen.also(Sql("created < ?", (latest,)))
     if criteria.keep_last is not None:
         chosen = chosen.also(Sql(_OLDER, (json.dumps(index.roots), criteria.keep_last)))
-    going, staying = [], Counter[str]()
+    going = []
+    staying = Counter[str]()
     for row in index.select(chosen, columns=_COLUMNS):
         if criteria.statuses and row["status"] not in criteria.statuses:
             continue

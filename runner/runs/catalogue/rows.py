@@ -66,13 +66,17 @@ def row_of(run: Run, size: int | None) -> dict[str, object]:
     Args:
         size: bytes of its recording; None if there is none.
     """
-    config, summary = run.file.config, run.summary
+    config = run.file.config
+    summary = run.summary
     recorded = {} if summary.episodes is not None else _recorded(run)
-    last, done = summary.last_evaluation or EvaluationMetrics(), {**recorded, **summary}
+    last = summary.last_evaluation or EvaluationMetrics()
+    done = {**recorded, **summary}
     recent = summary.recent_training or recorded.get("recent_training")
     episodes, train, evaluation = (done.get(key) for key in ("episodes", "train_steps", "eval_steps"))
     logged = islice(summary.logged.items(), _LOGGED)
-    config_name, environment, origin = text(config.get("name")), config.get("env"), origin_in(config)
+    config_name = text(config.get("name"))
+    environment = config.get("env")
+    origin = origin_in(config)
     return {
         "id": run.run_id,
         "name": text(run.name),
@@ -137,7 +141,8 @@ def _flat(config: JsonView) -> dict[str, object]:
 
     def put(parts: Iterable[tuple[object, object]], path: str, depth: int) -> None:
         for key, value in islice(parts, _TEXT):
-            here, kind = f"{path}{key}", value.__class__
+            here = f"{path}{key}"
+            kind = value.__class__
             if kind is dict or kind is list:
                 if depth < _DEPTH:
                     inside: Any = value

@@ -181,7 +181,8 @@ def usage_of(
     Args:
         read: calls some work with the index and returns its result, as `look` does.
     """
-    exports, restored = cached(EXPORTS) + cached(TABLES) + cached(EPISODES), cached(RESTORED)
+    exports = cached(EXPORTS) + cached(TABLES) + cached(EPISODES)
+    restored = cached(RESTORED)
     rows = read(lambda index: index.with_same_as(index.select(chosen, columns=_COLUMNS)))
     checkpoints = {root: Store(Path(root)).sizes() for root in {row["root"] for row in rows}}
     sums = Sums()

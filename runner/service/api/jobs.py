@@ -198,7 +198,8 @@ async def watch(
         yield ServerSentEvent(retry=RETRY_MILLISECONDS)
         progress = None
         while not request.app.state.stopping.is_set():
-            job, events = jobs.store.job(number), list[JobEvent]()
+            job = jobs.store.job(number)
+            events = list[JobEvent]()
             if last != jobs.store.log_size(number):
                 events, last = await run_sync(jobs.store.events, number, last)
             before, progress = progress, job.progress

@@ -75,7 +75,8 @@ async def append(
         async for data in request.stream():
             collected += data
             if len(collected) >= WRITE_BYTES:
-                piece, collected = bytes(collected), bytearray()
+                piece = bytes(collected)
+                collected = bytearray()
                 upload = await write(upload.offset, piece)
     finally:
         if collected:

@@ -74,7 +74,8 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
             _require_change(recording, job.config, where)
             limit = recording.mdp.step_limit
             size = estimate(job.config, limit).typical_bytes if limit else 0
-            name, config = branch_name(run, question.name), job.config
+            name = branch_name(run, question.name)
+            config = job.config
             return CheckedJob("branch", name, 1, size, config.to_mapping(), config.seeds)
         step = at.resolved(recording)
         step.steps_in(recording)
@@ -88,7 +89,8 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
 
 def _require_change(recording: Recording, branch: ExperimentConfig, at: EpisodeRef) -> None:
     """Refuse a branch of training that repeats its parent."""
-    change, parent = branch.branches[-1], from_mapping(recording.config)
+    change = branch.branches[-1]
+    parent = from_mapping(recording.config)
     recorded: Mapping[str, str] = {}
     with contextlib.suppress(RecordingError):  # no steps were recorded
         recorded = actions_at(recording, at)
@@ -105,7 +107,8 @@ def _check_action(recording: Recording, at: EpisodeRef, question: BranchQuestion
 
     In a game, the agents that act at a step are known when it is played.
     """
-    action, is_recorded = question.action, question.action is None
+    action = question.action
+    is_recorded = question.action is None
     space = None if len(recording.agents) > 1 else known_space(recording.spaces["action"])
     if space is not None and action is not None:
         names = recording.phase(at.phase).action_names()

@@ -87,7 +87,8 @@ def _check_sweep(text: str, source: str, document: Document, recordings: Path) -
         "initial_q": require_run,
     }
     sweep = state.with_resolved_tables(sweep_from_text(text, source, checks), recordings)
-    values, runs = sweep.to_mapping(), Search(sweep).trials * len(sweep.seeds)
+    values = sweep.to_mapping()
+    runs = Search(sweep).trials * len(sweep.seeds)
     if sweep.name in sweeps_in(recordings):
         before = state.read_sweep(sweep.name, recordings).to_mapping()
         if differing := ", ".join(key for key, _, _ in state.differences(before, values)):

@@ -124,7 +124,8 @@ class JobStore:
 
     def __init__(self, recordings: Path, max_unfinished: int = 1000, max_over: int = 1000) -> None:
         self.recordings = recordings
-        self._max_unfinished, self._max_over = max_unfinished, max_over
+        self._max_unfinished = max_unfinished
+        self._max_over = max_over
         self.lock = threading.RLock()
         """Held by methods that change jobs, and by callers over several calls that belong together; not by
         methods that read, as no other thread changes a job or a dictionary of jobs meanwhile."""

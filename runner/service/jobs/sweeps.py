@@ -27,7 +27,8 @@ def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
 
 
 def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
-    sweep, recordings = from_values(spec.values()), spec.recordings
+    sweep = from_values(spec.values())
+    recordings = spec.recordings
     wait_for_owners(state.runs_of(sweep.name, recordings).values(), channel.stop)
     _, status = run_whole_sweep(
         sweep,
@@ -54,7 +55,8 @@ def _reporter(channel: JobChannel) -> Callable[[SweepStatus], None]:
 
     def report(status: SweepStatus) -> None:
         nonlocal last
-        best, shown = status.best, None
+        best = status.best
+        shown = None
         if best is not None:
             if best.number != last:
                 last = best.number

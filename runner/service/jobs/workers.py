@@ -42,7 +42,9 @@ class WorkerPool:
     """
 
     def __init__(self, store: JobStore, size: int, ray: str | None) -> None:
-        self.size, self.ray, self._store = size, ray, store
+        self.size = size
+        self.ray = ray
+        self._store = store
         self._context = process_context(PRELOADED)
         self._busy: dict[int, tuple[QueuedJob, threading.Thread]] = {}
         """The jobs whose worker has not ended, by number, each with the thread that follows its worker."""
@@ -115,7 +117,8 @@ class WorkerPool:
         try:
             thread.start()
         except RuntimeError as error:  # no thread is left
-            self._start_problem, self._retry_at = str(error), time.monotonic() + RETRY_SECONDS
+            self._start_problem = str(error)
+            self._retry_at = time.monotonic() + RETRY_SECONDS
             ours.close()  # its worker stops
             self._end(job, process, None)
 
