@@ -228,9 +228,7 @@ def _logged(recording: Recording, axis: Axis) -> tuple[Floats, Floats]:
     return np.array(steps, np.float64), np.array(values, np.float64)
 
 
-def first_crossing(
-    points: Mapping[Position, float], level: float, rising: bool | None = None
-) -> Position | None:
+def first_crossing(points: Mapping[Position, float], level: float, rising: bool | None) -> Position | None:
     """Return the first position at which a curve has reached a level, from below if `rising`.
 
     Without it the side where the curve begins decides.

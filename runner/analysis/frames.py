@@ -165,9 +165,7 @@ def transition_columns(mdp: Mdp) -> dict[str, Array]:
 # --- columns ------------------------------------------------------------------------------------------
 
 
-def episode_columns(
-    recording: Recording, phase: Phase = "train", start: int = 0, stop: int | None = None
-) -> dict[str, Array]:
+def episode_columns(recording: Recording, phase: Phase, start: int, stop: int | None) -> dict[str, Array]:
     """Return the columns of `episodes`, an array each."""
     return columns_of_episodes(recording, recording.phase(phase).episodes.array(start, stop))
 

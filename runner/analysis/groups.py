@@ -91,7 +91,7 @@ def grouped(
     return groups, notes
 
 
-def require_two(groups: Sequence[Group], by: str | None = None) -> None:
+def require_two(groups: Sequence[Group], by: str | None) -> None:
     """Refuse a single group.
 
     Raises:

@@ -34,9 +34,7 @@ def mark(run: Run, at: StepLike, text: str = "", *, tags: Iterable[str] = ()) ->
     return made
 
 
-def mark_steps(
-    run: Run, steps: Iterable[StepLike], text: str = "", *, tags: Iterable[str] = ()
-) -> list[Mark]:
+def mark_steps(run: Run, steps: Iterable[StepLike], text: str, *, tags: Iterable[str]) -> list[Mark]:
     """Mark steps of a run with the same text; arguments and errors as for `mark`."""
     run.require_folder()
     text = text.strip()

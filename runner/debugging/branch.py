@@ -215,9 +215,7 @@ def branches_training(
     return False
 
 
-def branch_episode(
-    run: Run, task: EpisodeBranch, recordings: Path, report: Report = lambda _: None
-) -> Branch:
+def branch_episode(run: Run, task: EpisodeBranch, recordings: Path, report: Report) -> Branch:
     """Play an episode of a loop on from a step, and record that as a run in a folder: see `branch`.
 
     Raises:

@@ -154,7 +154,7 @@ class SvgDrawing:
             lines.append('<line class="g-wall" x1="{}" y1="{}" x2="{}" y2="{}"/>'.format(*ends))
         return "".join(lines)
 
-    def trails(self, places: NDArray[np.int16] | None = None) -> str:
+    def trails(self, places: NDArray[np.int16] | None) -> str:
         """Return the trails of the movers over the frames so far, [frames, things, 3]."""
         return "".join(
             f'<polyline class="g-trail" data-trail="{thing}" stroke="{self.colour(thing)}" '

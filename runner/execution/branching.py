@@ -94,7 +94,7 @@ def branch_training(
     return TrainingBranch(own, origin, where)
 
 
-def branch_name(run: Run, name: str | None = None) -> str:
+def branch_name(run: Run, name: str | None) -> str:
     """Return the name of a branch of a run: the one that was chosen, checked, or `NAME.branch`."""
     return checked_run_name(name) or f"{run.name[:90]}.branch"
 

@@ -503,9 +503,9 @@ def _unlikely(recording: Recording, phases: Mapping[str, Findings]) -> str:
 
 def rerun_loop(
     checked: Verification,
-    sample: int | None = None,
-    tolerance: float = 0.0,
-    trust: bool = False,
+    sample: int | None,
+    tolerance: float,
+    trust: bool,
     report: StepsReport = lambda _: None,
 ) -> Verification:
     """Rerun a loop's environment in a child process with limits, and compare every step.

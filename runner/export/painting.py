@@ -99,7 +99,7 @@ def paint_redrawn(recording: Recording, phase: str, episode: int, trust: bool, f
 
 
 def redrawn(
-    recording: Recording, phase: str, episodes: Sequence[int], trust: bool = False, draw_from: int = 0
+    recording: Recording, phase: str, episodes: Sequence[int], trust: bool, draw_from: int = 0
 ) -> Generator[tuple[int, int, Pixels], None, None]:
     """Draw episodes by the environment, made again in a child process and compared with the recording.
 

@@ -159,9 +159,7 @@ class GeneratorWatch:
         return after
 
 
-def vector_watch(
-    envs: AnyVectorEnv, first: object, autoreset: AutoresetMode, sparse: bool = False
-) -> GeneratorWatch:
+def vector_watch(envs: AnyVectorEnv, first: object, autoreset: AutoresetMode, sparse: bool) -> GeneratorWatch:
     """Return the watch of a vector environment.
 
     The generators of a `SyncVectorEnv` are read, or the generator of a vector environment of its own class.

@@ -160,9 +160,7 @@ def _own_fields(base: object, assumed: list[str]) -> tuple[Json, str]:
     return fields, top_package(entry_point)
 
 
-def vector_maker_of(
-    envs: AnyVectorEnv, first: Any, autoreset: AutoresetMode, make: str = ""
-) -> EnvironmentMaker:
+def vector_maker_of(envs: AnyVectorEnv, first: Any, autoreset: AutoresetMode, make: str) -> EnvironmentMaker:
     """Return how a vector environment was made.
 
     Args:
@@ -232,7 +230,7 @@ def _custom_vector(base: object) -> EnvironmentMaker:
     return _with_versions(EnvironmentMaker("vector", spec=text, registered_by=registered_by), [top])
 
 
-def game_maker_of(env: Any, make: str = "") -> EnvironmentMaker:
+def game_maker_of(env: Any, make: str) -> EnvironmentMaker:
     """Return how a game with PettingZoo's parallel interface was made; `make` is the user's own function.
 
     By PettingZoo's convention the module of a game has a function `parallel_env`, and `env` for the game in

@@ -211,7 +211,7 @@ def record_aec(env: object, recordings: str | os.PathLike[str] | None = None, **
     return recorded
 
 
-def record_alone(env: Any, recordings: str | os.PathLike[str] | None = None, **options: Any) -> Any:
+def record_alone(env: Any, recordings: str | os.PathLike[str] | None, **options: Any) -> Any:
     """Return one environment of Gymnasium, or one game of PettingZoo, with everything recorded."""
     begin: Any = record_parallel if is_game(env) else record
     return begin(env, recordings, **options)

@@ -292,7 +292,7 @@ class StepBuffer:
         rewards: Floats,
         terminated: Flags,
         truncated: Flags,
-        finals: object = None,
+        finals: object,
     ) -> None:
         """Put down T steps of all environments; all or nothing of them.
 

@@ -418,7 +418,7 @@ def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust
         return str(error)
 
 
-def why_uncertain(recording: Recording, trust: bool = False) -> str:
+def why_uncertain(recording: Recording, trust: bool) -> str:
     """Return why a difference shows nothing, as some arguments are not known; empty if all are."""
     for phase in recording.phases:
         for given in phase.reset_options():

@@ -186,7 +186,7 @@ def trusting(
         yield trust or mark is not None
 
 
-def require_may_train(recording: Path, config: JsonView, trust: bool = False) -> None:
+def require_may_train(recording: Path, config: JsonView, trust: bool) -> None:
     """Refuse to make the environment of a recorded job, unless it is the user's own, or a listed one.
 
     Raises:

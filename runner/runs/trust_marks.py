@@ -118,7 +118,7 @@ def copy_mark(folder: Path, restored: Path) -> None:
 
 
 @contextlib.contextmanager
-def marking_nothing(is_strange: bool = True) -> Iterator[None]:
+def marking_nothing(is_strange: bool) -> Iterator[None]:
     """Leave runs without a mark that the block begins, if they are made from one that is not trusted."""
     global _marks_nothing  # noqa: PLW0603 - recorders begin far below the block
     before, _marks_nothing = _marks_nothing, _marks_nothing or is_strange

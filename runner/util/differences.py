@@ -70,9 +70,7 @@ def _bits(values: Array) -> Array:
     return np.ascontiguousarray(values).view(f"u{size}" if kind == "f" and size in (2, 4, 8) else "u1")
 
 
-def differing_part(
-    recorded: object, got: object, tolerance: float | None = None
-) -> tuple[str, object, object]:
+def differing_part(recorded: object, got: object, tolerance: float | None) -> tuple[str, object, object]:
     """Return where in two values of a space the first difference is, such as `[2]`, and both values there.
 
     Args:

@@ -94,8 +94,8 @@ def tabular_playback(
     steps: Records,
     ended: str,
     values: QValues,
-    first: int = 0,
-    limit: int = MAX_STEPS,
+    first: int,
+    limit: int,
 ) -> Playback:
     """Return what a page plays of an episode whose states and actions the environment's table names.
 
