@@ -171,7 +171,10 @@ def draw(part: Part, is_first: bool = False) -> None:
     heading = [title(section.title)] if section.title and not (pairs and is_first) else []
     _render(*heading, *([facts(pairs)] if pairs else []))
     for sentence in section.said:
-        echo(sentence) if "\n" in sentence else _render(sentence)
+        if "\n" in sentence:
+            echo(sentence)
+        else:
+            _render(sentence)
     for grid in section.tables:
         if _may_be_terminal() and len(grid.rows) <= MAX_DRAWN and (terminal := console()).is_terminal:
             _render(grid_table(grid, terminal.width))

@@ -100,7 +100,8 @@ def command_of(view: View) -> Command:
         if output is not None:
             require_one("output", *(f"as_{form}" for form in view.forms if form in ("quiet", "csv")))
         if output not in (None, _STDOUT):
-            (require_page if is_page else require_new)(output, force)
+            require_free = require_page if is_page else require_new
+            require_free(output, force)
         if view.shows_progress:
             values["progress"] = _PROGRESS
         with compilation_notice(), opened(subject) as content:

@@ -25,7 +25,6 @@ class ValueRows:
     """Where values stand in a run without an environment: the script's own step."""
 
     off_table = 0
-    is_any_over = False
 
     def __init__(self) -> None:
         self.progress = (0, 0)
@@ -36,9 +35,6 @@ class ValueRows:
         """Let the next values have this step."""
         self.progress = (step, 0)
         self.pending = max(self.pending, min(step, _MAX_POSITION))
-
-    def open(self) -> None:
-        """Do nothing: there are no steps."""
 
     def commit(self) -> None:
         """Do nothing: there are no steps."""
@@ -56,7 +52,7 @@ def begin_values(recordings: str | os.PathLike[str] | None, **arguments: Any) ->
     """
     given = {key: value for key, value in arguments.items() if key in _ARGUMENTS}
     rows = ValueRows()
-    make: Any = lambda *_: rows  # noqa: E731
-    loop = Loop(_NO_ENVIRONMENT, options_of(recordings, given), _NOT_MADE, make_rows=make)
+    options = options_of(recordings, given)
+    loop = Loop(_NO_ENVIRONMENT, options, _NOT_MADE, make_rows=lambda *_: rows)  # type: ignore[arg-type]
     loop.activate(loop.rows("train"))
     return loop, rows

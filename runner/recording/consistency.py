@@ -73,8 +73,8 @@ def check_phase(recording: Recording, phase: str, complete: bool) -> Findings:
             f"{recorded.steps.topic.name}: found actions alone, expected whole steps as in the configuration"
         )
     last = recorded.resets.last()
-    stop = None if complete else 0 if last is None else int(last["step"])
-    return _PhaseCheck(recording, phase, stop).check()
+    stop = 0 if last is None else int(last["step"])
+    return _PhaseCheck(recording, phase, None if complete else stop).check()
 
 
 def check_extras(recording: Recording, phase: str, complete: bool) -> None:

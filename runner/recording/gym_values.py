@@ -398,10 +398,12 @@ def _not_expected(value: Value) -> Value:
 
 @cache
 def _exact_scalars(base: DType) -> frozenset[type]:
-    scalars = {kind for kind in SCALARS if np.can_cast(kind, base)}
-    return frozenset(
-        scalars | {bool} | ({int} if base.kind in "iu" else {float} if base.char == "d" else set())
-    )
+    scalars: set[type] = {kind for kind in SCALARS if np.can_cast(kind, base)} | {bool}
+    if base.kind in "iu":
+        scalars.add(int)
+    elif base.char == "d":
+        scalars.add(float)
+    return frozenset(scalars)
 
 
 def only_number(value: object, what: str, kinds: str = "iubf", expected: str = "a number") -> Array:

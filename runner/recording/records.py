@@ -227,7 +227,8 @@ def raw_records(stream: BinaryIO, start: int, end: int, whole: bool = False) -> 
         kind, length = RECORD_HEAD.unpack(stream.read(RECORD_HEAD.size))
         if start + RECORD_HEAD.size + length > end:
             return
-        most = MAX_CHUNK_BYTES if whole else _BEGINNING_BYTES if kind in LARGE else most_bytes(kind)
+        of_kind = _BEGINNING_BYTES if kind in LARGE else most_bytes(kind)
+        most = MAX_CHUNK_BYTES if whole else of_kind
         yield RawRecord(kind, length, start, stream.read(min(length, most)))
         start += RECORD_HEAD.size + length
 

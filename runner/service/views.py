@@ -206,4 +206,7 @@ def _form_values(run: Run, view: View) -> dict[str, object]:
 
 for _view in (*shipped_views(), *map(view_named, installed_names())):
     if _view.is_served:
-        (_add_routes if _view.has_tab else _add_route_of_runs)(_view)
+        if _view.has_tab:
+            _add_routes(_view)
+        else:
+            _add_route_of_runs(_view)

@@ -185,6 +185,6 @@ def ranges_in(text: str) -> Ranges:
     for part in text.split(","):
         start, colon, stop = part.strip().replace("..", ":").partition(":")
         first = 0 if colon and not start else whole_number(start)
-        end = first + 1 if not colon else whole_number(stop) if stop else None
-        ranges.append((first, end))
+        last = whole_number(stop) if stop else None
+        ranges.append((first, last if colon else first + 1))
     return tuple(ranges)

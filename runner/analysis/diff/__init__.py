@@ -204,7 +204,7 @@ def _diff_jobs(
         divergence = training_divergence(a, b)
         cause = None
         if divergence is not None:
-            cause = (find_kind if first else find_cause)(divergence, a, b)
+            cause = find_kind(divergence, a, b) if first else find_cause(divergence, a, b)
             cause = with_branch(cause, divergence, relation)
         difference = replace(difference, divergence=divergence, cause=cause)
         if not first:

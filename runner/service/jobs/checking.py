@@ -56,7 +56,8 @@ def check(text: str, source: str, recordings: Path) -> CheckedJob:
     """
     document = read_yaml(text, source)
     is_sweep = isinstance(document.value, Mapping) and not document.value.keys().isdisjoint(SWEEP_KEYS)
-    checked = (_check_sweep if is_sweep else _check_config)(text, source, document, recordings)
+    check = _check_sweep if is_sweep else _check_config
+    checked = check(text, source, document, recordings)
     if checked.runs > MAX_RUNS:
         raise ConfigError(f"{source}: makes {checked.runs:,} runs, expected at most {MAX_RUNS:,} in a job.")
     return checked
