@@ -224,6 +224,11 @@ class Answer:
     """Sentences that a command prints after the answer in any form."""
 
     @property
+    def hints(self) -> Iterable[str]:
+        """Sentences that a command prints below the text, unless it writes the file."""
+        return ()
+
+    @property
     def step_to_look_at(self) -> object:
         """The reference of the step to look at next; None if there is none."""
         return None

@@ -213,13 +213,6 @@ class LazyGroup(CommandGroup):
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
 
-    def plugin(self, name: str) -> click.Command:
-        """Return the command of a view."""
-        from runner.cli.views import command_of
-        from runner.views import view_named
-
-        return command_of(view_named(name))
-
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the sections from their short help, without an import."""
         width = max(len(name) for name in self.list_commands(ctx))

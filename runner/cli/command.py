@@ -12,7 +12,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import click
 
@@ -138,6 +138,10 @@ class CommandGroup(click.Group):
     command_class = Command
     plugins = ""
     """The entry points by which installed packages add commands; empty for none."""
+    prefix = ""
+    """What the names of those begin with, and of views: `sweep ` for the view `sweep show`."""
+    views: ClassVar[Mapping[str, str]] = {}
+    """Commands that follow from views, by their names without the prefix; and their short help."""
 
     def __init__(self, name: str | None, **attributes: Any) -> None:
         super().__init__(name, **attributes)
@@ -145,16 +149,23 @@ class CommandGroup(click.Group):
 
     def shipped(self) -> list[str]:
         """Return the names of the commands of this package, in the order of definition."""
-        return list(self.commands)
+        return [*self.commands, *self.views]
 
     def installed(self) -> dict[str, str]:
         """Return the names of commands that other packages add, and the package of each."""
         names = plugin_names(self.plugins) if self.plugins else {}
-        return {name: package for name, package in names.items() if name not in self.shipped()}
+        return {
+            name: package
+            for view, package in names.items()
+            if view.startswith(self.prefix) and (name := view.removeprefix(self.prefix)) not in self.shipped()
+        }
 
     def plugin(self, name: str) -> click.Command:
-        """Import a command that another package adds."""
-        raise NotImplementedError
+        """Return the command of a view."""
+        from runner.cli.views import command_of
+        from runner.views import view_named
+
+        return command_of(view_named(f"{self.prefix}{name}"))
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """Return the names, those that other packages add last."""
@@ -162,7 +173,7 @@ class CommandGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command."""
-        if (command := super().get_command(ctx, cmd_name)) is None and cmd_name in self.installed():
+        if (command := super().get_command(ctx, cmd_name)) is None and cmd_name in self.list_commands(ctx):
             return self.plugin(cmd_name)
         return command
 
@@ -186,7 +197,7 @@ class CommandGroup(click.Group):
         """List the commands with the first sentence of their help, wrapped instead of cut off."""
         texts = {name: command.get_short_help_str(_MAX_SHORT_HELP) for name, command in self.commands.items()}
         with formatter.section("Commands"):
-            formatter.write_dl([*texts.items(), *self.installed_rows()])
+            formatter.write_dl([*texts.items(), *self.views.items(), *self.installed_rows()])
 
     def installed_rows(self) -> list[tuple[str, str]]:
         """Return the rows of the help about the commands that other packages add."""

@@ -173,6 +173,18 @@ def all_recorded_runs(
     return find_all_recorded(run_names, recordings)
 
 
+@record
+def runs_folder(recordings: Path | None = recordings_option) -> Path:
+    """Return the folder of runs."""
+    return recordings_folder(recordings)
+
+
+@record
+def named_sweep(name: str = argument(), folder: Path = runs_folder) -> tuple[str, Path]:
+    """Return the name of a sweep, and its folder of runs."""
+    return name, folder
+
+
 # --- working ----------------------------------------------------------------------------------------------
 
 

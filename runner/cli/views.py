@@ -30,15 +30,17 @@ from runner.cli.options import (
     trial_option,
     trust_option,
 )
-from runner.cli.output import Part, Reply, files_written, path_and_size, require_page, say
+from runner.cli.output import Part, Remark, Reply, files_written, path_and_size, require_page, say
 from runner.cli.parameter_types import FILE, PATH, ExpressionText, Number, Parsed
 from runner.cli.progress import bytes_line, count_line, progress_line, stage_line, steps_line
 from runner.cli.runs import (
     all_recorded_runs,
     any_run,
     compilation_notice,
+    named_sweep,
     recorded_run,
     recording_and_run,
+    runs_folder,
     two_recorded_runs,
 )
 from runner.errors import RunnerError
@@ -73,7 +75,9 @@ _SUBJECTS: Final[dict[str, tuple[Declared, Callable[..., AbstractContextManager[
     "pair": (two_recorded_runs, nullcontext),
     "runs": (all_recorded_runs, nullcontext),
     "file": (recording_and_run, nullcontext),
+    "folder": (runs_folder, nullcontext),
     "folders": (folders_option, nullcontext),
+    "sweep": (named_sweep, nullcontext),
     "environment": (environment_options, nullcontext),
 }
 """The subject of a view -> what its command names, and how that is opened."""
@@ -108,7 +112,7 @@ def command_of(view: View) -> Command:
             with nullcontext() if view.shows_progress else stage_line("reading"):
                 answer = view.compute(content, **values)
             if output is None:
-                text = _text(subject, answer)
+                text = chain(_text(subject, answer), map(Remark, answer.hints))
                 yield Reply(answer.as_json, text, answer.lines, "", answer.remarks, answer.exit_code)
                 return
             if output == _STDOUT:
@@ -137,7 +141,7 @@ def command_of(view: View) -> Command:
         metavar = f"FILE{view.file_ending}"
         output = option(*view.file_flags, type=FILE, metavar=metavar, help=help_text)
         declared |= {"output": html_option if is_page else output, "force": force_option}
-    return Command(view.name, call, declared, forms=view.forms, help=view.help)
+    return Command(view.name.split()[-1], call, declared, forms=view.forms, help=view.help)
 
 
 def _text(run: Run, answer: Answer) -> Iterator[Part]:

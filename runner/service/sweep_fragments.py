@@ -7,7 +7,7 @@ import importlib
 import os
 import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -19,8 +19,8 @@ from runner.errors import RunnerError
 from runner.export.reports.rendering import partials
 from runner.service.settings import without_folders
 from runner.sweep.charts import best_section, learning, learning_section, parameters_section, picture_of
-from runner.sweep.results import Results, effects_sections, ranking_sections, results_of
-from runner.sweep.state import read_sweep
+from runner.sweep.results import Results, effects_sections, ranking_sections
+from runner.views.sweep_show import sweep_show
 
 
 def load_sweep_libraries() -> None:
@@ -44,20 +44,32 @@ def load_sweep_libraries() -> None:
 @lru_cache(maxsize=1)
 def _results(name: str, recordings: Path, digest: str) -> Results:  # noqa: ARG001
     """Return the results of a sweep in the state that the digest identifies."""
-    return results_of(read_sweep(name, recordings), recordings)
+    return sweep_show((name, recordings), everything=True)
 
 
-def sweep_results(name: str, recordings: Path, digest: str) -> bytes:
-    """Return the ranking of a sweep as HTML, with links to its runs."""
-    results = _results(name, recordings, digest)
-    ranking, *others = ranking_sections(results, None)
+def sweep_part(
+    part: Callable[[Results, Path], Iterable[Section]], name: str, recordings: Path, digest: str
+) -> bytes:
+    """Return a part of the page of a sweep as HTML, without the path of the recordings folder."""
+    shown = [
+        replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
+        for section in part(_results(name, recordings, digest), recordings)
+    ]
+    return str(partials().answer(shown)).encode()
+
+
+def ranking(results: Results, _: Path) -> Iterator[Section]:
+    """Yield the ranking of a sweep, with links to its runs, and the best configuration."""
+    first, *others = ranking_sections(results)
     runs = {str(entry.number): _run_links(entry.runs) for entry in results.ranking}
     grids = [
         Grid((*grid.headings, "runs, by seed"), [(*row, runs[row[0]]) for row in grid.rows])
-        for grid in ranking.grids
+        for grid in first.grids
     ]
-    best = [best_section(results)] if results.best_yaml else []
-    return _answer([replace(ranking, title="Ranking", grids=grids), *others, *best], recordings)
+    yield replace(first, title="Ranking", grids=grids)
+    yield from others
+    if results.best_yaml:
+        yield best_section(results)
 
 
 def _run_links(runs: Mapping[int, str]) -> str:
@@ -67,28 +79,16 @@ def _run_links(runs: Mapping[int, str]) -> str:
     return Markup(" ").join(links)
 
 
-def sweep_importance(name: str, recordings: Path, digest: str) -> bytes:
-    """Return the importance of a sweep's parameters as HTML, empty if it is unknown."""
-    return _answer(effects_sections(_results(name, recordings, digest)), recordings)
+def importance(results: Results, _: Path) -> Iterable[Section]:
+    """Return the importance of a sweep's parameters; nothing if it is unknown."""
+    return effects_sections(results)
 
 
-def sweep_pictures(name: str, recordings: Path, digest: str) -> bytes:
-    """Return the charts of a sweep as HTML: its parameters, and learning curves of some of its trials."""
-    results = _results(name, recordings, digest)
-    sections = []
+def pictures(results: Results, recordings: Path) -> Iterator[Section]:
+    """Yield the charts of a sweep: its parameters, and learning curves of some of its trials."""
     with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
-        sections.append(parameters_section(picture_of(results)))
+        yield parameters_section(picture_of(results))
     try:
-        sections.append(learning_section(learning(results, recordings)))
+        yield learning_section(learning(results, recordings))
     except RunnerError as error:
-        sections.append(Section("Learning curves", [str(error)]))
-    return _answer(sections, recordings)
-
-
-def _answer(sections: Sequence[Section], recordings: Path) -> bytes:
-    """Return sections as HTML, without the path of the recordings folder."""
-    shown = [
-        replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
-        for section in sections
-    ]
-    return str(partials().answer(shown)).encode()
+        yield Section("Learning curves", [str(error)])

@@ -27,7 +27,7 @@ from runner.export.plots.curves import HEIGHT, WIDTH, curves_section, panel_char
 from runner.export.reports.rendering import render
 from runner.runs.resolve import find_run
 from runner.sweep.parameters import Parameter, Range
-from runner.sweep.results import Ranked, Results, sections, value_text, values_text
+from runner.sweep.results import Ranked, Results, value_text, values_text
 from runner.util.arrays import Floats
 
 Values = Floats
@@ -277,7 +277,7 @@ def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
 
 def render_sweep(results: Results, recordings: Path) -> str:
     """Return the page of a sweep whose runs are in a recordings folder."""
-    ranking, *others = sections(results)
+    ranking, *others = results.sections()
     return render(
         ranking.title,
         ranking.sentences,

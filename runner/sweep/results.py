@@ -7,19 +7,21 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, get_args
+from typing import BinaryIO, Final, get_args
 
 import numpy as np
 
 from runner.analysis.compare import statistics
 from runner.analysis.compare.statistics import Estimate, bounded
-from runner.analysis.sections import Grid, Section
+from runner.analysis.sections import Answer, Grid, Section
+from runner.errors import RunnerError
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
 from runner.sweep.model import Sweep
 from runner.sweep.parameters import points_of, samples_of
+from runner.sweep.state import read_sweep
 from runner.sweep.trials import State, Trial, Trials, best_of, recorded_trials
 from runner.util.humanize import UNKNOWN, counted
 from runner.util.values import Json
@@ -53,7 +55,7 @@ class Ranked:
 
 
 @dataclass(frozen=True)
-class Results:
+class Results(Answer):
     """The results of a sweep so far."""
 
     sweep: Sweep
@@ -64,6 +66,8 @@ class Results:
     suggested: list[Trial]
     """All trials so far, in the order in which they were suggested."""
     best: Trial | None
+    shown: int | None = DEFAULT_SHOWN
+    """Number of trials in the text; None for all."""
 
     @property
     def is_whole_grid(self) -> bool:
@@ -97,9 +101,43 @@ class Results:
         """The best configuration as a file that can be run; None without a finished trial."""
         return None if self.best is None else yaml_of(self.sweep, self.best)
 
+    @property
+    def hints(self) -> list[str]:
+        """How the best configuration is written."""
+        what = self.best and f"the configuration of trial {self.best.number}, with seeds not searched"
+        return [f"--write-best FILE writes {what}."] if what else []
 
-def results_of(sweep: Sweep, recordings: Path) -> Results:
-    """Return the results of a sweep so far."""
+    def as_json(self) -> Json:
+        """Return objective, ranking and effects, and the number of the best trial."""
+        return {
+            "name": self.sweep.name,
+            "objective": self.sweep.objective.model_dump(mode="json"),
+            "trials": self.trials,
+            "ranking": [asdict(entry) for entry in self.ranking],
+            "effects": [asdict(effect) for effect in self.effects],
+            "best": self.best and self.best.number,
+        }
+
+    def sections(self) -> list[Section]:
+        """Return the ranking, the trials without a value, and what mattered."""
+        return [*ranking_sections(self), *effects_sections(self)]
+
+    def write(self, stream: BinaryIO) -> None:
+        """Write the best configuration."""
+        if self.best_yaml is None:
+            raise RunnerError(
+                f"the sweep {self.sweep.name!r} has no finished trial yet, so there is no best one."
+            )
+        stream.write(self.best_yaml.encode())
+
+
+def results_of(name: str, recordings: Path) -> Results:
+    """Return the results of a sweep so far.
+
+    Raises:
+        RunnerError: there is none of this name, or its file is damaged.
+    """
+    sweep = read_sweep(name, recordings)
     statistics.require_scipy()
     trials = Trials(sweep)
     suggested = list(recorded_trials(trials, recordings))
@@ -173,14 +211,9 @@ def fresh_seeds(searched: Sequence[int]) -> list[int]:
 # --- as text ------------------------------------------------------------------------------------------
 
 
-def sections(results: Results, shown: int | None = DEFAULT_SHOWN) -> list[Section]:
-    """Return the results of a sweep as sections of text, with `shown` trials; None for all."""
-    return [*ranking_sections(results, shown), *effects_sections(results)]
-
-
-def ranking_sections(results: Results, shown: int | None) -> list[Section]:
-    """Return the ranking and the trials without a value as sections; arguments as for `sections`."""
-    ranked = results.ranking[:shown]
+def ranking_sections(results: Results) -> list[Section]:
+    """Return the ranking and the trials without a value as sections."""
+    ranked = results.ranking[: results.shown]
     grid = _ranking_grid(results.sweep, ranked)
     result = [Section(f"Sweep {results.sweep.name}", _heading(results, len(ranked)), [grid])]
     for state, title in (("failed", "Failed"), ("excluded", "Excluded: these values contradict each other")):

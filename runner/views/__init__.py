@@ -34,8 +34,10 @@ NAMES: Final = (
     "find",
     "sql",
     "table",
+    "sweep show",
+    "sweep ls",
 )
-"""The shipped views, each the module of its name; those of one run in the order of their tabs."""
+"""The shipped views, each the module of its name with `_`; those of one run in the order of their tabs."""
 
 
 def shipped_views() -> Iterator[View]:
@@ -52,5 +54,5 @@ def view_named(name: str) -> View:
     """
     if name not in NAMES:
         return plugins.load_plugin(plugins.VIEWS, name, View)
-    view: View = import_module(f"runner.views.{name}").VIEW
+    view: View = import_module(f"runner.views.{name.replace(' ', '_')}").VIEW
     return view

@@ -148,17 +148,18 @@ class View:
     """A question about recorded runs."""
 
     name: str
-    """Name of the command, and last part of the addresses of route and page."""
+    """Name of the command, such as `sweep show` in a group; last part of the addresses of route and page."""
     title: str
     compute: Callable[..., Any]
     """Takes the subject, the inputs and, if it is slow, `progress`; returns an `Answer`."""
-    subject: Literal["recording", "run", "pair", "runs", "any run", "file", "folders", "environment"] = (
-        "recording"
-    )
+    subject: Literal[
+        "recording", "run", "pair", "runs", "any run", "file", "folder", "folders", "sweep", "environment"
+    ] = "recording"
     """What the function takes first: a recording; or the run, to read files stored next to it, with answers
     that are not cached and have no API route, as they hold paths; or a list of two or more runs.
     Only a command names any run, which may lack its recording; a file by its path, with its run if any;
-    the folders of runs; or an environment, of which it is the MDP."""
+    the folder of runs, or several; a sweep, by its name and its folder of runs; or an environment, of which
+    it is the MDP."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""

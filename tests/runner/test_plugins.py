@@ -81,6 +81,21 @@ def test_an_installed_view_and_export_are_served(environment, run):
         assert get(f"{api}/exports/others").status_code == 404
 
 
+def test_an_installed_view_may_be_a_command_of_a_group(environment, run):
+    with (environment / "long_episodes.py").open("a") as module:
+        module.write(
+            "def names(sweep):\n    return Longest({sweep[0]: len(sweep)})\n"
+            'NAMES = View("sweep names", "Names", names, subject="sweep")\n'
+        )
+    points = environment / "long_episodes-1.0.dist-info" / "entry_points.txt"
+    points.write_text(
+        "[dualtaxi.views]\nsweep names = long_episodes:NAMES\nsweep run = long_episodes:NAMES\n"
+    )
+    assert re.search(r"ls +List .*\n +names +From the package long-episodes", dualtaxi("sweep", "--help"))
+    assert json.loads(dualtaxi("sweep", "names", "small", "--json"))["lengths"] == {"small": 2}
+    assert "--dry-run" in dualtaxi("sweep", "run", "--help")
+
+
 def test_a_plugin_that_cannot_be_used_is_named(environment, run):
     module = environment / "long_episodes.py"
     module.write_text("import no_such_module")

@@ -480,7 +480,7 @@ def test_a_view_that_takes_code_or_a_path_is_a_command_only(service):
 
     here = {view.name for view in shipped_views() if not view.is_served}
     own_pages = {"find", "sql"}
-    assert here == own_pages | {"du", "ls", "show", "table", "values", "verify"}
+    assert here == own_pages | {"du", "ls", "show", "sweep ls", "sweep show", "table", "values", "verify"}
     assert not View("made", "Made", made).is_served
 
     def wrong(recording, code=ONLY_HERE):

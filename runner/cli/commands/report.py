@@ -137,9 +137,8 @@ def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
     from runner.export.plots.image import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
-    from runner.sweep.state import read_sweep
 
-    results = results_of(read_sweep(name, recordings), recordings)
+    results = results_of(name, recordings)
     picture = picture_of(results)
     groups = learning(results, recordings)
     panel = panel_of(results.sweep.objective.metric, panels_of(groups))
@@ -210,9 +209,8 @@ def report_command(
 def _report_sweep(name: str, recordings: Path, to: Writing) -> Reply:
     from runner.sweep.charts import render_sweep
     from runner.sweep.results import results_of
-    from runner.sweep.state import read_sweep
 
-    results = results_of(read_sweep(name, recordings), recordings)
+    results = results_of(name, recordings)
     with stage_line("drawing"):
         write_text_new(to.path(), to.force, render_sweep(results, recordings))
     output = to.path()

@@ -8,7 +8,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
@@ -16,24 +16,20 @@ from runner.cli.command import CommandGroup, argument, option
 from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
-    all_option,
-    force_option,
     ray_option,
     recordings_option,
     workers_option,
 )
-from runner.cli.output import Remark, Reply, console, facts, say
-from runner.cli.parameter_types import PATH, ConfigName
-from runner.cli.progress import seldom, stage_line
-from runner.errors import ExitCode, RunnerError
-from runner.export.places import require_new, write_text_new
+from runner.cli.output import Reply, console, facts, say
+from runner.cli.parameter_types import ConfigName
+from runner.cli.progress import seldom
+from runner.errors import ExitCode
 from runner.runs.run import recordings_folder
-from runner.sweep import sweeps_in
 from runner.util.humanize import UNKNOWN, amount, duration, size
+from runner.util.plugins import VIEWS
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:
-    from runner.cli.output import Part
     from runner.sweep.model import Sweep
     from runner.sweep.parameters import Parameter
     from runner.sweep.plan import Plan
@@ -41,7 +37,19 @@ if TYPE_CHECKING:
     from runner.sweep.trials import Trials
 
 
-@click.group("sweep", cls=CommandGroup)
+class SweepGroup(CommandGroup):
+    """The commands of sweeps: `run`, and views."""
+
+    plugins = VIEWS
+    prefix = "sweep "
+    views: ClassVar = {
+        "show": "Rank the trials of the sweep NAME with intervals over seeds, and show which parameters "
+        "mattered.",
+        "ls": "List the sweeps of a recordings folder.",
+    }
+
+
+@click.group("sweep", cls=SweepGroup)
 def sweep_command() -> None:
     """Run an experiment with many values, and rank them.
 
@@ -123,70 +131,6 @@ def run(
         )
     code = ExitCode.DIFFERENT if status.stopped or status.failed else ExitCode.OK
     return _results(sweep, trials, status, ExitCode.INTERRUPTED if code and interrupt.came else code)
-
-
-@sweep_command.command("show")
-def show(
-    name: str = argument(),
-    everything: bool = all_option,
-    best: Path | None = option(
-        "--write-best",
-        type=PATH,
-        metavar="FILE",
-        help="Write the best configuration, with fresh seeds.",
-    ),
-    force: bool = force_option,
-    recordings: Path | None = recordings_option,
-) -> Iterator[Reply]:
-    """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.
-
-    The value of a trial is the median over its seeds, shown with the interquartile mean (IQM) and its 95 %
-    bootstrap interval, for four seeds and more. What mattered is the share of the objective's variance that
-    each parameter explains (functional ANOVA), and each pair in a completed grid. --all lists every trial.
-
-    Examples:
-      dualtaxi sweep show hyperparameters
-      dualtaxi sweep show hyperparameters --write-best best.yaml
-    """
-    from runner.sweep.results import DEFAULT_SHOWN, results_of, sections
-    from runner.sweep.state import read_sweep
-
-    folder = recordings_folder(recordings)
-    if best is not None:
-        require_new(best, force)
-    sweep = read_sweep(name, folder)
-    with stage_line("ranking trials"):
-        results = results_of(sweep, folder)
-    values = {
-        "name": name,
-        "objective": results.sweep.objective.model_dump(mode="json"),
-        "trials": results.trials,
-        "ranking": [dataclasses.asdict(entry) for entry in results.ranking],
-        "effects": [dataclasses.asdict(effect) for effect in results.effects],
-        "best": results.best and results.best.number,
-    }
-    text: list[Part] = [*sections(results, None if everything else DEFAULT_SHOWN)]
-    if best is None and results.best is not None:
-        number = results.best.number
-        what = f"the configuration of trial {number}, with seeds not searched"
-        text.append(Remark(f"--write-best FILE writes {what}."))
-    yield Reply(values, text)
-    if best is not None:
-        if results.best_yaml is None:
-            raise RunnerError(f"the sweep {name!r} has no finished trial yet, so there is no best one.")
-        write_text_new(best, force, results.best_yaml)
-        say(f"{best}: the best configuration, with fresh seeds; `dualtaxi run {best}` confirms it.")
-
-
-@sweep_command.command("ls")
-def ls(recordings: Path | None = recordings_option) -> Reply:
-    """List the sweeps of a recordings folder.
-
-    Example:
-      dualtaxi sweep ls
-    """
-    names = sweeps_in(recordings_folder(recordings))
-    return Reply({"sweeps": names}, names or [Remark("No sweeps yet. `dualtaxi sweep run FILE` starts one.")])
 
 
 @contextlib.contextmanager

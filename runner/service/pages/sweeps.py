@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Grid
 from runner.debugging.explanation_files import explanations_in
@@ -32,9 +31,9 @@ router = APIRouter(prefix="/sweeps", include_in_schema=False)
 Name = Annotated[str, InPath(max_length=100)]
 Part = Literal["results", "importance", "pictures"]
 PARTS: Final = {
-    "results": (sweep_fragments.sweep_results, "Comparing the trials"),
-    "importance": (sweep_fragments.sweep_importance, "Computing the importance of parameters"),
-    "pictures": (sweep_fragments.sweep_pictures, "Drawing parameters and learning curves"),
+    "results": (sweep_fragments.ranking, "Comparing the trials"),
+    "importance": (sweep_fragments.importance, "Computing the importance of parameters"),
+    "pictures": (sweep_fragments.pictures, "Drawing parameters and learning curves"),
 }
 """Parts of the page of a sweep in the order in which they are computed, the fastest first.
 
@@ -62,55 +61,6 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
     return Page("sweeps.html", {"sweeps": listed_sweeps, "explanations": names})
 
 
-@router.get("/{name}")
-async def sweep(
-    name: Name,
-    settings: SettingsOf,
-    catalogue: CatalogueOf,
-    cache: CacheOf,
-    jobs: JobsOf,
-) -> Response:
-    """Show the results of a sweep, at once, with placeholders for the parts that are not ready yet."""
-    state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
-    cached = {part: cache.get(_key(state, part)) for part in PARTS}
-    bodies = {part: None if body is None else body.decode() for part, body in cached.items()}
-    waiting = {part: text for part, (_, text) in PARTS.items()}
-
-    def show() -> dict[str, object]:
-        sweep_jobs = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == name]
-        parameters = [f"config.{path}" for path in read_sweep(name, state.folder).file.parameters]
-        columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
-        query = {"filter": _filter_of(name), "columns": columns}
-        return {
-            "name": name,
-            "runs": state.runs,
-            "runs_address": link("/runs", query),
-            "job": sweep_jobs[-1].status() if sweep_jobs else None,
-            "bodies": bodies,
-            "waiting": waiting,
-        }
-
-    return Page("sweep_page.html", show)
-
-
-@router.get("/{name}/{part}")
-async def sweep_part(
-    name: Name,
-    part: Part,
-    settings: SettingsOf,
-    catalogue: CatalogueOf,
-    cache: CacheOf,
-    processes: SweepProcesses,
-) -> Response:
-    """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
-    state = await run_in_threadpool(_state_of, name, settings.recordings, catalogue)
-    make, _ = PARTS[part]
-    body = await cache.get_or_await(
-        _key(state, part), lambda: processes(make, state.name, state.folder, state.digest), ALWAYS
-    )
-    return HTMLResponse(body)
-
-
 @dataclass(frozen=True)
 class _SweepState:
     """The state of a sweep; what is computed from it holds as long as it is the same."""
@@ -123,13 +73,13 @@ class _SweepState:
     """A hash of the catalogue's rows of its runs, and of the sweep's own files."""
 
 
-def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _SweepState:
+def _state_of(name: Name, settings: SettingsOf, catalogue: CatalogueOf) -> _SweepState:
     """Return the present state of a sweep.
 
     Raises:
         RunNotFound: there is no sweep of this name.
     """
-    folder = next((folder for folder in folders if name in sweeps_in(folder)), None)
+    folder = next((folder for folder in settings.recordings if name in sweeps_in(folder)), None)
     if folder is None:
         raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
     is_of_sweep = parse(_filter_of(name))
@@ -141,6 +91,42 @@ def _state_of(name: str, folders: tuple[Path, ...], catalogue: Catalogue) -> _Sw
     )
     digest = hashlib.sha256(json.dumps([files, rows], default=str, sort_keys=True).encode()).hexdigest()
     return _SweepState(name, folder, len(rows), digest)
+
+
+SweepOf = Annotated[_SweepState, Depends(_state_of)]
+
+
+@router.get("/{name}")
+async def sweep(state: SweepOf, cache: CacheOf, jobs: JobsOf) -> Response:
+    """Show the results of a sweep, at once, with placeholders for the parts that are not ready yet."""
+    parts = [(part, waiting, cache.get(_key(state, part))) for part, (_, waiting) in PARTS.items()]
+
+    def show() -> dict[str, object]:
+        sweep_jobs = [job for job in jobs.store.jobs() if job.kind == "sweep" and job.name == state.name]
+        parameters = [f"config.{path}" for path in read_sweep(state.name, state.folder).file.parameters]
+        columns = ",".join(["id", "seed", "status", "success_percent", "mean_length", *parameters])
+        query = {"filter": _filter_of(state.name), "columns": columns}
+        return {
+            "name": state.name,
+            "runs": state.runs,
+            "runs_address": link("/runs", query),
+            "job": sweep_jobs[-1].status() if sweep_jobs else None,
+            "shown_parts": parts,
+        }
+
+    return Page("sweep_page.html", show)
+
+
+@router.get("/{name}/{part}")
+async def sweep_part(state: SweepOf, part: Part, cache: CacheOf, processes: SweepProcesses) -> Response:
+    """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
+    make, _ = PARTS[part]
+    body = await cache.get_or_await(
+        _key(state, part),
+        lambda: processes(sweep_fragments.sweep_part, make, state.name, state.folder, state.digest),
+        ALWAYS,
+    )
+    return HTMLResponse(body)
 
 
 def _count_runs(catalogue: Catalogue, name: str) -> int:

@@ -24,7 +24,7 @@ from runner.sweep.results import fresh_seeds, results_of
 
 @pytest.fixture(scope="module")
 def results(done, sweep):
-    return results_of(sweep, done[0])
+    return results_of(sweep.name, done[0])
 
 
 def typed(*words):
@@ -116,13 +116,13 @@ def test_a_sweep_without_finished_trials_cannot_be_drawn(tmp_path):
     sweep = from_values(described())
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     with pytest.raises(RunnerError, match="no finished trial yet"):
-        picture_of(results_of(sweep, tmp_path))
+        picture_of(results_of(sweep.name, tmp_path))
 
 
 def test_duplicate_values_are_shown_once(tmp_path):
     sweep = from_values(described(strategy="random", trials=8, parameters={"discount": [0.5, 0.9]}))
     swept(tmp_path, sweep)
-    results = results_of(sweep, tmp_path)
+    results = results_of(sweep.name, tmp_path)
     assert len(results.ranking) == 2
     assert sum(1 + len(entry.duplicates) for entry in results.ranking) == 8
 
@@ -138,7 +138,7 @@ def test_a_level_never_reached_is_not_drawn(tmp_path):
     trials, _ = swept(tmp_path, sweep)
     assert len(digests(trials)) == 3
     with pytest.raises(RunnerError, match="nothing to draw"):
-        picture_of(results_of(sweep, tmp_path))
+        picture_of(results_of(sweep.name, tmp_path))
 
 
 def test_a_sweep_of_archived_runs_is_complete(tmp_path, monkeypatch):
@@ -148,7 +148,7 @@ def test_a_sweep_of_archived_runs_is_complete(tmp_path, monkeypatch):
     for run in list_runs(folder):
         archive_run(run, str(tmp_path / "archive"), remove=True)
     assert {run.status for run in list_runs(folder)} == {"archived"}
-    results = results_of(sweep, folder)
+    results = results_of(sweep.name, folder)
     assert results.best.value == ended.best.value
     assert len(learning(results, folder)) == 2
     nobody = Here()

@@ -17,7 +17,7 @@ from runner.sweep.charts import parameters_section, picture_of
 from runner.sweep.loading import from_values
 from runner.sweep.model import Objective
 from runner.sweep.objective import curve_of, pruning_bounds, should_prune, value_of
-from runner.sweep.results import results_of, sections
+from runner.sweep.results import results_of
 from runner.sweep.search import Search
 from runner.sweep.strategies import STRATEGIES
 from runner.sweep.trials import Trials
@@ -169,13 +169,13 @@ def test_parameters_that_an_algorithm_does_not_use_spend_no_trials(changes, tmp_
     }
     sweep = from_values(described(parameters=parameters, seeds=[0], batch=4, **changes))
     swept(tmp_path, sweep)
-    results = results_of(sweep, tmp_path)
+    results = results_of(sweep.name, tmp_path)
     assert sorted(map(str, (trial.values for trial in results.ranking))) == [
         str({"algorithm": "q_learning"}),
         *(str({"algorithm": "wolf_phc", "wolf_phc.lose": lose}) for lose in (0.1, 0.2, 0.4)),
     ]
     assert results.trials == len(results.suggested) == 4
-    rows = {row[-3]: row[-2] for row in sections(results)[0].grids[0].rows}
+    rows = {row[-3]: row[-2] for row in results.sections()[0].grids[0].rows}
     assert rows["q_learning"] == "–"
     picture = picture_of(results)
     assert "nan" not in "".join(plot.svg for plot in parameters_section(picture).figures).lower()

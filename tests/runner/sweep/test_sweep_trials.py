@@ -24,7 +24,7 @@ from runner.sweep.local import LocalWorkers
 from runner.sweep.model import Objective
 from runner.sweep.parameters import Range
 from runner.sweep.plan import plan_of
-from runner.sweep.results import ranking, results_of, sections
+from runner.sweep.results import ranking, results_of
 from runner.sweep.running import run_sweep
 from runner.sweep.task import Task, move_files
 
@@ -140,7 +140,7 @@ def test_a_task_whose_worker_dies_twice_fails_and_the_sweep_continues(tmp_path):
     assert trials.done[0].errors == ["seed 0: its worker died twice"]
     again, status = swept(tmp_path, sweep)
     assert (status.started, digests(again)) == (0, digests(trials))
-    assert len(results_of(sweep, tmp_path).ranking) == 6
+    assert len(results_of(sweep.name, tmp_path).ranking) == 6
     state.forget_failures("small", tmp_path)
     _, status = swept(tmp_path, sweep)
     assert (status.done, status.failed, status.started) == (6, 0, 1)
@@ -226,7 +226,7 @@ def test_contradictory_values_are_excluded(tmp_path):
     assert "found tables: joint" in trials.done[3].errors[0]
     assert (status.runs, status.done, status.failed, status.excluded) == (3, 3, 0, 1)
     assert plan_of(sweep).excluded == 1
-    assert "found tables: joint" in str(sections(results_of(sweep, tmp_path)))
+    assert "found tables: joint" in str(results_of(sweep.name, tmp_path).sections())
 
 
 def test_a_changed_sweep_is_refused_with_its_changes(sweep, tmp_path):
@@ -262,7 +262,7 @@ def test_a_second_sweep_of_a_name_and_a_second_process_are_refused(sweep, tmp_pa
 def test_results_rank_by_the_objective_with_intervals(tmp_path):
     sweep = from_values(described(seeds=[0, 1, 2, 3, 4]))
     _, status = swept(tmp_path, sweep)
-    results = results_of(sweep, tmp_path)
+    results = results_of(sweep.name, tmp_path)
     medians = [entry.median for entry in results.ranking]
     assert medians == sorted(medians, reverse=True)
     assert results.best.number == status.best.number == results.ranking[0].number

@@ -1,0 +1,47 @@
+"""`sweep show`: the results of a sweep."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from runner.views.view import NO_PROGRESS, ShownProgress, View, view_input
+
+if TYPE_CHECKING:
+    from runner.sweep.results import Results
+
+
+def sweep_show(
+    sweep: tuple[str, Path],
+    everything: bool = view_input(
+        "all", "Include everything, not only a selection.", kind=bool, default=False
+    ),
+    progress: ShownProgress = NO_PROGRESS,
+) -> Results:
+    """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.
+
+    The value of a trial is the median over its seeds, shown with the interquartile mean (IQM) and its 95 %
+    bootstrap interval, for four seeds and more. What mattered is the share of the objective's variance that
+    each parameter explains (functional ANOVA), and each pair in a completed grid. --all lists every trial.
+
+    Examples:
+      dualtaxi sweep show hyperparameters
+      dualtaxi sweep show hyperparameters --write-best best.yaml
+    """
+    from runner.sweep.results import results_of
+
+    with progress.stage("ranking trials"):
+        results = results_of(*sweep)
+    return replace(results, shown=None) if everything else results
+
+
+VIEW: Final = View(
+    "sweep show",
+    "Sweep",
+    sweep_show,
+    subject="sweep",
+    file_ending=".yaml",
+    file_flags=("--write-best",),
+    file_help="Write the best configuration, with fresh seeds.",
+)
