@@ -327,11 +327,11 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
     for kind, names in sorted(kinds.items(), key=lambda own: (own[1][0] not in success_events, len(own[1]))):
         counts = [[record.events[name] for name in names] for record in records]
         heading = spoken(kind)
-        cells = [str(sum(own)) for own in counts]
+        cells = [str(sum(by_agent)) for by_agent in counts]
         if names[0] in success_events and len(names) > 1:
             agents = [name.rpartition(".")[0].rpartition("_")[2] for name in names]
             heading = f"{heading} {'/'.join(agents)}"
-            cells = ["/".join(map(str, own)) for own in counts]
+            cells = ["/".join(map(str, by_agent)) for by_agent in counts]
         columns[heading.replace(" ", "\n", 1)] = cells
     events = [*columns][fixed:]
     spare = sorted(events, key=lambda heading: (heading != "pickup", -events.index(heading)))

@@ -64,7 +64,7 @@ def unmark(run: Run, *ids: str) -> None:
     run.require_folder()
 
     def change(marks: Marks) -> Marks:
-        known = [each.id for each in marks.marks]
+        known = [mark.id for mark in marks.marks]
         if missing := [name for name in ids if name not in known]:
             raise NotInRecording(
                 f"run {run.run_id}: found no mark {missing[0]!r}, expected one of: "

@@ -192,7 +192,7 @@ class RunDetails(Answer):
         if self.run.marks:
             rows = [(mark.at, mark.text, " ".join(mark.tags)) for mark in self.run.marks]
             results.append(Section("Marks", grids=[Grid(("step", "text", "tags"), rows)]))
-        return [each for each in results if each.facts or each.grids or each.sentences]
+        return [section for section in results if section.facts or section.grids or section.sentences]
 
     def origin_sections(self) -> list[Section]:
         """Return what identifies the run, its configuration and its provenance."""

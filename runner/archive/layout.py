@@ -130,10 +130,10 @@ def encodings_of(columns: pa.Schema) -> dict[str, str]:
     if any(pa.types.is_list(kind) for kind in columns.types):
         return {}
     values = {"value"} | {name for name in columns.names if name.startswith(VALUES)}
-    split = {one.name for one in columns if one.name in values and pa.types.is_floating(one.type)}
-    numbers = (one.name for one in columns if not pa.types.is_string(one.type))
+    split = {column.name for column in columns if column.name in values and pa.types.is_floating(column.type)}
+    numbers = (column.name for column in columns if not pa.types.is_string(column.type))
     special = {name: ENCODINGS[name] for name in numbers if name in ENCODINGS}
-    plain = {one.name for one in columns if pa.types.is_fixed_size_binary(one.type)}
+    plain = {column.name for column in columns if pa.types.is_fixed_size_binary(column.type)}
     return special | dict.fromkeys(split, "BYTE_STREAM_SPLIT") | dict.fromkeys(plain, "PLAIN")
 
 

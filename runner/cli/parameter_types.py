@@ -137,7 +137,7 @@ class ConfigName(click.Path):
         """Return the shipped names, and have the shell add files."""
         from runner.config.shipped import shipped
 
-        names = {each.name for each in shipped().values() if each.kind == self.kind}
+        names = {experiment.name for experiment in shipped().values() if experiment.kind == self.kind}
         own = [item for item in SHIPPED.shell_complete(ctx, param, incomplete) if item.value in names]
         return [*own, *super().shell_complete(ctx, param, incomplete)]
 
@@ -149,7 +149,7 @@ class ConfigName(click.Path):
 def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
     from runner.config.shipped import shipped
 
-    return {each.name: each.about for each in shipped().values()}
+    return {experiment.name: experiment.about for experiment in shipped().values()}
 
 
 class ExpressionText(Completed):

@@ -77,11 +77,11 @@ def pull(client: Connection, name: str, recordings: Path, report: Report = lambd
 def _pull_contents(client: Connection, run: Run, report: Report) -> None:
     """Download the contents of a run's checkpoints that are at the server and not here."""
     store = Store(run.folder.parent)
-    wanted = {each.digest: each for each in run.checkpoints() if not each.is_here}
+    wanted = {checkpoint.digest: checkpoint for checkpoint in run.checkpoints() if not checkpoint.is_here}
     if not wanted:
         return
     listed = client.request_object("GET", f"/runs/{quote(run.run_id, safe='')}/checkpoints")
-    there = {each["digest"] for each in listed["checkpoints"] if each["here"]}
+    there = {checkpoint["digest"] for checkpoint in listed["checkpoints"] if checkpoint["here"]}
     for digest, checkpoint in wanted.items():
         if digest in there:
             part = run.folder.parent / FOLDER / f"{run.folder.name}-{digest}.part"

@@ -70,9 +70,10 @@ def push(server: Connection, run: Run, report: Report = lambda *_: None, begun: 
     source["content_digest"] = run.summary.content_digest
     source["run"] = {} if run.stands_alone else import_record(run)
     upload = _send(server, begun or digest, source, run.recording, f"the run {run.run_id}", report)
-    for each in {each.digest: each for each in run.checkpoints() if each.is_here}.values():
-        source = {"digest": each.digest, "size": each.size, "checkpoint_of": upload.run_id}
-        _send(server, each.digest, source, each.path, each.reference, report)
+    by_digest = {checkpoint.digest: checkpoint for checkpoint in run.checkpoints() if checkpoint.is_here}
+    for checkpoint in by_digest.values():
+        source = {"digest": checkpoint.digest, "size": checkpoint.size, "checkpoint_of": upload.run_id}
+        _send(server, checkpoint.digest, source, checkpoint.path, checkpoint.reference, report)
     return upload
 
 

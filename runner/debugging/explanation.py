@@ -131,7 +131,7 @@ class Explanation:
 
     def part_of(self, mixture: Mixture) -> Estimate:
         """Return the part of the difference that a mixture makes, with its interval over seeds."""
-        low, *_, high = (np.array(one.values) for one in self.mixtures)
+        low, *_, high = (np.array(mixture.values) for mixture in self.mixtures)
         return bootstrap_ratio(np.array(mixture.values) - low, high - low)
 
     def as_json(self) -> Json:
@@ -264,7 +264,11 @@ def shown_mixtures(explanation: Explanation) -> list[Mixture]:
         return list(explanation.mixtures)
     count = len(explanation.settings)
     counts = (0, 1, count - 1, count)
-    return [one for one in explanation.mixtures if len(one.settings) in counts or one == explanation.smallest]
+    return [
+        mixture
+        for mixture in explanation.mixtures
+        if len(mixture.settings) in counts or mixture == explanation.smallest
+    ]
 
 
 def _mixtures_section(explanation: Explanation) -> Section:
@@ -316,7 +320,7 @@ def _figures(explanation: Explanation) -> list[Figure]:
     """Return shares, clear interactions, and mixtures by their value."""
     names = [setting.name for setting in explanation.settings]
     result = []
-    shares = [(each.name, each.share) for each in explanation.settings if each.share is not None]
+    shares = [(setting.name, setting.share) for setting in explanation.settings if setting.share is not None]
     if shares:
         title = f"Share of each setting in the difference of {explanation.metric}"
         result.append(Figure(bars_chart(title, shares).svg(), is_wide=True))

@@ -60,7 +60,7 @@ class Trained:
     def bytes(self) -> int:
         """The bytes that removing it frees; runs that are kept or in use stay."""
         own = sum(file.stat().st_size for file in self.files)
-        return own + sum(each.freed for each in self.runs if not each.refusal)
+        return own + sum(run.freed for run in self.runs if not run.refusal)
 
 
 def trained_in(recordings: Path) -> list[Trained]:
@@ -122,13 +122,16 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
 
 def _check(explanation: Explanation) -> None:
     """Check what the types do not say, or raise a `ValueError`."""
-    numbers = [explanation.difference.value, *(value for one in explanation.mixtures for value in one.values)]
-    numbers += [each.share.value for each in explanation.settings if each.share is not None]
+    numbers = [
+        explanation.difference.value,
+        *(value for mixture in explanation.mixtures for value in mixture.values),
+    ]
+    numbers += [setting.share.value for setting in explanation.settings if setting.share is not None]
     numbers.append(explanation.seconds)
-    counts = {len(one.values) for one in explanation.mixtures}
-    known_settings = {each.name for each in explanation.settings}
-    named = [each.settings for each in explanation.mixtures]
-    named += [each.settings for each in explanation.interactions]
+    counts = {len(mixture.values) for mixture in explanation.mixtures}
+    known_settings = {setting.name for setting in explanation.settings}
+    named = [mixture.settings for mixture in explanation.mixtures]
+    named += [interaction.settings for interaction in explanation.interactions]
     if len(explanation.mixtures) < 2 or counts != {len(explanation.seeds)} or not explanation.seeds:
         raise ValueError("a mixture lacks values")
     if not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):

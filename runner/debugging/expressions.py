@@ -210,7 +210,7 @@ class JobParser(Parser[Series]):
     @property
     def states(self) -> tuple[tuple[int, str], ...]:
         """The states of the quantities, with their names."""
-        numbers = sorted({each.state for each in self.quantities if each.state >= 0})
+        numbers = sorted({quantity.state for quantity in self.quantities if quantity.state >= 0})
         return tuple((number, self._state_names[number]) for number in numbers)
 
     def named(self, node: ast.expr) -> Series:
@@ -252,7 +252,7 @@ class JobParser(Parser[Series]):
 
     def _learner(self, node: ast.expr, name: str, agent: str | None) -> int:
         several = len(self._learners) > 1
-        expected = " or ".join(f"{name}.{each}" for each in self._learners)
+        expected = " or ".join(f"{name}.{learner}" for learner in self._learners)
         if agent is not None:
             if name not in ("q", "greedy", "visits", "reward"):
                 raise self.error(node, f"found {name} of an agent, expected {name} alone.")

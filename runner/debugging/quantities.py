@@ -41,15 +41,15 @@ class JobColumns:
         self._widths = list(self._mdp.action_counts) if several else [self._mdp.joint_actions]
         self._cells: dict[Quantity, slice] = {}
         self._greedy: dict[Quantity, list[int]] = {}
-        self._paths = [each for each in quantities if each.name == "greedy_success"]
-        names = {each.name for each in quantities}
+        self._paths = [quantity for quantity in quantities if quantity.name == "greedy_success"]
+        names = {quantity.name for quantity in quantities}
         by_step = "epsilon" in names and (
             len(starts) > 1 or any(rules.epsilon[1] == 1.0 for _, rules in self._segments)
         )
         self._every_step = by_step or bool(names & {"step", "reward"})
         self._by_episode = bool(names & {"episode", "epsilon"})
         self._watch = self._new_watch()
-        self._visits = {each: 0 for each in quantities if each.name == "visits"}
+        self._visits = {quantity: 0 for quantity in quantities if quantity.name == "visits"}
         if self._visits:
             self._count_visits(recording, start)
         self._replay = TableReplay(recording, start) if names & set(TABLE_NAMES) else None
@@ -84,7 +84,7 @@ class JobColumns:
             states=states,
             cells=np.array(cells, np.int64),
             greedy=np.array(greedy, np.int64).reshape(-1, 2),
-            starts=np.array([each.state for each in self._paths], np.int64),
+            starts=np.array([quantity.state for quantity in self._paths], np.int64),
             success=np.uint32(self._mdp.success_mask),
             path=np.zeros(paths, np.int32),
             length=np.zeros(len(self._paths), np.int64),
@@ -115,7 +115,7 @@ class JobColumns:
 
     def _part(self, block: Records, needed: int) -> tuple[Ints, Columns]:
         changes = None if self._replay is None else self._replay.watch(block, self._watch)
-        visits = {each: self._visited(each, block) for each in self._visits}
+        visits = {quantity: self._visited(quantity, block) for quantity in self._visits}
         may_change = np.full(len(block), self._every_step)
         for mask in visits.values():
             may_change |= mask
@@ -170,7 +170,7 @@ class JobColumns:
         return columns
 
     def _first(self) -> Columns:
-        columns: dict[Quantity, Array] = {each: np.full(1, np.nan) for each in self._quantities}
+        columns: dict[Quantity, Array] = {quantity: np.full(1, np.nan) for quantity in self._quantities}
         for each, visits in self._visits.items():
             columns[each] = np.full(1, float(visits))
         if self._replay is not None:

@@ -144,7 +144,7 @@ def branch_job(
     )
     seed = recording.seed or 0
     given = wanted.to_mapping()
-    branches = [each.model_dump(mode="json") for each in (*parent.branches, branch)]
+    branches = [step_branch.model_dump(mode="json") for step_branch in (*parent.branches, branch)]
     changes = {key: given[key] for key in OF_THE_WHOLE} | {"seeds": [seed], "branches": branches}
     return Job(from_mapping(parent.to_mapping() | changes), seed), where
 
@@ -190,7 +190,7 @@ def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
     """
     with open_recording(own.recording) as recording:
         count = min(episodes, unbroken(parent)[1], recording.train.episodes.count())
-        ours, theirs = (one.train.episodes.blocks(0, count) for one in (recording, parent))
+        ours, theirs = (run.train.episodes.blocks(0, count) for run in (recording, parent))
         left, right = first_difference(ours, theirs, ("episode", "last_step", "returns"))
     differing = right if left is None else left
     if differing is not None:

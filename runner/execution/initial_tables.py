@@ -74,7 +74,7 @@ def configured_tables(
         tables = named_tables_at(recording, last_step(recording) if start.step is None else start.step)
     joint = config.tables == "joint"
     shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
-    found = [one["q"].shape for one in tables]
+    found = [table["q"].shape for table in tables]
     if found != shapes:
         raise RunnerError(f"initial_q: run {source.run_id} has tables of shape {found}, expected {shapes}.")
     return tables

@@ -301,10 +301,10 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Me
         "evaluation": evaluation,
         "trials": len(trials),
         "successes": successes if has_success else -1,
-        **{each.field: math.nan for each in METRICS},
+        **{metric.field: math.nan for metric in METRICS},
         **{
-            each.field: np.asarray(each.combine(each.of_trials(trials))).tolist()
-            for each in defined_metrics(has_success, True)
+            metric.field: np.asarray(metric.combine(metric.of_trials(trials))).tolist()
+            for metric in defined_metrics(has_success, True)
         },
         "terminations": int(trials["terminated"].sum()),
         "events": trials["events"].sum(axis=0, dtype=np.int64).tolist(),

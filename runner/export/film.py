@@ -100,12 +100,12 @@ def write_grid(
                     done += 1
                     progress(done)
             films.append(one)
-        height, each_width = max(one.size[1] for one in films), max(one.size[0] for one in films)
+        height, each_width = max(film.size[1] for film in films), max(film.size[0] for film in films)
         rows = -(-len(films) // columns)
         canvas = np.full((rows * height, columns * each_width, 3), 255, np.uint8)
-        decoded = [stack.enter_context(contextlib.closing(frames_of(one.path))) for one in films]
+        decoded = [stack.enter_context(contextlib.closing(frames_of(film.path))) for film in films]
         film = stack.enter_context(encoder(path, fps))
-        for _ in range(max(one.frames for one in films)):
+        for _ in range(max(film.frames for film in films)):
             for place, frames in enumerate(decoded):
                 top = place // columns * height
                 left = place % columns * each_width

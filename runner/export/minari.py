@@ -111,7 +111,9 @@ def write_dataset(
 def _missing(recording: Recording, phase: str, is_all: bool, written: Written) -> list[str]:
     """Return what a dataset lacks or has otherwise than recorded, a sentence each."""
     notes = []
-    ended, steps = (own.count() for own in (recording.phase(phase).episodes, recording.phase(phase).steps))
+    ended, steps = (
+        table.count() for table in (recording.phase(phase).episodes, recording.phase(phase).steps)
+    )
     if written.abandoned:
         notes.append(
             f"{written.abandoned:,} episodes were reset before their end; "

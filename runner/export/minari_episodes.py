@@ -131,7 +131,7 @@ def _extend(recording: Recording, parts: list[Records], part: Records, is_last: 
         yield np.concatenate(parts)
         parts.clear()
     parts.append(part.copy())
-    if sum(one.nbytes for one in parts) > MAX_EPISODE_BYTES:
+    if sum(part.nbytes for part in parts) > MAX_EPISODE_BYTES:
         raise RecordingError(
             f"{recording.path}: episode {part['episode'][0]} has more than {MAX_EPISODE_BYTES:,} bytes, "
             "which Minari would hold at once; choose others by --episodes, or export parquet."

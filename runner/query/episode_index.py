@@ -264,13 +264,17 @@ def _hash(value: object) -> str:
 
 def _aggregates(shape: Shape, steps: pa.Schema) -> dict[str, str]:
     """Return the columns of the index that need steps, with their SQL."""
-    numbers = [one.name for one in steps if pa.types.is_integer(one.type) or pa.types.is_floating(one.type)]
+    numbers = [
+        column.name
+        for column in steps
+        if pa.types.is_integer(column.type) or pa.types.is_floating(column.type)
+    ]
     columns = {
         f"{function}({name})": f"CASE WHEN count({{0}}) = count(*) THEN {sql} END".format(quoted(name))
         for name in [name for name in numbers if name not in _NOT_INDEXED][:_MAX_COLUMNS]
         for function, sql in (("min", "min({0})"), ("max", "max({0})"), ("last", "arg_max({0}, step)"))
     }
-    flags = [one.name for one in steps if pa.types.is_boolean(one.type)]
+    flags = [column.name for column in steps if pa.types.is_boolean(column.type)]
     columns |= {f"count({name})": f"count_if({quoted(name)})" for name in flags}
     return columns | {
         f"count({name} == {k})": f"count_if({quoted(name)} = {k})"

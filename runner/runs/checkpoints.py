@@ -191,15 +191,15 @@ def find_checkpoint(every: Sequence[Checkpoint], reference: str, where: str) -> 
         raise RunNotFound(
             f"checkpoint {reference!r}: found the step {step!r}, expected a number: {name}@20000."
         )
-    candidates = [one for one in every if one.phase == "train"] or every
-    candidates = [one for one in candidates if not name or one.name == name]
+    candidates = [checkpoint for checkpoint in every if checkpoint.phase == "train"] or every
+    candidates = [checkpoint for checkpoint in candidates if not name or checkpoint.name == name]
     if step and step != "latest":
-        candidates = [one for one in candidates if one.step <= int(step)]
+        candidates = [checkpoint for checkpoint in candidates if checkpoint.step <= int(step)]
     if candidates:
         return candidates[-1]
     if not every:
         raise RunNotFound(f"{where} has no checkpoints; a loop records one by rec.checkpoint(name, value).")
-    available = ", ".join(one.reference for one in every[:20])
+    available = ", ".join(checkpoint.reference for checkpoint in every[:20])
     raise RunNotFound(f"{where} has no checkpoint {reference!r}; it has: {available}.")
 
 

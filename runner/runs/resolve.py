@@ -161,7 +161,7 @@ def not_found(name: str, index: CatalogueIndex, recordings: Path) -> RunNotFound
         return RunNotFound("found an empty name, expected an id, the beginning of one, a name or @latest.")
     names = {run.name for run in runs}
     if "@" in name:
-        names = {LATEST} | {f"{each}{LATEST}" for each in names}
+        names = {LATEST} | {f"{name}{LATEST}" for name in names}
     hint = nearest(name, names | {run.run_id for run in runs})
     return RunNotFound(
         f"no run {name!r} in {recordings}, which has {counted(index.count(), 'run')}.{hint} `dualtaxi ls` "

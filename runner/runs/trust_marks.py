@@ -84,7 +84,7 @@ def mark(folder: Path, environment: EnvironmentMaker | JsonView | None) -> None:
 def merge_marks(folder: Path, others: list[Path]) -> None:
     """Add to a run's mark what the marks in other folders state; those that do not hold state nothing."""
     marks = [mark_of(place) for place in (folder, *others)]
-    if any(one.environments for one in marks) and (key := _key(False)) is not None:
+    if any(mark.environments for mark in marks) and (key := _key(False)) is not None:
         _write(folder, marks, key)
 
 
@@ -178,10 +178,10 @@ def _seal(values: Mapping[str, object], key: bytes) -> str:
 
 def _write(folder: Path, marks: list[TrustMark], key: bytes) -> None:
     """Replace a run's mark by one that states what these state; the first script among them counts."""
-    script = next((one for one in marks if one.script), TrustMark())
+    script = next((mark for mark in marks if mark.script), TrustMark())
     values: dict[str, object] = {
-        "environments": list(dict.fromkeys(digest for one in marks for digest in one.environments)),
-        "folders": list(dict.fromkeys(path for one in marks for path in one.folders)),
+        "environments": list(dict.fromkeys(digest for mark in marks for digest in mark.environments)),
+        "folders": list(dict.fromkeys(path for mark in marks for path in mark.folders)),
         "script": script.script,
         "script_digest": script.script_digest,
     }

@@ -228,7 +228,7 @@ class Uploads:
             return run if stored_as or has else None
         if run is None:
             raise RunNotFound("no such run: push it before the contents of its checkpoints.")
-        checkpoints = [(each.digest, each.size) for each in run.checkpoints()]
+        checkpoints = [(checkpoint.digest, checkpoint.size) for checkpoint in run.checkpoints()]
         if (source.digest, source.size) not in checkpoints:
             raise StateConflict(f"run {run.run_id} has no checkpoint of this digest and size.")
         return run if Store(self._recordings).has(source.digest or "", source.size or 0) else None

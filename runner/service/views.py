@@ -94,7 +94,7 @@ def _add_routes(view: View) -> None:
     ) -> Response:
         """Show the form, and the answer to what it asks."""
         query = request.query_params
-        form = {each.name: query.get(each.name, "").strip() for each in view.inputs.values()}
+        form = {given.name: query.get(given.name, "").strip() for given in view.inputs.values()}
         body, problem = b"", None
         try:
             if view.has_default or any(form.values()):

@@ -134,7 +134,7 @@ def finite(value: object) -> Any:
     if callable(to_list := getattr(value, "tolist", None)):  # an array, without an import of NumPy
         return finite(to_list())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {each.name: finite(getattr(value, each.name)) for each in dataclasses.fields(value)}
+        return {field.name: finite(getattr(value, field.name)) for field in dataclasses.fields(value)}
     return value
 
 

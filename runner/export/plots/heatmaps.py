@@ -38,7 +38,11 @@ def heatmap_plots(histograms: list[ValueCounts]) -> list[Figure]:
 
 def constants_in(histograms: list[ValueCounts]) -> list[str]:
     """Return a sentence on each quantity that has one value, of which a heat map shows nothing."""
-    return [f"{title_of(each)}: always {each.names[0]}." for each in histograms if len(each.names) == 1]
+    return [
+        f"{title_of(histogram)}: always {histogram.names[0]}."
+        for histogram in histograms
+        if len(histogram.names) == 1
+    ]
 
 
 def title_of(histogram: ValueCounts) -> str:

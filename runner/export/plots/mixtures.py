@@ -53,7 +53,7 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
 
 def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn]) -> Chart:
     """Return each mixture as a column: its values and their mean, and below a dot for what is changed."""
-    values = np.array([value for one in columns for value in one.values])
+    values = np.array([value for column in columns for value in column.values])
     bottom = 170.0
     last = 184.0 + 16 * len(names)
     x = Scale(-0.6, len(columns) - 0.4, _NAMES, _WIDTH - 10)

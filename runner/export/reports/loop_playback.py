@@ -71,7 +71,7 @@ class _ShownPart:
                 part = part[name]
             return part.reshape(len(part), -1)[:, : len(self.names)].copy()
         for name in self.path:
-            values = [each[int(name) if isinstance(each, tuple) else name] for each in values]
+            values = [value[int(name) if isinstance(value, tuple) else name] for value in values]
         if self.is_text:
             return [shortened(value, _MAX_LETTERS) for value in values]
         return np.array(values).reshape(len(values), -1)[:, : len(self.names)]
@@ -233,7 +233,7 @@ def _frames(
     """
     texts, series = [], []
     for i, part in enumerate(parts):
-        columns = [each[i] for each in observations]
+        columns = [observation[i] for observation in observations]
         if part.is_text:
             shown = [text for column in columns for text in column]
             unknown = [""] * (frames - len(shown))

@@ -67,7 +67,7 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[EpisodeRef | None, str]:
                 "Where they diverge is unknown: states or actions differ, or steps were not recorded.",
             )
         places = list(divergences(a, b))
-        both = [each for each in places if None not in (each.a_step, each.b_step)]
+        both = [place for place in places if None not in (place.a_step, place.b_step)]
         if not both:
             suffix = ", as far as the shorter goes" if places else ""
             return None, f"They never diverge: every step is the same{suffix}."

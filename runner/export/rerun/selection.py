@@ -242,7 +242,7 @@ def _default_episodes(lengths: Ints, limit: int = DEFAULT_STEPS) -> Ints:
 
 def _steps_without_values(recording: Recording, ranges: Sequence[range]) -> int:
     """Return how many of the training steps in these ranges have unknown Q-values."""
-    if not recording.lost and next((one.step for one in recording.snapshots()), -1) == 0:
+    if not recording.lost and next((snapshot.step for snapshot in recording.snapshots()), -1) == 0:
         return 0
     from runner.replay.tables import are_within, known_steps  # loads Numba
 
@@ -261,7 +261,7 @@ def _describe_job(
 ) -> None:
     """Put in words what is exported of a job, and what is not: training episodes and evaluations."""
     spread = f", evenly spread from {numbers[0]} to {numbers[-1]:,}" if request.is_default and count else ""
-    named = f" (after {', '.join(f'{one.after:,}' for one in evaluations)} episodes)"
+    named = f" (after {', '.join(f'{evaluation.after:,}' for evaluation in evaluations)} episodes)"
     trained, tested = selection.counts
     selection.exported += [
         f"the {trained:,} steps of {len(numbers):,} of {count:,} training episodes{spread}",
@@ -273,7 +273,7 @@ def _describe_job(
             f"the steps of {count - len(numbers):,} training episodes "
             "(--episodes START..STOP or --every N includes them; --all: everything)"
         )
-    if rest := [one.after for one in available if one not in evaluations]:
+    if rest := [evaluation.after for evaluation in available if evaluation not in evaluations]:
         selection.left_out.append(
             f"the trials of {len(rest):,} evaluations (--evaluations {rest[-1]} includes the one "
             f"after {rest[-1]:,} episodes; --all: everything)"
