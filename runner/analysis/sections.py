@@ -252,10 +252,12 @@ class Answer:
 def markdown(sections: Sequence[Section]) -> Iterator[str]:
     """Yield the lines of sections in Markdown."""
     for section in sections:
-        yield from (f"## {section.title}", "") if section.title else ()
-        facts = [(name, text.replace("\n", "\\\n  ")) for name, text in section.shown_facts.items()]
-        yield from (f"- {name}: {text}" for name, text in facts)
-        yield from [""] * bool(facts)
+        if section.title:
+            yield from (f"## {section.title}", "")
+        for name, text in section.shown_facts.items():
+            yield f"- {name}: {text}".replace("\n", "\\\n  ")
+        if section.shown_facts:
+            yield ""
         for sentence in section.said:
             yield from _fenced(sentence.splitlines()) if "\n" in sentence else (sentence, "")
         for grid in section.tables:

@@ -253,9 +253,9 @@ class Phase:
         self.steps = steps
         self.episodes = recording.table(topics.episodes)
         self.resets = recording.table(topics.resets)
-        self.infos, self.frames, self.metrics = map(
-            recording.table, (topics.infos, topics.frames, topics.metrics)
-        )
+        self.infos = recording.table(topics.infos)
+        self.frames = recording.table(topics.frames)
+        self.metrics = recording.table(topics.metrics)
         self._recording = recording
         self.topics = topics
 

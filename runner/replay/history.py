@@ -33,7 +33,8 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     widths = np.array(replay.learner.model.width)
     is_action = np.arange(widths.max()) < widths[:, np.newaxis]
     visits = np.zeros(is_action.shape, np.int64)
-    changed_step, changed_episode = (np.full(widths.sum(), -1) for _ in range(2))
+    changed_step = np.full(widths.sum(), -1)
+    changed_episode = np.full(widths.sum(), -1)
     watch = _watch_of(replay, state)
     before = replay.begin_watch(watch).q
     for steps in replay.blocks(step):
