@@ -201,20 +201,21 @@ def expect(
         limit: steps of an episode.
     """
     states, outcomes = next_state.shape
-    chances = np.zeros((states, 2))
-    sums = np.zeros(gains.shape)
+    chances, sums = np.zeros((states, 2)), np.zeros(gains.shape)
+    chances_before, sums_before = np.zeros((states, 2)), np.zeros(gains.shape)
     for _ in range(limit):
-        chances_before, sums_before = chances.copy(), sums.copy()
-        chances[:] = 0.0
-        sums[:] = gains
-        for state in range(states):
+        chances, chances_before, sums, sums_before = chances_before, chances, sums_before, sums
+        for state in range(states):  # loops: array expressions take seconds to compile
+            chances[state, 0] = chances[state, 1] = 0.0
+            for i in range(gains.shape[1]):
+                sums[state, i] = gains[state, i]
             for k in range(outcomes):
                 p, after = probability[state, k], next_state[state, k]
                 goes_on = not terminated[state, k]
                 chances[state, 0] += p * (1.0 if success[state, k] else goes_on * chances_before[after, 0])
                 chances[state, 1] += p * (goes_on * chances_before[after, 1] + (1.0 - goes_on))
                 if goes_on:
-                    for i in range(gains.shape[1]):  # a loop: an array expression would allocate each time
+                    for i in range(gains.shape[1]):
                         sums[state, i] += p * sums_before[after, i]
     return chances, sums
 
