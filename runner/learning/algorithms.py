@@ -302,7 +302,7 @@ class WolfPhcSchedules(NamedTuple):
     lose: Floats
 
 
-@numba.njit
+@numba.njit(cache=True)
 def drawn(model: Model, tables: Tables, i: int, state: int, u: float) -> int:
     """Return the action of learner i's policy that u in [0, 1) selects; never one of probability 0."""
     row = tables.offset[i] + state * model.width[i]
@@ -318,7 +318,7 @@ def drawn(model: Model, tables: Tables, i: int, state: int, u: float) -> int:
     return chosen
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _improve_policy(
     tables: Tables, i: int, state: int, row: int, width: int, win: float, lose: float
 ) -> None:

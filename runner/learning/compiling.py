@@ -10,6 +10,7 @@ loop = numba.njit(cache=True, nogil=True, _nrt=False, no_cfunc_wrapper=True)
 """Compiles a loop. It allocates nothing, so it need not count references to its arrays (`_nrt`): inlined
 functions would count them at every step, atomically, and take four times as long."""
 INLINED: Final = {
+    "cache": True,
     "forceinline": True,
     "_nrt": False,
     "no_cpython_wrapper": True,
@@ -17,4 +18,5 @@ INLINED: Final = {
 }
 inlined = numba.njit(**INLINED)
 """Compiles a function that takes arrays and is called by loops alone. LLVM inlines it; if Numba did so first
-(`inline="always"`), a loop would be as fast and take two to four times as long to compile."""
+(`inline="always"`), a loop would be as fast and take two to four times as long to compile. Cached, so that
+loops of another algorithm, in another process, take half as long to compile."""

@@ -31,7 +31,7 @@ _MIX_2 = np.uint64(0x94D049BB133111EB)
 _LOW_32 = np.uint64(0xFFFFFFFF)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _finalize(z: np.uint64) -> np.uint64:
     """Return SplitMix64's output function of the state `z`."""
     z = (z ^ (z >> np.uint64(30))) * _MIX_1
@@ -39,7 +39,7 @@ def _finalize(z: np.uint64) -> np.uint64:
     return z ^ (z >> np.uint64(31))
 
 
-@numba.njit
+@numba.njit(cache=True)
 def key(seed: np.uint64, stream: int, episode: int) -> np.uint64:
     """Return the generator state that seed, stream and episode fix."""
     z = _finalize(np.uint64(seed) + _GOLDEN)
@@ -47,25 +47,25 @@ def key(seed: np.uint64, stream: int, episode: int) -> np.uint64:
     return _finalize(z + np.uint64(episode) + _GOLDEN)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def draw(state: np.uint64, index: int) -> np.uint64:
     """Return 64 random bits: output `index` (from 0) of the generator with this state."""
     return _finalize(state + (np.uint64(index) + np.uint64(1)) * _GOLDEN)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def uniform(bits: np.uint64) -> float:
     """Return a float64 in [0, 1) from the upper 53 bits."""
     return np.float64(bits >> np.uint64(11)) * 2.0**-53
 
 
-@numba.njit
+@numba.njit(cache=True)
 def coin(bits: np.uint64) -> float:
     """Return a float64 in [0, 1) from the upper 32 bits; the lower 32 stay free for `below`."""
     return np.float64(bits >> np.uint64(32)) * 2.0**-32
 
 
-@numba.njit
+@numba.njit(cache=True)
 def below(bits: np.uint64, n: int) -> int:
     """Return an integer in [0, n) from the lower 32 bits; its bias is at most n / 2**32."""
     return np.int64(((bits & _LOW_32) * np.uint64(n)) >> np.uint64(32))

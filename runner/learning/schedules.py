@@ -27,7 +27,7 @@ def schedule_value(schedule: Floats, episode: int, step: int) -> float:
     return _changing_value(schedule, step if schedule[1] == 1.0 else episode)
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _changing_value(schedule: Floats, n: int) -> float:
     if schedule[0] == LINEAR:
         value = _between(0.0, schedule[3], schedule[5], schedule[4], n)
@@ -38,7 +38,7 @@ def _changing_value(schedule: Floats, n: int) -> float:
     return max(value, schedule[2])
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _between(x0: float, y0: float, x1: float, y1: float, x: float) -> float:
     """Return the point at x of the line from (x0, y0) to (x1, y1), and y1 from x1 on."""
     if x >= x1:
@@ -46,7 +46,7 @@ def _between(x0: float, y0: float, x1: float, y1: float, x: float) -> float:
     return y0 + (y1 - y0) * ((x - x0) / (x1 - x0))
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _power(base: float, n: int) -> float:
     """Return base ** n by squaring: the same multiplications everywhere."""
     result = 1.0
@@ -58,7 +58,7 @@ def _power(base: float, n: int) -> float:
     return result
 
 
-@numba.njit
+@numba.njit(cache=True)
 def _piecewise(schedule: Floats, n: int) -> float:
     k = 5
     while k < len(schedule):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.learning import kernel, schedules
+from runner.learning import algorithms, kernel, schedules
 from runner.learning.numba_cache import stamp
 
 
@@ -22,7 +22,8 @@ def test_the_stamp_changes_with_any_file_of_the_folder(tmp_path):
 
 def test_the_kernel_is_cached_by_it():
     expected = stamp(Path(kernel.__file__).resolve().parent)
-    for function in (kernel.train, kernel.evaluate, kernel.replay, schedules.schedule_value):
+    functions = (kernel.train, kernel.evaluate, kernel.replay, algorithms.choose, schedules.schedule_value)
+    for function in functions:
         assert function._cache._impl.locator.get_source_stamp() == expected
 
 
