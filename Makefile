@@ -20,9 +20,11 @@ run: $(VENV)/.installed  ## train the tutorial's cooperative job, every step rec
 serve: $(VENV)/.installed-service  ## open the runs in the browser
 	$(BIN)/dualtaxi serve
 
+# By name: of a package that has a plugin which pytest finds by itself, such as `runner`, it compiles each module again.
+PLUGINS := $(addprefix -p ,xdist.plugin pytest_timeout _hypothesis_pytestplugin runner.golden.plugin)
 test: export PYTHONDONTWRITEBYTECODE :=  # the tests start hundreds of processes: compile modules for them once
 test: $(VENV)/.installed-dev  ## run all tests
-	$(BIN)/python -m pytest -n 3 --dist worksteal
+	$(BIN)/python -m pytest --disable-plugin-autoload $(PLUGINS) -n 3 --dist worksteal
 
 test-integrations: $(VENV)-integrations/.installed  ## test the adapters against the real libraries (8 GB of them)
 	$(VENV)-integrations/$(notdir $(BIN))/python -m pytest tests/integrations
