@@ -211,7 +211,7 @@ def _settings_section(explanation: Explanation) -> Section:
             part = [_percent(explanation.part(setting.share.value))] if is_clear else []
             others = (setting.alone, setting.last)
             cells += [signed(setting.share), *part]
-            cells += [number(one.value, True) if one else "" for one in others]
+            cells += [number(share.value, True) if share else "" for share in others]
         elif has_shares:
             cells += ["not in the set", "", "", ""]
         rows.append(tuple(cells))
@@ -275,9 +275,9 @@ def _mixtures_section(explanation: Explanation) -> Section:
     names = [setting.name for setting in explanation.settings]
     mixtures = shown_mixtures(explanation)
     rows = []
-    for one in mixtures:
-        sides = ("B" if name in one.settings else "A" for name in names)
-        rows.append((number(one.mean.value), _interval(one.mean), *sides))
+    for mixture in mixtures:
+        sides = ("B" if name in mixture.settings else "A" for name in names)
+        rows.append((number(mixture.mean.value), _interval(mixture.mean), *sides))
     text = f"{counted(explanation.runs, 'run')}, {len(explanation.mixtures)} mixtures of the settings"
     text += f"; {len(mixtures)} of them are listed." if len(mixtures) < len(explanation.mixtures) else "."
     if explanation.trained:
@@ -329,8 +329,8 @@ def _figures(explanation: Explanation) -> list[Figure]:
         title = f"{explanation.metric}: what two settings do together beyond what each does"
         result.append(Figure(bars_chart(title, pairs).svg(), is_wide=True))
     columns = [
-        BarColumn(one.settings, one.values, one == explanation.smallest)
-        for one in sorted(shown_mixtures(explanation), key=lambda one: one.mean.value)
+        BarColumn(mixture.settings, mixture.values, mixture == explanation.smallest)
+        for mixture in sorted(shown_mixtures(explanation), key=lambda mixture: mixture.mean.value)
     ]
     title = f"{explanation.metric} of mixtures: a filled dot is the value of B, a hollow one that of A"
     result.append(Figure(mixtures_chart(title, names, columns).svg(), is_wide=True))

@@ -60,19 +60,19 @@ class JobColumns:
         cells: list[int] = []
         greedy: list[tuple[int, int]] = []
         states = np.zeros(self._mdp.states, np.bool_)
-        for each in self._quantities:
-            if each.name == "q":
-                width = self._widths[each.learner]
-                row = offsets[each.learner] + each.state * width
-                own = range(row, row + width) if each.action < 0 else [row + each.action]
-                self._cells[each] = slice(len(cells), len(cells) + len(own))
+        for quantity in self._quantities:
+            if quantity.name == "q":
+                width = self._widths[quantity.learner]
+                row = offsets[quantity.learner] + quantity.state * width
+                own = range(row, row + width) if quantity.action < 0 else [row + quantity.action]
+                self._cells[quantity] = slice(len(cells), len(cells) + len(own))
                 cells += own
-            elif each.name == "greedy":
-                learners = range(len(self._widths)) if each.learner == JOINT else [each.learner]
-                self._greedy[each] = [len(greedy) + k for k in range(len(learners))]
-                greedy += [(i, each.state) for i in learners]
-            if each.name in ("q", "greedy"):
-                states[each.state] = True
+            elif quantity.name == "greedy":
+                learners = range(len(self._widths)) if quantity.learner == JOINT else [quantity.learner]
+                self._greedy[quantity] = [len(greedy) + k for k in range(len(learners))]
+                greedy += [(i, quantity.state) for i in learners]
+            if quantity.name in ("q", "greedy"):
+                states[quantity.state] = True
         if len(cells) > MAX_CELLS or len(self._paths) * self._mdp.states > MAX_PATH_STATES:
             raise RunnerError(
                 f"expression: needs {len(cells):,} Q-values and {len(self._paths)} greedy paths through "
@@ -131,25 +131,25 @@ class JobColumns:
             columns = self._of_steps(block[places])
             if changes is not None:
                 columns |= self._of_tables(changes, places)
-        for each, mask in visits.items():
+        for quantity, mask in visits.items():
             if len(places):
-                columns[each] = (self._visits[each] + np.cumsum(mask)[places]).astype(np.float64)
-            self._visits[each] += int(np.count_nonzero(mask))
+                columns[quantity] = (self._visits[quantity] + np.cumsum(mask)[places]).astype(np.float64)
+            self._visits[quantity] += int(np.count_nonzero(mask))
         return places, columns
 
     def _of_steps(self, steps: Records) -> dict[Quantity, Array]:
         columns: dict[Quantity, Array] = {}
-        for each in self._quantities:
-            if each.name in ("step", "episode"):
-                columns[each] = steps[each.name].astype(np.float64)
-            elif each.name == "reward":
-                columns[each] = steps["rewards"][:, each.learner].astype(np.float64)
-            elif each.name == "epsilon":
-                columns[each] = np.empty(len(steps))
+        for quantity in self._quantities:
+            if quantity.name in ("step", "episode"):
+                columns[quantity] = steps[quantity.name].astype(np.float64)
+            elif quantity.name == "reward":
+                columns[quantity] = steps["rewards"][:, quantity.learner].astype(np.float64)
+            elif quantity.name == "epsilon":
+                columns[quantity] = np.empty(len(steps))
                 for start, rules in self._segments:
                     own = steps[steps["step"] >= start]
                     numbers = (np.ascontiguousarray(own[name], np.int64) for name in ("episode", "step"))
-                    columns[each][len(steps) - len(own) :] = explorations(rules, *numbers)
+                    columns[quantity][len(steps) - len(own) :] = explorations(rules, *numbers)
         return columns
 
     def _of_tables(self, changes: WatchedValues, places: Ints) -> dict[Quantity, Array]:
@@ -160,19 +160,19 @@ class JobColumns:
 
     def _table_values(self, changes: WatchedValues) -> dict[Quantity, Array]:
         columns: dict[Quantity, Array] = {}
-        for each, cells in self._cells.items():
-            columns[each] = changes.q[:, cells] if each.action < 0 else changes.q[:, cells.start]
-        for each, own in self._greedy.items():
+        for quantity, cells in self._cells.items():
+            columns[quantity] = changes.q[:, cells] if quantity.action < 0 else changes.q[:, cells.start]
+        for quantity, own in self._greedy.items():
             strides = [math.prod(self._widths[i + 1 :]) for i in range(len(own))] if len(own) > 1 else [1]
-            columns[each] = (changes.greedy[:, own] * np.array(strides)).sum(axis=1).astype(np.float64)
-        for p, each in enumerate(self._paths):
-            columns[each] = changes.succeeds[:, p]
+            columns[quantity] = (changes.greedy[:, own] * np.array(strides)).sum(axis=1).astype(np.float64)
+        for p, quantity in enumerate(self._paths):
+            columns[quantity] = changes.succeeds[:, p]
         return columns
 
     def _first(self) -> Columns:
         columns: dict[Quantity, Array] = {quantity: np.full(1, np.nan) for quantity in self._quantities}
-        for each, visits in self._visits.items():
-            columns[each] = np.full(1, float(visits))
+        for quantity, visits in self._visits.items():
+            columns[quantity] = np.full(1, float(visits))
         if self._replay is not None:
             columns |= self._table_values(self._replay.begin_watch(self._watch))
         return columns
@@ -184,8 +184,8 @@ class JobColumns:
                 first = int(block["step"][0])
                 check_lost(recording, expected, first)
                 expected = first + len(block)
-                for each in self._visits:
-                    self._visits[each] += int(np.count_nonzero(self._visited(each, block)))
+                for quantity in self._visits:
+                    self._visits[quantity] += int(np.count_nonzero(self._visited(quantity, block)))
         check_lost(recording, expected, stop)
 
     def _visited(self, quantity: Quantity, steps: Records) -> Flags:

@@ -300,13 +300,13 @@ def _step_number(recording: Recording, at: StepLike) -> int:
 
 def _intervals_grid(intervals: Sequence[Interval], last: int) -> Grid:
     rows = []
-    for each in intervals:
-        end = each.end
-        steps = (last + 1 if end is None else end.step) - each.start.step
+    for interval in intervals:
+        end = interval.end
+        steps = (last + 1 if end is None else end.step) - interval.start.step
         lost = (UNKNOWN, UNKNOWN) if end is None else (f"{end.step:,}", str(end.at))
-        rows.append((f"{each.start.step:,}", str(each.start.at), *lost, f"{steps:,}"))
+        rows.append((f"{interval.start.step:,}", str(interval.start.at), *lost, f"{steps:,}"))
     headings = ("from step", "episode:t", "lost at step", "episode:t", "steps")
-    return Grid(headings, rows, "Intervals", [each.start.at.replay for each in intervals])
+    return Grid(headings, rows, "Intervals", [interval.start.at.replay for interval in intervals])
 
 
 def _text(value: Scalar) -> str:
