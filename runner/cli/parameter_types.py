@@ -15,7 +15,7 @@ from runner.errors import RunnerError
 from runner.runs.catalogue import columns
 from runner.runs.resolve import completions
 from runner.runs.run import recordings_folder
-from runner.util.values import JsonView, ranges_in, whole_number
+from runner.util.values import Json, ranges_in, whole_number
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -167,20 +167,21 @@ class ExpressionText(Completed):
 
 
 def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
-    from runner.config.schema import schema_at
+    from runner.config import json_schema
 
-    return {f"{key}=": text for key, text in _keys(schema_at(())).items()}
+    return {f"{key}=": text for key, text in _keys(json_schema()).items()}
 
 
-def _keys(schema: JsonView, prefix: str = "") -> dict[str, str]:
+def _keys(schema: Json, part: Json | None = None, prefix: str = "") -> dict[str, str]:
     """Return the paths of a schema's values, sections included, and what each means."""
     keys = {}
-    for name, value in schema.get("properties", {}).items():
+    for name, value in (schema if part is None else part).get("properties", {}).items():
         path = f"{prefix}{name}"
         keys[path] = str(value.get("description", ""))
         for kind in (value, *value.get("anyOf", ())):
-            if "ref" in kind:
-                keys |= _keys(kind, f"{path}.")
+            if reference := kind.get("$ref"):
+                section = schema["$defs"][reference.rpartition("/")[2]]
+                keys |= _keys(schema, section, f"{path}.")
     return keys
 
 

@@ -48,11 +48,10 @@ def without_references(schema: JsonView) -> Schema:
             return [followed(item) for item in node]
         if not isinstance(node, dict):
             return node
-        others = {key: followed(value) for key, value in node.items() if key not in ("$defs", "$ref")}
-        if "$ref" not in node:
-            return others
-        name = node["$ref"].rpartition("/")[2]
-        return {"ref": name, **followed(schema["$defs"][name]), **others}
+        if "$ref" in node:
+            name = node["$ref"].rpartition("/")[2]
+            return {"ref": name, **followed(schema["$defs"][name])}
+        return {key: followed(value) for key, value in node.items() if key != "$defs"}
 
     result: Schema = followed(schema)
     return result
