@@ -193,10 +193,21 @@ def _of_the_system(error: Exception) -> RunnerError | None:
     return found
 
 
-class LazyGroup(CommandGroup):
-    """The commands of `COMMANDS`, each imported when it is invoked."""
+class ViewGroup(CommandGroup):
+    """A group of which some commands are views."""
 
     plugins = VIEWS
+
+    def plugin(self, name: str) -> click.Command:
+        """Return the command of a view."""
+        from runner.cli.views import command_of
+        from runner.views import view_named
+
+        return command_of(view_named(f"{self.prefix}{name}"))
+
+
+class LazyGroup(ViewGroup):
+    """The commands of `COMMANDS`, each imported when it is invoked."""
 
     def shipped(self) -> list[str]:
         """Return the names, section by section."""

@@ -161,11 +161,8 @@ class CommandGroup(click.Group):
         }
 
     def plugin(self, name: str) -> click.Command:
-        """Return the command of a view."""
-        from runner.cli.views import command_of
-        from runner.views import view_named
-
-        return command_of(view_named(f"{self.prefix}{name}"))
+        """Import a command that is not defined here: of a view, or of another package."""
+        raise NotImplementedError
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """Return the names, those that other packages add last."""

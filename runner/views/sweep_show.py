@@ -43,5 +43,5 @@ VIEW: Final = View(
     subject="sweep",
     file_ending=".yaml",
     file_flags=("--write-best",),
-    file_help="Write the best configuration, with fresh seeds.",
+    file_help="Write the best configuration, with fresh seeds; `dualtaxi run` confirms it.",
 )

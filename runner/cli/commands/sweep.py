@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from runner.cli.command import CommandGroup, argument, option
+from runner.cli import ViewGroup
+from runner.cli.command import argument, option
 from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
@@ -26,7 +27,6 @@ from runner.cli.progress import seldom
 from runner.errors import ExitCode
 from runner.runs.run import recordings_folder
 from runner.util.humanize import UNKNOWN, amount, duration, size
-from runner.util.plugins import VIEWS
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:
@@ -37,10 +37,9 @@ if TYPE_CHECKING:
     from runner.sweep.trials import Trials
 
 
-class SweepGroup(CommandGroup):
+class SweepGroup(ViewGroup):
     """The commands of sweeps: `run`, and views."""
 
-    plugins = VIEWS
     prefix = "sweep "
     views: ClassVar = {
         "show": "Rank the trials of the sweep NAME with intervals over seeds, and show which parameters "
