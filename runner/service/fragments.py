@@ -6,7 +6,7 @@ import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -120,7 +120,7 @@ def _branch_part(recording: Recording, at: StepLike, action: str, start: int, st
 def _part(recording: Recording, episode: Playback, has_pictures: bool, note: str) -> Json:
     scene = recording.environment["scene"] if episode.grid else None
     return {
-        "episode": asdict(episode),
+        "episode": episode.as_json(),
         "scene": scene,
         "has_pictures": has_pictures,
         "picture_note": note,

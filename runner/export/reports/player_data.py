@@ -7,7 +7,7 @@ with the index of each frame's text.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import chain, islice
 from typing import Final
 
@@ -15,9 +15,10 @@ import numpy as np
 
 from runner.analysis.contents import ENDINGS
 from runner.drawing import svg
+from runner.environments.naming import exploration_in_words, spoken
 from runner.recording import schema
 from runner.recording.reader import Recording
-from runner.util.arrays import Array, Ints
+from runner.util.arrays import Array, Floats, Ints
 from runner.util.humanize import counted
 from runner.util.values import Json
 
@@ -118,12 +119,48 @@ class Playback:
     trail: int = svg.TRAIL
     """The number of places that a trail joins."""
 
+    def as_json(self) -> dict[str, object]:
+        """Return its fields, and as `facts` what a page lists for each frame."""
+        return asdict(self) | {"facts": [asdict(fact) for fact in self._facts()]}
+
+    def _facts(self) -> Iterator[Words]:
+        """Yield the facts of frames, of each agent or of all together; empty where a frame has none."""
+        rewards = np.array([self.before or [0] * len(self.agents), *self.reward], np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            returns = rewards.cumsum(axis=0).round(4)
+        explored = [
+            exploration_in_words(mask, self.agents) for mask in self.explored or [0] * len(self.reward)
+        ]
+        ways = [f" ({text}: chosen at random)" if text else "" for text in explored]
+        yield from self.texts
+        for action in self.actions:
+            own = [i for i, agent in enumerate(self.agents) if spoken(action.agent) in ("", agent)]
+            names = [self.agents[i] for i in own]
+            taken = [action.values[i] + way for i, way in zip(action.at, ways, strict=True)]
+            yield words(action.agent, "last action", ["none yet: the episode begins", *taken])
+            yield words(action.agent, "reward", ["", *(_signed(names, row) for row in rewards[1:, own])])
+            if self.events:
+                events = [
+                    ", ".join(name for i, name in enumerate(self.events) if mask >> i & 1) or "none"
+                    for mask in self.event
+                ]
+                yield words(action.agent, "events", ["", *events])
+            yield words(
+                action.agent, "return so far", ["", *(_signed(names, row) for row in returns[1:, own])]
+            )
+
 
 def words(agent: str, name: str, texts: Iterable[str]) -> Words:
     """Return texts with each different one stored once."""
     numbers: dict[str, int] = {}
     at = [numbers.setdefault(text, len(numbers)) for text in texts]
     return Words(agent, name, list(numbers), at)
+
+
+def _signed(names: Sequence[str], values: Floats) -> str:
+    """Return the rewards of agents as text, without the name where there is one only."""
+    texts = [f"{value:+.10g}" if value else "0" for value in values.tolist()]
+    return ", ".join(map("{} {}".format, names, texts)) if len(names) > 1 else "".join(texts)
 
 
 def outcome_in_words(length: int, ended: str, total: float | None) -> str:

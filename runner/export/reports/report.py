@@ -248,7 +248,7 @@ def _player(recording: Recording, episodes: Mapping[EpisodeRef, list[str]], prog
             own = thumbnails(recording.path, at.phase, at.number_in(recording), len(episode.reward) + 1)
             own.picture_note = own.picture_note or picture_note(recording, at.phase)[1]
         has_frames = has_frames or bool(own.pictures)
-        data.append(asdict(episode) | asdict(own))
+        data.append(episode.as_json() | asdict(own))
     titles = [episode.title for _, episode in shown]
     return Player(titles, picture, key, embedded(data), has_frames, is_broad)
 

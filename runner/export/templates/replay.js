@@ -175,60 +175,26 @@ class Replay {
   }
 
   describe(i) {
-    const add = (to, name, ...content) =>
-      to.append(make("dt", {}, name[0].toUpperCase() + name.slice(1)), make("dd", {}, content));
-    const { episode } = this,
-      together = this.owners.length < 2,
-      list = make("dl"),
-      total = this.total(i);
-    for (const { agent, facts, rows } of this.columns) {
-      const to = together ? list : facts,
-        own = (part) => part.agent === agent,
-        number = episode.agents.indexOf(spaced(agent));
-      facts.replaceChildren();
-      for (const text of episode.texts.filter(own)) add(to, text.name, text.values[text.at[i]]);
-      for (const action of episode.actions.filter(own)) {
-        const taken = () => action.values[action.at[i - 1]] + this.explorers(i);
-        add(to, "last action", i > 0 ? taken() : "none yet: the episode begins");
-      }
-      if (!together && number >= 0) {
-        if (i > 0) add(to, "reward", signed(episode.reward[i - 1][number]));
-        add(to, "return so far", signed(total[number]));
-      }
-      for (const { values, cursor, value } of rows) {
+    const { facts, end } = this.episode,
+      list = make("dl");
+    for (const column of this.columns) {
+      const own = facts.filter((fact) => fact.agent === column.agent && fact.values[fact.at[i]]);
+      const to = this.owners.length < 2 ? list : column.facts;
+      to.replaceChildren(...own.flatMap(({ name, values, at }) => this.fact(name, values[at[i]])));
+      for (const { values, cursor, value } of column.rows) {
         cursor.setAttribute("x1", i);
         cursor.setAttribute("x2", i);
         value.textContent = values[i] ?? "unknown";
       }
     }
-    if (i > 0 && together) {
-      add(list, "reward", this.several(episode.reward[i - 1]));
-      const events = episode.events.filter((_, bit) => (episode.event[i - 1] >>> bit) & 1);
-      const names = events.map((name) => make("span", { class: "tag" }, name));
-      if (episode.events.length) add(list, "events", ...(names.length ? names : ["none"]));
-      add(list, "return so far", this.several(total));
-    }
-    if (this.bar.k === this.bar.length) add(list, "end", episode.end);
+    if (this.bar.k === this.bar.length) list.append(...this.fact("end", end));
     this.find(".caption").replaceChildren(list);
   }
 
-  // Bit i of a step's mask: agent i chose its part of the action at random.
-  explorers(i) {
-    const { agents, explored } = this.episode,
-      who = agents.filter((_, agent) => (explored[i - 1] >>> agent) & 1);
-    if (!who.length) return "";
-    return ` (${who.length < agents.length ? `${who.join(" and ")} ` : ""}explored: chosen at random)`;
-  }
-
-  several(values) {
-    const { agents } = this.episode;
-    return agents.length > 1 ? values.map((value, i) => `${agents[i]} ${signed(value)}`).join(", ") : signed(values[0]);
-  }
-
-  total(i) {
-    const { agents, reward, before } = this.episode;
-    const sum = (agent) => reward.slice(0, i).reduce((sum, row) => sum + Number(row[agent]), before[agent] ?? 0);
-    return agents.map((_, agent) => Math.round(sum(agent) * 1e4) / 1e4);
+  fact(name, text) {
+    const isTagged = name === "events" && text !== "none",
+      content = isTagged ? text.split(", ").map((event) => make("span", { class: "tag" }, event)) : text;
+    return [make("dt", {}, name[0].toUpperCase() + name.slice(1)), make("dd", {}, content)];
   }
 
   // The value logged last under each name up to this frame; of names that were logged only later, the next one.
@@ -303,7 +269,6 @@ class Replay {
 const rowOf = (tag, [name, ...cells], kind = "") =>
     make("tr", { class: kind }, make("th", { scope: tag === "td" ? "row" : "col" }, name), cells.map((cell) => make(tag, {}, cell))),
   isNumber = (value) => typeof value === "number",
-  signed = (value) => (value > 0 ? "+" : "") + value,
   spaced = (name) => name.replaceAll("_", " ");
 
 // A report contains its episodes, with their pictures.
