@@ -80,7 +80,7 @@ def _page(
     def values() -> dict[str, object]:
         with open_recording(run.recording) as recording:
             return {
-                "form": given,
+                "given": given,
                 "problem": problem,
                 "actions": _action_fields(recording, given.get("at", "")),
                 "is_trained": recording.can_train_again,

@@ -26,7 +26,7 @@ Name = Annotated[str, Query(max_length=200)]
 @router.get("/explain")
 def form(a: Name = "", b: Name = "") -> Response:
     """Show the form."""
-    return Page("explain.html", {"form": {"a": a, "b": b}, "problem": ""})
+    return Page("explain.html", {"given": {"a": a, "b": b}, "problem": ""})
 
 
 @router.post("/explain")
@@ -36,7 +36,7 @@ async def explain(sent: Form, jobs: JobsOf) -> Response:
     try:
         job = await queue_explanation(jobs, filled(ExplainQuestion, given))
     except RunnerError as error:
-        values = {"form": given, "problem": error}
+        values = {"given": given, "problem": error}
         return Page("explain.html", values, HTTPStatus.UNPROCESSABLE_ENTITY)
     return to_job(job.number)
 

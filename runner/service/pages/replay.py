@@ -44,6 +44,7 @@ from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Form, Page
 from runner.service.pictures import PictureStreams
 from runner.service.problems import status_of
+from runner.util.humanize import counted
 from runner.util.values import JsonView
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -217,7 +218,7 @@ def _page(
         )
         with open_recording(run.recording) as recording:
             shown = _values(recording, run, replace(at, t=0), catalogue)
-        return shown | {"stage": stage, "problem": problem, "refused": str(refused or ""), "form": form}
+        return shown | {"stage": stage, "problem": problem, "refused": str(refused or ""), "given": form}
 
     wrong = refused or part
     status = status_of(wrong) if isinstance(wrong, RunnerError) else None
@@ -296,7 +297,7 @@ def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue
     return {
         "at": at,
         "episodes": episodes,
-        "evaluations": list(evaluations),
+        "evaluations": {after: counted(after, "episode") for after in evaluations},
         "before": neighbour(at.episode - 1),
         "after": neighbour(at.episode + 1),
         "source": f"/api/v1{base}/replay/{at.episode_path}",

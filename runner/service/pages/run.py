@@ -258,7 +258,7 @@ def _overview(
         return {
             "status": _status(run, request.app.state.jobs, settings),
             "problem": problem,
-            "form": form,
+            "given": {"name": run.name, "tags": " ".join(run.tags), "note": run.note, **form},
             "max_note": MAX_NOTE,
             "removal": plan(run, settings.recordings[0]) if viewer_of(request).can_write else None,
             "film_endings": {ending: ending[1:].upper() for ending in FORMATS},
