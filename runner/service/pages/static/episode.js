@@ -1,25 +1,22 @@
 // The replay of an episode: the address names the step, and so do the links to other pages.
 import { isTaken, json } from "./page.js";
-import { listen, open } from "./player.js";
+import { keepAddress, listen, open } from "./player.js";
 
 const root = document.querySelector("[data-source]"),
   fields = root.querySelectorAll("[data-step]"); // links and fields that end with a step
 const asked = new URLSearchParams(location.search),
   search = asked.get("found"), // whose hits are played one after the other
   kept = search ? `found=${encodeURIComponent(search)}` : "";
-let writing = null,
-  onward = null;
+let onward = null;
 
-// Browsers limit how often the address may change, so a playing replay does not write every step.
 function moved({ k, length, timer }) {
   const steps = { last: Math.max(0, k - 1), now: k, next: Math.min(k, length - 1) };
   for (const field of fields) {
     const name = field.matches("a") ? "href" : "value";
     field.setAttribute(name, field.getAttribute(name).replace(/[0-9]+$/, steps[field.dataset.step]));
   }
-  clearTimeout(writing);
   if (onward && timer && k === length) return location.assign(`${onward}?${kept}&play=1`);
-  writing = setTimeout(() => history.replaceState(null, "", `?t=${k}${kept && `&${kept}`}`), 150);
+  keepAddress(`?t=${k}${kept && `&${kept}`}`);
 }
 
 const { bar } = await open(root, Number(root.dataset.at), moved);

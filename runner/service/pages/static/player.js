@@ -17,6 +17,13 @@ export async function open(root, at = 0, moved) {
   return replay;
 }
 
+// Browsers limit how often the address may change, so a playing replay does not write every step.
+let writing = null;
+export function keepAddress(address) {
+  clearTimeout(writing);
+  writing = setTimeout(() => history.replaceState(null, "", address), 150);
+}
+
 // Keys move and play, unless the element with the focus uses them.
 export function listen(bar) {
   document.addEventListener("keydown", (event) => {
