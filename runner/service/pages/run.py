@@ -24,6 +24,7 @@ from runner.analysis.summary import describe_run, results_in_words
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.export.encoder import FORMATS
+from runner.export.reports.rendering import partials
 from runner.recording import schema
 from runner.recording.composition import composition_of
 from runner.recording.labels import MAX_NOTE
@@ -242,7 +243,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
         Section("", links=links),
         Section("Log", grids=[log]) if lines else Section("Log", [silence]),
     ]
-    return RunPage(run, "config", "run_config.html", {"setup": sections})
+    return RunPage(run, "config", "run_body.html", {"body": partials().answer(sections)})
 
 
 def _overview(
