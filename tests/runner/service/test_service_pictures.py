@@ -62,17 +62,22 @@ def test_pictures_after_the_end_are_none(loops_client):
     assert pictures(loops_client, "pole/replay/train/0", start=10**6) == ([], "")
 
 
-def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_client, monkeypatch):
+@pytest.fixture
+def too_long(monkeypatch):
+    """Let environments take too long, also those whose process is quicker than this one."""
     monkeypatch.setattr("runner.replay.makers.SECONDS", 1e-3)
+    monkeypatch.setattr("multiprocessing.connection.Connection.poll", lambda *_: False)
+
+
+def test_an_environment_that_takes_too_long_is_given_up_with_a_reason(loops_client, too_long):
     found, problem = pictures(loops_client, "pole/replay/train/2")
     assert found == []
     assert "took longer than 0.001 s" in problem
 
 
 def test_where_an_environment_cannot_draw_the_recorded_frames_are_shown_with_the_reason(
-    loops_client, monkeypatch
+    loops_client, too_long
 ):
-    monkeypatch.setattr("runner.replay.makers.SECONDS", 1e-3)
     notes = []
     found, problem = pictures(loops_client, "framed/replay/train/2", notes, steps=1000)
     assert found[0].startswith(b"\x89PNG")
