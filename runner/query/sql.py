@@ -93,7 +93,9 @@ class Database:
             raise
         except TimeoutError:
             raise RunnerError(f"{self._name}: stopped after {self._seconds:g} s; {self._runs}.") from None
-        except self._errors as error:
+        except (OSError, *self._errors) as error:  # Arrow raises the former for what fails in the middle
+            if isinstance(error, OSError) and error.errno is not None:
+                raise
             message = str(error).removeprefix("Error: ").strip()
             if "Out of Memory" in message:
                 limit = f"needs more than {self._memory:,} MB of memory, and was stopped"
@@ -124,6 +126,7 @@ class QueryResult:
         self._database = Database("sql", runs, memory, seconds)
         try:
             self._reader = self._database.call(self._begin, query)
+            self._first = self._database.call(next, self._reader, None)  # most queries fail here, if they do
         except BaseException:
             self.close()
             raise
@@ -157,8 +160,10 @@ class QueryResult:
             RunnerError: the query fails, or exceeds its time or memory.
         """
         with contextlib.closing(self):
-            while (batch := self._database.call(next, self._reader, None)) is not None:
+            batch = self._first
+            while batch is not None:
                 yield self._database.call(batch.cast, self.columns)
+                batch = self._database.call(next, self._reader, None)
 
     def rows(self) -> Generator[list[object], None, None]:
         """Yield the rows one by one, their values as JSON can hold them; errors as for `batches`."""

@@ -236,6 +236,14 @@ def test_only_one_select_over_the_views_is_answered(folder, tmp_path, query, mes
     assert not path.exists()
 
 
+@pytest.mark.parametrize("form", ["--csv", "--json", "--markdown"])
+def test_a_row_that_cannot_be_computed_is_an_error_without_output(folder, form):
+    query = "SELECT CASE WHEN step = 3 THEN error('a bad row') ELSE step END AS value FROM steps"
+    result = CliRunner().invoke(cli, ["sql", query, form, "--recordings", str(folder)])
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "sql: Invalid Input Error: a bad row" in result.stderr
+
+
 def test_limits_say_how_far_a_query_came(folder):
     with pytest.raises(RunnerError, match=r"stopped after 0\.5 s; .* runs were read"):
         rows(folder, "SELECT count(*) FROM range(100000000000) WHERE hash(range) = 3", timeout=0.5)
