@@ -643,11 +643,7 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
     monkeypatch.setattr(episode_index, "_PACKED", 1 << 70)
     loose = hits()
     assert all(found.count for found in loose)
-    for size in (
-        1,
-        7,
-        2,
-    ):  # where packs are cut depends on inodes; among twenty files, two stay together at 2
+    for size in (1, 7, 2):  # where packs are cut depends on inodes; two of twenty files stay together at 2
         monkeypatch.setattr(episode_index, "_PACKED", size)
         for _ in range(2):
             assert hits() == loose
