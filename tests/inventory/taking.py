@@ -40,7 +40,8 @@ for (const node of document.querySelectorAll("details[data-was-closed]")) node.o
 return document.body.scrollHeight;
 """
 """Closes what was opened to be read; returns the height of the page."""
-WINDOW: Final = (1440, 8000)
+WINDOW: Final = {"width": 1440, "height": 8000, "deviceScaleFactor": 0.1, "mobile": False}
+"""Shows whole pages, drawn small: nobody looks at them, and drawing takes long."""
 WIDTHS: Final = (1440, 390)
 THEMES: Final = ("light", "dark")
 
@@ -123,7 +124,7 @@ def _prepare(shop: Shop, browser: WebDriver) -> None:
     for name, words in REPORTS.items():
         lines = read_command(shlex.split(shop.filled(f"{words} {shop.folder / name}")), lambda: shop.mask)
         assert (shop.folder / name).exists(), lines
-    browser.set_window_size(*WINDOW)
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", WINDOW)
     browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": COUNT_REQUESTS})
 
 
