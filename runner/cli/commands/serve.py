@@ -65,7 +65,7 @@ def serve_command(
 
     Examples:
       dualtaxi serve
-      dualtaxi serve --port 8080 --recordings /data/runs
+      dualtaxi serve --port 8080 --recordings others
       dualtaxi serve --host 0.0.0.0 --allow-host runs.example.org --proxy 10.0.0.2
     """
     require("fastapi", "uvicorn", "httptools", "httpx2", "jinja2", extra="service", purpose="the service")

@@ -145,9 +145,7 @@ class Playback:
                     for mask in self.event
                 ]
                 yield words(action.agent, "events", ["", *events])
-            yield words(
-                action.agent, "return so far", ["", *(_signed(names, row) for row in returns[1:, own])]
-            )
+            yield words(action.agent, "return so far", [_signed(names, row) for row in returns[:, own]])
 
 
 def words(agent: str, name: str, texts: Iterable[str]) -> Words:

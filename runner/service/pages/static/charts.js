@@ -73,8 +73,7 @@ function complain(text) {
 // Return the query for curves over the axis, with values that are neither empty nor usual.
 function queryOf(values) {
   const axis = new URLSearchParams(location.search).get("axis") ?? USUAL.axis;
-  const query = new URLSearchParams(box.dataset.charts); // the runs
-  query.set("axis", axis);
+  const query = new URLSearchParams([["axis", axis], ...new URLSearchParams(box.dataset.charts)]); // the runs
   for (const [name, value] of Object.entries(values)) if (value && value !== USUAL[name]) query.set(name, value);
   return query;
 }
