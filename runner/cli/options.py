@@ -55,14 +55,19 @@ recordings_option: Final = option(
 )
 
 
-folders_option: Final = option(
-    "--recordings",
-    type=click.Path(exists=True, file_okay=False, path_type=Path),
-    metavar="DIR",
-    multiple=True,
-    callback=lambda _context, _option, folders: folders or (recordings_folder(),),
-    help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
-)
+def _folders_option(must_exist: bool) -> Declared:
+    return option(
+        "--recordings",
+        type=click.Path(exists=must_exist, file_okay=False, path_type=Path),
+        metavar="DIR",
+        multiple=True,
+        callback=lambda _context, _option, folders: folders or (recordings_folder(),),
+        help="A folder of runs; may be repeated.  [default: $DUALTAXI_RECORDINGS, or ./recordings]",
+    )
+
+
+folders_option: Final = _folders_option(must_exist=True)
+served_folders_option: Final = _folders_option(must_exist=False)
 set_option: Final = option(
     "--set",
     multiple=True,

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import folders_option, workers_option
+from runner.cli.options import served_folders_option, workers_option
 from runner.cli.output import echo, say
 from runner.cli.parameter_types import FILE, Number
 from runner.service.settings import ServiceSettings
@@ -18,7 +18,7 @@ from runner.util.files import storage_errors
 
 @click.command("serve", cls=Command, forms=())
 def serve_command(
-    recordings: tuple[Path, ...] = folders_option,
+    recordings: tuple[Path, ...] = served_folders_option,
     host: str = option(
         "--host", default="127.0.0.1", show_default=True, metavar="HOST", help="The address to listen on."
     ),
@@ -65,7 +65,7 @@ def serve_command(
 
     Examples:
       dualtaxi serve
-      dualtaxi serve --port 8080 --recordings others
+      dualtaxi serve --port 8080 --recordings /data/runs
       dualtaxi serve --host 0.0.0.0 --allow-host runs.example.org --proxy 10.0.0.2
     """
     require("fastapi", "uvicorn", "httptools", "httpx2", "jinja2", extra="service", purpose="the service")
@@ -88,6 +88,9 @@ def serve_command(
         from runner.service.jobs.cluster import require_job_api
 
         require_job_api()
+    for folder in recordings:
+        if not folder.is_dir():
+            say(f"{folder}: there is no such folder yet, so it has no runs.")
     with storage_errors(log or settings.recordings[0]):
         settings.recordings[0].mkdir(parents=True, exist_ok=True)
         stream = log.open("a", encoding="utf-8") if log else sys.stderr
