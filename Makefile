@@ -20,7 +20,7 @@ run: $(VENV)/.installed  ## train the tutorial's cooperative job, every step rec
 serve: $(VENV)/.installed-service  ## open the runs in the browser
 	$(BIN)/dualtaxi serve
 
-# By name: of a package that has a plugin which pytest finds by itself, such as `runner`, it compiles each module again.
+# By name: where pytest finds a plugin in a package by itself, as in `runner`, it compiles all modules of that package again.
 PLUGINS := $(addprefix -p ,xdist.plugin pytest_timeout _hypothesis_pytestplugin runner.golden.plugin)
 test: export PYTHONDONTWRITEBYTECODE :=  # the tests start hundreds of processes: compile modules for them once
 test: $(VENV)/.installed-dev  ## run all tests

@@ -39,7 +39,9 @@ class Curve:
     low: Floats
     high: Floats
     runs: Floats
-    """Each run, [runs, positions], NaN where it has no value."""
+    """Each run that has the metric, [runs, positions], NaN where it has no value."""
+    ids: tuple[str, ...] = ()
+    """The ids of these runs."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +131,9 @@ def _curve(number: int, group: Group, metric: str, line: str) -> Curve | None:
     values = np.array(
         [np.interp(places, list(points), list(points.values()), np.nan, np.nan) for points in runs if points]
     )
+    ids = tuple(run.run_id for run, points in zip(group.runs, runs, strict=True) if points)
     inside = ~np.isnan(values).all(axis=0)  # between the end of one run and the beginning of another
-    return Curve(number, line, places[inside], *iqm_band(values[:, inside]), values[:, inside])
+    return Curve(number, line, places[inside], *iqm_band(values[:, inside]), values[:, inside], ids)
 
 
 def _rank(metric: str) -> tuple[int, int]:

@@ -139,9 +139,9 @@ class CommandGroup(click.Group):
     plugins = ""
     """The entry points by which installed packages add commands; empty for none."""
     prefix = ""
-    """What the names of those begin with, and of views: `sweep ` for the view `sweep show`."""
+    """Prefix of the names of views in this group: `sweep ` for the view `sweep show`."""
     views: ClassVar[Mapping[str, str]] = {}
-    """Commands that follow from views, by their names without the prefix; and their short help."""
+    """Short help of the group's views, by the name of the command."""
 
     def __init__(self, name: str | None, **attributes: Any) -> None:
         super().__init__(name, **attributes)
@@ -157,7 +157,9 @@ class CommandGroup(click.Group):
         return {
             name: package
             for view, package in names.items()
-            if view.startswith(self.prefix) and (name := view.removeprefix(self.prefix)) not in self.shipped()
+            if view.startswith(self.prefix)
+            and " " not in (name := view.removeprefix(self.prefix))
+            and name not in self.shipped()
         }
 
     def plugin(self, name: str) -> click.Command:

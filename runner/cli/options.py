@@ -245,12 +245,12 @@ def writing_options(default: str, metavar: str = "FILE") -> Declared:
     return record(writing)
 
 
-def limit_option(default: int | str) -> Declared:
-    """Return the option --limit, with a default number of rows, or a text that describes the default."""
+def limit_option(default: int) -> Declared:
+    """Return the option --limit, with a default number of rows."""
     return option(
         "--limit",
         type=INDEX,
-        default=default if isinstance(default, int) else None,
+        default=default,
         help=f"Maximum number of rows, 0 for all.  [default: {default}]",
     )
 

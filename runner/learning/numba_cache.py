@@ -6,10 +6,12 @@ be taken from the cache as it was before those were edited.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from uuid import uuid4
 
 from numba.core import caching, event
 from numba.core.compiler_lock import global_compiler_lock
@@ -89,7 +91,24 @@ def _load_readable_index(file: caching.IndexDataCacheFile) -> dict[object, str]:
         return {}
 
 
+def _save(file: caching.IndexDataCacheFile, key: object, data: object) -> None:
+    """Add an entry: its data under a name of its own, and only then the index that names it.
+
+    Numba writes the index first, and numbers the data: a process that was killed in between, or another one
+    at the same time, would leave an index that names the data of other code.
+    """
+    entries = file._load_index()
+    if not entries:  # of other code, or none: what is there was made of other code, too
+        prefix = file._data_name_pattern.partition("{")[0]
+        for stale in Path(file._cache_path).glob(f"{glob.escape(prefix)}*.nbc"):
+            stale.unlink(missing_ok=True)
+    entries[key] = file._data_name(uuid4().int)
+    file._save_data(entries[key], data)
+    file._save_index(entries)
+
+
 caching.IndexDataCacheFile._load_index = _load_readable_index
+caching.IndexDataCacheFile.save = _save
 
 
 class _Announcement(event.Listener):  # type: ignore[misc]  # Numba has no types

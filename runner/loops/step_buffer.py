@@ -686,7 +686,7 @@ class StepBuffer:
     def _put_resets(self, episode: Ints, first: int, before: int) -> None:
         """Record the resets in their order, and the ends of the episodes that they cut off.
 
-        `episode` is of each step, [rows, N]; `first` and `before` are as for `_put_steps`.
+        `episode` is the episode of each step, [rows, N]; `first` and `before` are as for `_put_steps`.
         """
         resets = self._resets[: self._waiting]
         last = resets[resets["row"] == self.filled]

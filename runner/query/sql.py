@@ -126,15 +126,14 @@ class QueryResult:
         self._database = Database("sql", runs, memory, seconds)
         try:
             self._reader = self._database.call(self._begin, query)
-            self._first = self._database.call(next, self._reader, None)  # most queries fail here, if they do
+            self.columns = pa.schema(
+                (column.name, pa.int64() if column.type == _WHOLE else column.type)
+                for column in self._reader.schema
+            )
+            self._first = self._next()  # most errors of a query appear with its first rows
         except BaseException:
             self.close()
             raise
-        columns = [
-            (column.name, pa.int64() if column.type == _WHOLE else column.type)
-            for column in self._reader.schema
-        ]
-        self.columns = pa.schema(columns)
 
     def _begin(self, query: str) -> pa.RecordBatchReader:
         connection = self._database.connection
@@ -160,10 +159,14 @@ class QueryResult:
             RunnerError: the query fails, or exceeds its time or memory.
         """
         with contextlib.closing(self):
-            batch = self._first
+            batch, self._first = self._first, None
             while batch is not None:
-                yield self._database.call(batch.cast, self.columns)
-                batch = self._database.call(next, self._reader, None)
+                yield batch
+                batch = self._next()
+
+    def _next(self) -> pa.RecordBatch | None:
+        batch = self._database.call(next, self._reader, None)
+        return None if batch is None else self._database.call(batch.cast, self.columns)
 
     def rows(self) -> Generator[list[object], None, None]:
         """Yield the rows one by one, their values as JSON can hold them; errors as for `batches`."""

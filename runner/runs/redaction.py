@@ -48,8 +48,13 @@ _BUT_TOKEN: Final = (
 )
 """In sources a mere `key` is seldom a secret: `sort(key="length")`."""
 _IN_SOURCES: Final = rf"(?:token(?!i[sz])|{_BUT_TOKEN})"
+_OF_MODELS: Final = (
+    "embed(?:ding)?s?|dims?|types?|size|len(?:gth)?|level|counts?|num|per|budget|limit|schedule|ids?|index|"
+    "positions?|masks?|mix(?:er|ing)?|drop(?:out)?|shift|merging|pruning|padding|vocab|weights?|loss|rate"
+)
+"""Words after `token` that speak of a model's tokens."""
 _SECRET_SETTING: Final = re.compile(
-    rf"{_BUT_TOKEN}|(?:api|access|auth)[_-]?token|tokens?(?=[\d_-]*(?:\.|$))", re.IGNORECASE
+    rf"{_BUT_TOKEN}|token(?!i[sz]|s?[_-]?(?:{_OF_MODELS})(?![a-z]))", re.IGNORECASE
 )
 """A path of keys: `hf_token` is a secret, but not `token_embedding`."""
 _PLACEHOLDERS: Final = "{$<%["
@@ -198,9 +203,10 @@ def redacted_line(text: str) -> str:
 def redacted_settings(value: Any, name: str = "") -> Any:
     """Return settings, as JSON has them, with secrets replaced by `[redacted]`.
 
-    As in sources, a mere `key` in a name does not count, nor `token` before other words, unless the value
-    looks random. Placeholders such as `${TOKEN}` and `<pad>` stay. All parts of a mapping with the name of a
-    secret are secrets. Of numbers, only whole ones are, and not under `token`: `max_tokens` is a setting.
+    As in sources, a mere `key` in a name does not count, nor `token` before a word of models, unless the
+    value is long and has a digit. Placeholders such as `${TOKEN}` and `<pad>` stay. All parts of a mapping
+    with the name of a secret are secrets. Of numbers, only whole ones are, and not under `token`:
+    `max_tokens` is a setting.
     """
     if isinstance(value, dict):
         return {key: redacted_settings(part, f"{name}.{key}" if name else key) for key, part in value.items()}

@@ -181,7 +181,9 @@ def curves_of(
     if most:
         drawn = "the lowest and highest of each stretch are drawn; zoom in for all of them."
         notes.insert(0, f"Thinned: of up to {most:,} points a curve {drawn}")
-    elif not any((averaged, *values_left_out(series), not_drawn(panels, options.style))):
+    elif not any((averaged, *values_left_out(series), not_drawn(panels, options.style))) and all(
+        len(group.runs) == 1 for group in groups
+    ):
         notes.insert(0, "Every recorded point is drawn.")
     result = Curves(
         over.name,
@@ -207,8 +209,9 @@ def figure_of(paths: Sequence[Path], options: FigureOptions) -> bytes:
 
 def _columns(axis: str, curves: Sequence[ShownCurve]) -> tuple[list[str], Iterator[list[object]]]:
     """Return the headings and the rows of a table with the axis, and each curve with its band and runs."""
+    has_several = len({curve.metric for curve in curves}) > 1
     columns = [
-        (name, dict(zip(curve.positions, values, strict=True)))
+        (f"{curve.title}: {name}" if has_several else name, dict(zip(curve.positions, values, strict=True)))
         for curve in curves
         for name, values in (
             (f"{curve.label}, high", curve.high),
@@ -266,9 +269,7 @@ def _shown_curve(
         low=curve.low[drawn].tolist() if has_band else None,
         high=curve.high[drawn].tolist() if has_band else None,
         runs=curve.runs[:, drawn].tolist() if has_band and lines else [],
-        run_labels=[
-            ", ".join([": ".join(names[run.run_id]), *line]) for run in group.runs if has_band and lines
-        ],
+        run_labels=[", ".join([": ".join(names[run]), *line]) for run in curve.ids if has_band and lines],
         of=len(inside),
         thinned=len(drawn) < len(inside),
     )

@@ -267,15 +267,20 @@ class Uploads:
     def _drop_old(self) -> None:
         """Drop uploads without a request for `IDLE_SECONDS`; of those that are over, only the newest stay."""
         over = 0
-        for upload in self.all():
+        for upload in sorted(self.all(), key=self._changed, reverse=True):
             over += upload.is_over
-            body = self._body(upload)
-            changed = 0.0
-            with contextlib.suppress(OSError):
-                changed = (body.with_name(STATE_FILE) if upload.is_over else body).stat().st_mtime
-            is_old = time.time() - changed > IDLE_SECONDS or (upload.is_over and over > self._limits.uploads)
+            is_old = time.time() - self._changed(upload) > IDLE_SECONDS or (
+                upload.is_over and over > self._limits.uploads
+            )
             if is_old and upload.state != "verifying":
                 self.delete(upload.owner, upload.id)
+
+    def _changed(self, upload: Upload) -> float:
+        """Return when a request last changed an upload, in seconds of the epoch."""
+        body = self._body(upload)
+        with contextlib.suppress(OSError):
+            return (body.with_name(STATE_FILE) if upload.is_over else body).stat().st_mtime
+        return 0.0
 
     def _proceed(self, upload: Upload) -> Upload:
         """Verify an upload that is complete, or list the run that is still being recorded."""

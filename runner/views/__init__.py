@@ -1,4 +1,4 @@
-"""Views: questions about recorded runs, each asked once; commands, API routes and pages are derived of them.
+"""Views: questions about recorded runs, each asked once. Commands, routes and pages are derived from them.
 
 A view is a module with a `VIEW`. It imports heavy packages in its function, so that help is quick. Installed
 packages add views by entry points, see `runner.util.plugins`.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 from runner.analysis.sections import Answer, Grid, Section
 from runner.query.text import cell_of, csv_value, reasons_in_words, without_pandas
 from runner.util.extras import require
-from runner.util.humanize import counted
+from runner.util.humanize import counted, size
 from runner.util.row_text import csv_lines, json_list
 from runner.views.view import NO_PROGRESS, ONLY_HERE, ShownProgress, View, view_input
 
@@ -37,7 +37,7 @@ class Rows(Answer):
         self.remarks = reasons_in_words(result)
 
     def as_json(self) -> Json:
-        """Return nothing but the file: the rows are lines."""
+        """Return an empty object: the rows are printed by `lines`."""
         return {}
 
     def sections(self) -> Iterator[Section]:
@@ -49,7 +49,8 @@ class Rows(Answer):
 
     def write(self, stream: BinaryIO) -> None:
         """Write the rows as Parquet."""
-        self.contents = counted(self._result.write_parquet(stream), "row")
+        rows = counted(self._result.write_parquet(stream), "row")
+        self.contents = f"{size(stream.tell())}, {rows}"
 
 
 def sql(

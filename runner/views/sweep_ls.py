@@ -1,4 +1,4 @@
-"""`sweep ls`: which sweeps there are."""
+"""`sweep ls`: the sweeps of a folder."""
 
 from __future__ import annotations
 

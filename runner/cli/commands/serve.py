@@ -88,9 +88,7 @@ def serve_command(
         from runner.service.jobs.cluster import require_job_api
 
         require_job_api()
-    for folder in recordings:
-        if not folder.is_dir():
-            say(f"{folder}: there is no such folder yet, so it has no runs.")
+    missing = [str(folder) for folder in recordings if not folder.is_dir()]
     with storage_errors(log or settings.recordings[0]):
         settings.recordings[0].mkdir(parents=True, exist_ok=True)
         stream = log.open("a", encoding="utf-8") if log else sys.stderr
@@ -100,6 +98,8 @@ def serve_command(
     echo(url_of(listening))
     sys.stdout.flush()
     if sys.stderr.isatty():
+        if missing:
+            say(f"There was no folder {', '.join(missing)}: it has no runs yet.")
         say("Ctrl-C stops it.")
     with logs.logged_to(stream, for_people=log is None and sys.stderr.isatty()):
         serve(app, settings, listening)

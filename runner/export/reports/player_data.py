@@ -6,6 +6,7 @@ with the index of each frame's text.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import chain, islice
@@ -124,7 +125,7 @@ class Playback:
         return asdict(self) | {"facts": [asdict(fact) for fact in self._facts()]}
 
     def _facts(self) -> Iterator[Words]:
-        """Yield the facts of frames, of each agent or of all together; empty where a frame has none."""
+        """Yield what is known of frames besides `texts`, of each agent or all together; empty for none."""
         rewards = np.array([self.before or [0] * len(self.agents), *self.reward], np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             returns = rewards.cumsum(axis=0).round(4)
@@ -132,12 +133,13 @@ class Playback:
             exploration_in_words(mask, self.agents) for mask in self.explored or [0] * len(self.reward)
         ]
         ways = [f" ({text}: chosen at random)" if text else "" for text in explored]
-        yield from self.texts
         for action in self.actions:
             own = [i for i, agent in enumerate(self.agents) if spoken(action.agent) in ("", agent)]
             names = [self.agents[i] for i in own]
             taken = [action.values[i] + way for i, way in zip(action.at, ways, strict=True)]
-            yield words(action.agent, "last action", ["none yet: the episode begins", *taken])
+            yield words(
+                action.agent, "last action", ["" if self.first else "none yet: the episode begins", *taken]
+            )
             yield words(action.agent, "reward", ["", *(_signed(names, row) for row in rewards[1:, own])])
             if self.events:
                 events = [
@@ -157,7 +159,10 @@ def words(agent: str, name: str, texts: Iterable[str]) -> Words:
 
 def _signed(names: Sequence[str], values: Floats) -> str:
     """Return the rewards of agents as text, without the name where there is one only."""
-    texts = [f"{value:+.10g}" if value else "0" for value in values.tolist()]
+    texts = [
+        f"{'+' * (value > 0)}{value:.10g}" if math.isfinite(value) else str(short(value))
+        for value in values.tolist()
+    ]
     return ", ".join(map("{} {}".format, names, texts)) if len(names) > 1 else "".join(texts)
 
 

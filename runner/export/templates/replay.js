@@ -175,10 +175,10 @@ class Replay {
   }
 
   describe(i) {
-    const { facts, end } = this.episode,
+    const { texts, facts, end } = this.episode,
       list = make("dl");
     for (const column of this.columns) {
-      const own = facts.filter((fact) => fact.agent === column.agent && fact.values[fact.at[i]]);
+      const own = [...texts, ...facts].filter((fact) => fact.agent === column.agent && fact.values[fact.at[i]]);
       const to = this.owners.length < 2 ? list : column.facts;
       to.replaceChildren(...own.flatMap(({ name, values, at }) => this.fact(name, values[at[i]])));
       for (const { values, cursor, value } of column.rows) {

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from numba.core import caching
 
 from runner.learning import algorithms, kernel, schedules
 from runner.learning.numba_cache import stamp
@@ -87,3 +88,20 @@ def test_another_thread_can_import_scipy_while_numba_begins():
         "print(numba.njit(lambda a: a + 1)(1))\n"
     )
     assert "True" in _printed(program)
+
+
+def test_a_process_that_is_killed_while_it_saves_leaves_no_entry(tmp_path, monkeypatch):
+    def cache(source):
+        return caching.IndexDataCacheFile(str(tmp_path), "choose-1", source)
+
+    cache("old").save("key", "old code")
+    with monkeypatch.context() as killed:
+        killed.setattr(caching.IndexDataCacheFile, "_save_index", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            cache("new").save("key", "new code")
+    assert cache("new").load("key") is None
+    assert cache("old").load("key") is None, "whose data was removed"
+    for key in ("key", "other"):
+        cache("new").save(key, f"{key} of new code")
+    assert [cache("new").load(key) for key in ("key", "other")] == ["key of new code", "other of new code"]
+    assert len(list(tmp_path.glob("*.nbc"))) == 2

@@ -242,6 +242,10 @@ def test_a_row_that_cannot_be_computed_is_an_error_without_output(folder, form):
     result = CliRunner().invoke(cli, ["sql", query, form, "--recordings", str(folder)])
     assert (result.exit_code, result.stdout) == (2, "")
     assert "sql: Invalid Input Error: a bad row" in result.stderr
+    large = CliRunner().invoke(
+        cli, ["sql", "SELECT 1::HUGEINT << 100 AS x", form, "--recordings", str(folder)]
+    )
+    assert (large.exit_code, large.stdout) == (2, ""), large.stderr
 
 
 def test_limits_say_how_far_a_query_came(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -141,6 +142,10 @@ def test_settings_that_only_begin_like_a_secret_stay():
     }
     assert redacted_settings(settings) == settings
     random = "0a1b2c3d4e5f6a7b8c9d"
+    names = ("hf_token_v2", "token_postgres", "bot_token_prod", "telegramTokenProd", "vault_token_ci")
+    for name, value in itertools.product(names, ("hunter2secret", "123456789:AAFx9k2L", "hvs.CAESIJ0a1b")):
+        assert redacted_settings({name: value}) == {name: REDACTED}
+    assert redacted_settings({"auth_tokenizer": "gpt2"}) == {"auth_tokenizer": "gpt2"}
     assert redacted_settings({"token_prod": random, "token_of": {"lab": random}}) == {
         "token_prod": REDACTED,
         "token_of": {"lab": REDACTED},

@@ -20,6 +20,7 @@ from runner.cli import cli
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
 from runner.runs.resolve import find_run
+from runner.service.curves import CurveOptions, curves_of
 from runner.service.settings import ServiceLimits
 from runner.service.views import _type_of
 from runner.views.view import View, view_input
@@ -175,6 +176,27 @@ def test_runs_that_differ_in_the_seed_are_one_curve_with_a_band(recordings, clie
     assert [float(row[-1]) for row in rows] == curve["values"]
     alone = client.get("/api/v1/curves", params={"run": params["run"][:1], "metric": "mean_length"}).json()
     assert (alone["curves"][0]["low"], alone["curves"][0]["runs"]) == (None, [])
+
+
+def test_a_run_of_a_group_that_lacks_a_metric_has_no_line(tmp_path):
+    runs = []
+    for seed, name in enumerate(("loss", "acc", "acc")):
+        with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="same", seed=seed) as env:
+            env.reset(seed=seed)
+            env.step(0)
+            env.log(name, 0.5)
+        runs.append(env.run)
+    options = CurveOptions(metric=("training.logged.acc",))
+    paths = [run.recording for run in runs]
+    found = json.loads(curves_of(paths, options, lines=True))
+    (curve,) = found["curves"]
+    assert curve["run_labels"] == ["B: same", "C: same"]
+    assert "Every recorded point is drawn." not in found["notes"], "at points that the runs share"
+    head, *rows = csv.reader(curves_of(paths, options, lines=True, table=True).decode().splitlines())
+    assert head[3:5] == curve["run_labels"]
+    assert all(len(row) == len(head) for row in rows)
+    both = csv.reader(curves_of(paths, CurveOptions(), lines=True, table=True).decode().splitlines())
+    assert len(set(head := next(both))) == len(head)
 
 
 def test_histograms_count_every_step(client, recording):
