@@ -7,13 +7,11 @@ import os
 import sys
 from pathlib import Path
 
-GC_THRESHOLD = 50_000
-"""New objects after which Python searches for cycles, instead of 700: most objects of imports stay."""
+import runner.util.fewer_searches  # noqa: F401 - before all other imports
 
 
 def main() -> None:
     """Run the command line; Ctrl-C only sets the exit code, even while modules are imported."""
-    gc.set_threshold(GC_THRESHOLD)
     os.environ.setdefault("PYTHONSAFEPATH", "1")  # no child imports from the current folder
     try:
         from runner.cli import main as command_line

@@ -11,11 +11,10 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-from runner.__main__ import GC_THRESHOLD
+import runner.util.fewer_searches  # noqa: F401 - as the command line does it, for the imports of all test modules too
 from runner.service.processes import PRELOADED
 from runner.util.processes import process_context
 
-gc.set_threshold(GC_THRESHOLD)  # as the command line does it, for the imports of all test modules too
 hypothesis.settings.register_profile(
     "untimed", deadline=None, max_examples=40
 )  # a loaded machine is no reason to fail
