@@ -17,6 +17,8 @@ from runner.service import computed
 from runner.service.addresses import link
 from runner.service.dependencies import json_response
 from runner.service.pages.rendering import Page
+from runner.views.find import VIEW as FIND
+from runner.views.sql import VIEW as SQL
 
 MAX_PICTURES: Final = 24
 """The most hits that a page shows pictures of."""
@@ -76,12 +78,18 @@ async def find(request: Request, search: SearchOf) -> Response:
 @pages.get("/find")
 async def find_page(request: Request, search: SearchOf) -> Response:
     """Show the form, and the episodes that match."""
-    shown: dict[str, object] = {"search": search, "problem": "", "found": None, "max_pictures": MAX_PICTURES}
+    asked = search.model_dump()
+    shown: dict[str, object] = {
+        "view": FIND,
+        "given": asked,
+        "problem": "",
+        "found": None,
+        "max_pictures": MAX_PICTURES,
+    }
     try:
         if search.expression.strip():
             from runner.query.find import Found  # needs the extra
 
-            asked = search.model_dump()
             answer = await _answer(request, computed.find, *asked.values())
             found = TypeAdapter(Found).validate_json(answer)
             kept = link("", asked).removeprefix("?")
@@ -94,7 +102,13 @@ async def find_page(request: Request, search: SearchOf) -> Response:
 @pages.get("/sql")
 async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Response:
     """Show the form, and the answer to a query."""
-    shown: dict[str, object] = {"query": query, "runs": runs, "problem": "", "left_out": [], "grid": None}
+    shown: dict[str, object] = {
+        "view": SQL,
+        "given": {"query": query, "runs": runs},
+        "problem": "",
+        "left_out": [],
+        "grid": None,
+    }
     try:
         if query.strip():
             answer = json.loads(await _answer(request, computed.query, query, runs))

@@ -107,7 +107,7 @@ def _add_routes(view: View) -> None:
             asked = {name: text for name, text in form.items() if text}
             shown_page = {"page": number} if number > 1 else {}
             live = link(f"/runs/{run.run_id}/{view.name}/part", asked | shown_page | {"status": run.status})
-        shown = {"view": view, "form": form, "body": body.decode(), "problem": problem, "live": live}
+        shown = {"view": view, "given": form, "body": body.decode(), "problem": problem, "live": live}
         status = status_of(problem) if isinstance(problem, RecordingError) else None
         return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
 
@@ -192,14 +192,14 @@ def _checked(check: Callable[[str], object], expected: str, text: str) -> str:
 
 
 def _form_values(run: Run, view: View) -> dict[str, object]:
-    """Return the texts to choose from in the form of a view, or why it has none, and damage of the run."""
+    """Return texts of a run to choose from in the form of a view, or why it has none, and what is damaged."""
     with open_recording(run.recording) as recording:
         refusal = view.refusal(recording) if view.refusal is not None and run.can_train_again else ""
         damage = damage_of(run, recording).partition(": ")[2]
         choices = {
-            given.name: given.values if given.choices is None else given.choices(recording)
+            given.name: given.choices(recording)
             for given in view.inputs.values()
-            if given.values or given.choices is not None
+            if given.choices is not None
         }
     return {"choices": choices, "refusal": refusal, "damage": damage}
 

@@ -16,16 +16,31 @@ from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress
 
 def find(
     folders: tuple[Path, ...],
-    expression: str = view_input("expression", "A condition on episodes.", required=True),
+    expression: str = view_input(
+        "expression",
+        "A condition on episodes.",
+        required=True,
+        label="Episodes",
+        placeholder="ret < -100 and count(collision) >= 2 and length > 50",
+    ),
     runs: str = ONLY_HERE,
     phase: str | None = view_input(
-        "phase", "Training or evaluation.  [default: both]", values=("train", "eval")
+        "phase",
+        "Training or evaluation.  [default: both]",
+        values=("train", "eval"),
+        label="Phase",
+        placeholder="both",
     ),
     sort: str = view_input(
-        "sort", "Sort by a number, such as ret, or -ret from the highest.", default="", metavar="NUMBER"
+        "sort",
+        "Sort by a number, such as ret, or -ret from the highest.",
+        default="",
+        metavar="NUMBER",
+        label="Sort by",
+        placeholder="newest run; or -ret",
     ),
     limit: int = view_input(
-        "limit", "Maximum number of rows, 0 for all.  [default: 20]", kind=int, default=20
+        "limit", "Maximum number of rows, 0 for all.  [default: 20]", kind=int, default=20, label="Show"
     ),
     mark: str | None = view_input(
         "mark", "Mark the first step of the episodes shown, as `dualtaxi mark` does.", metavar="TEXT"
@@ -97,4 +112,14 @@ def find(
     return ReadyAnswer(data, sections(), lines={"quiet": lines()}, remarks=reasons_in_words(found))
 
 
-VIEW: Final = View("find", "Episodes", find, subject="folders", forms=("quiet", "json", "markdown"))
+VIEW: Final = View(
+    "find",
+    "Find episodes",
+    find,
+    subject="folders",
+    button="Find",
+    lead="A condition C on the steps of an episode, or a value V of them, has events such as `collision`, "
+    "and `reward`, `action`, `next_state` or `next_observation[0]`.",
+    list_title="Of an episode",
+    forms=("quiet", "json", "markdown"),
+)

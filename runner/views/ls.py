@@ -273,4 +273,13 @@ def ls(
     return Listing(folders, matching, shown, sort, limit, offset, progress.say)
 
 
-VIEW: Final = View("ls", "Runs", ls, subject="folders", forms=("quiet", "csv", "json", "markdown"))
+VIEW: Final = View(
+    "ls",
+    "Runs",
+    ls,
+    subject="folders",
+    lead="Words are searched in id, name, configuration, tags and note. A condition compares fields in "
+    'Python\'s syntax: `name == "quick"`, `0 < seed < 10`, `"keep" in tags`, `like(name, "q*")`, '
+    '`age < "12h"`, `digest is None`, joined by `and`, `or`, `not` and parentheses.',
+    forms=("quiet", "csv", "json", "markdown"),
+)

@@ -55,7 +55,14 @@ class Rows(Answer):
 
 def sql(
     folders: tuple[Path, ...],
-    query: str = view_input("query", "One SELECT in the SQL of DuckDB.", required=True),
+    query: str = view_input(
+        "query",
+        "One SELECT in the SQL of DuckDB.",
+        required=True,
+        max_length=10_000,
+        label="Query",
+        placeholder="SELECT config, avg(success_percent), avg(mean_return) FROM runs GROUP BY ALL",
+    ),
     runs: str = ONLY_HERE,
     timeout: int = view_input(
         "timeout",
@@ -114,6 +121,9 @@ VIEW: Final = View(
     "SQL",
     sql,
     subject="folders",
+    button="Ask",
+    lead="One SELECT in the SQL of DuckDB. Each view has a column `run`; `DESCRIBE steps` lists columns.",
+    list_title="Views",
     forms=("csv", "json", "markdown"),
     file_ending=".parquet",
     file_flags=("--parquet",),

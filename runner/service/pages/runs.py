@@ -31,6 +31,7 @@ from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import Page, message_of, render, viewer_of
+from runner.views.ls import VIEW as LS
 
 router = APIRouter(include_in_schema=False)
 
@@ -182,6 +183,7 @@ def _search(
         "table": table,
         "problem": problem,
         "fields": fields,
+        "lead": LS.lead,
         "settings": settings,
     }
 
