@@ -40,7 +40,11 @@ def find(
         placeholder="newest run; or -ret",
     ),
     limit: int = view_input(
-        "limit", "Maximum number of rows, 0 for all.  [default: 20]", kind=int, default=20, label="Show"
+        "limit",
+        "Maximum number of rows, 0 for all.  [default: 20]",
+        kind=int,
+        default=20,
+        label="Show at most",
     ),
     mark: str | None = view_input(
         "mark", "Mark the first step of the episodes shown, as `dualtaxi mark` does.", metavar="TEXT"
@@ -52,7 +56,7 @@ def find(
 
     It is a condition in Python's syntax. Words alone are searched for in the id, name, tags and note of runs.
 
-    Of an episode:
+    What the condition may contain:
       ret, ret.taxi_1, length          sum of rewards, or of an agent's rewards; number of steps
       success, terminated, truncated   how it ended
       any(C), all(C), never(C)         whether a condition holds at some, every or no step
@@ -118,8 +122,8 @@ VIEW: Final = View(
     find,
     subject="folders",
     button="Find",
-    lead="A condition C on the steps of an episode, or a value V of them, has events such as `collision`, "
-    "and `reward`, `action`, `next_state` or `next_observation[0]`.",
-    list_title="Of an episode",
+    lead="A condition on episodes. In functions of their steps, C is a condition on a step and V a value of "
+    "it: `reward`, `action`, `next_state`, `next_observation[0]`, or an event such as `collision`.",
+    list_title="What the condition may contain",
     forms=("quiet", "json", "markdown"),
 )
