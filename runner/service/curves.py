@@ -31,6 +31,8 @@ from runner.util.values import finite
 
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
+MAX_NAMED_AXES: Final = 100
+"""The most logged values among the axes to choose from."""
 AxisName = Annotated[
     str,
     Field(
@@ -114,7 +116,7 @@ class ShownCurve:
 
 @dataclass(frozen=True)
 class AxisInfo:
-    """An axis that all of the runs have."""
+    """An axis that all of the runs have, or values that one of them logged."""
 
     name: str
     title: str
@@ -164,6 +166,9 @@ def curves_of(
     over = series[0].axis if series else axis_of(options.axis)
     if over not in common and options.axis not in AXES:
         common.append(over)
+    logged = list(dict.fromkeys(name for run in series for name in run.names))[:MAX_NAMES]
+    known = [axis.name for axis in common]
+    common += [axis_of(name) for name in logged if name not in known][:MAX_NAMED_AXES]
     groups = groups_of(series)
     names = {run.run_id: (letter(number), run.name) for number, run in enumerate(series)}
     panels: list[Panel] = []
@@ -192,7 +197,7 @@ def curves_of(
         shown,
         averaged,
         notes if shown else ["No metrics were recorded."],
-        list(dict.fromkeys(name for run in series for name in run.names))[:MAX_NAMES],
+        logged,
     )
     return as_json(result)
 

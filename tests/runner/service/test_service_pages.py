@@ -469,7 +469,7 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     assert "Training steps" not in page
     curves = client.get("/api/v1/curves?run=alone").json()
     assert ([axis["label"] for axis in curves["axes"]], curves["axis"]) == (
-        ["steps", "wall time, seconds"],
+        ["steps", "wall time, seconds", *curves["names"]],
         "steps",
     )
     assert [len(curve["positions"]) for curve in curves["curves"]] == [20] * 64

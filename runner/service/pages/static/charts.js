@@ -12,7 +12,6 @@ const fields = form.elements;
 const USUAL = { axis: "episodes", smooth: "0" };
 const COLOURS = 7; // of lines, in the style
 const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
-const MAX_AXES = 100; // logged values among the axes to choose from
 const HEIGHT = 216;
 const HIDDEN = "charts hidden",
   PINNED = "charts pinned"; // names of metrics, which this browser keeps
@@ -94,10 +93,8 @@ async function draw() {
     const found = await json(`/api/v1/curves?${query}`);
     if (mine !== requests) return;
     last = found;
-    const named = found.axes.map(({ name }) => name),
-      others = found.names.filter((name) => !named.includes(name)).slice(0, MAX_AXES),
-      axes = [...found.axes, ...others.map((name) => ({ name, label: name }))];
-    fields.axis.replaceChildren(...axes.map(({ name, label }) => new Option(label, name, false, name === found.axis)));
+    const axes = found.axes.map(({ name, label }) => new Option(label, name, false, name === found.axis));
+    fields.axis.replaceChildren(...axes);
     fields.logged.list.replaceChildren(...found.names.map((name) => new Option(name)));
     fields.logged.parentElement.hidden = found.names.length < 2;
     fields.lines.parentElement.hidden = found.groups.every((group) => group.runs.length < 2);
