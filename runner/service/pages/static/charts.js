@@ -182,10 +182,11 @@ function plot(metric, curves, isPinned) {
     series = seriesOf(curves),
     looks = series.map(({ positions, values, ...look }) => look),
     points = uPlot.join(series.map(({ positions, values }) => [positions, values])),
+    logX = log_x && points[0].length > 0,
     logY = log_y && points.slice(1).some((values) => values.some((value) => value > 0));
   const one = shown.get(metric) ?? figureOf(metric, title);
   const { caption, place, key, picture, table, pin } = one,
-    kinds = JSON.stringify([looks, log_x, logY, last.axis, plots.clientWidth < 500]);
+    kinds = JSON.stringify([looks, logX, logY, last.axis, plots.clientWidth < 500]);
   pin.setAttribute("aria-pressed", isPinned);
   picture.href = `/api/v1/curves.svg?${queryOf({ metric, smooth: fields.smooth.value, log_x, log_y })}`;
   table.href = `/api/v1/curves.csv?${queryOf({ metric, lines: fields.lines.checked })}`;
@@ -195,7 +196,7 @@ function plot(metric, curves, isPinned) {
   if (one.chart && one.kinds === kinds) return one.chart.setData(points);
   one.chart?.destroy();
   one.kinds = kinds;
-  one.chart = new uPlot(options(unit, looks, log_x, logY, one), points, place);
+  one.chart = new uPlot(options(unit, looks, logX, logY, one), points, place);
   legend(one.chart, key, looks);
 }
 
@@ -250,7 +251,7 @@ function readOut(chart, key) {
     position.textContent = known(at) ? `${axisLabel()} ${exact(chart.data[0][at])}${alone ? `: ${alone}` : ""}` : "";
 }
 
-function options(unit, series, log_x, logY, { place, key }) {
+function options(unit, series, logX, logY, { place, key }) {
   const axis = {
     stroke: style("--soft"),
     grid: { stroke: style("--line"), width: 1 },
@@ -258,30 +259,23 @@ function options(unit, series, log_x, logY, { place, key }) {
     font: "12px system-ui, sans-serif",
     values: (_, ticks) => ticks.map(tick),
   };
-  const scale = (log, range) => ({
-    time: false,
-    distr: log ? 3 : 1,
-    range: (chart, low, high) =>
-      log ? uPlot.rangeLog(low > 0 ? low : 0.1, high > 0 ? high : 1, 10, false) : range(low, high, chart.data[0]),
-  });
-  const end = (name, other) => (fields[name].value === "" ? other : Number(fields[name].value));
   // To the only position where there is one: uPlot proposes an axis to twice that.
-  const x = scale(log_x, (low, high, positions) => {
+  const across = ({ data: [positions] }, low, high) => {
     const [first, last] = positions.length > 1 ? [low, high] : [0, positions[0] || 1];
-    return [end("from", first), end("to", last)];
-  });
-  const y = scale(logY, (low, high) => {
-    if (unit.startsWith("percent") && high <= 100 && low >= 0) return [0, 100];
-    if (low === null || (low === 0 && high === 0)) return [0, 1];
-    const from = low >= 0 ? 0 : low - 0.05 * (high - low || -low);
-    return [from, high + 0.05 * (high - from || 1)];
-  });
+    return [Number(fields.from.value || first), Number(fields.to.value || last)];
+  };
+  const whole = unit.startsWith("percent") ? 100 : null,
+    ends = { min: { pad: 0.05, soft: 0, mode: 1 }, max: { pad: 0.05, soft: whole, mode: 1 } };
+  const up = (_, low, high) => (low || high ? uPlot.rangeNum(Math.min(0, low), high, ends) : [0, whole ?? 1]);
   const wide = (_, ticks) => 18 + 7.2 * Math.max(3, ...(ticks ?? []).map((text) => text.length));
   return {
     width: place.clientWidth,
     height: HEIGHT,
     padding: [8, 22, 0, 0],
-    scales: { x, y },
+    scales: {
+      x: logX ? { time: false, distr: 3 } : { time: false, range: across },
+      y: logY ? { distr: 3 } : { range: up },
+    },
     series: [{}, ...series.map(({ fill, ...look }) => look)],
     bands: series.flatMap(({ fill }, i) => (fill ? [{ series: [i + 1, i + 2], fill }] : [])),
     axes: [
