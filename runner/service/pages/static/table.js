@@ -4,14 +4,10 @@ import { isTaken } from "./page.js";
 const form = document.querySelector("[data-rows]");
 const search = document.querySelector("[data-focus]");
 
-function chosen() {
-  const boxes = form.querySelectorAll("tbody input:checked");
-  return [...boxes].reduce((runs, box) => runs + Number(box.dataset.runs ?? 1), 0);
-}
-
 function update() {
   const button = form.querySelector("[data-compare]"),
-    count = chosen();
+    boxes = [...form.querySelectorAll("tbody input:checked")],
+    count = boxes.reduce((runs, box) => runs + Number(box.dataset.runs ?? 1), 0);
   button.disabled = count < 2;
   button.textContent = count < 2 ? "Select two or more runs to compare" : `Compare ${count} runs`;
 }
@@ -32,13 +28,7 @@ document.addEventListener("keydown", (event) => {
   if (!form) return;
   if (event.key === "j") step(1);
   if (event.key === "k") step(-1);
-  if (event.key === "x") {
-    const box = document.activeElement.closest("tr")?.querySelector("input");
-    if (box) {
-      box.checked = !box.checked;
-      update();
-    }
-  }
+  if (event.key === "x") document.activeElement.closest("tr")?.querySelector("input")?.click();
 });
 if (form) {
   form.addEventListener("change", update);
