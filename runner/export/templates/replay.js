@@ -203,8 +203,7 @@ class Replay {
       now = time[i],
       box = this.find(".logged");
     const rows = logged.map(({ name, at, values }) => {
-      const after = at.findIndex((step) => step > now),
-        j = after < 0 ? at.length - 1 : Math.max(0, after - 1),
+      const j = Math.max(0, at.findLastIndex((step) => step <= now)),
         far = Math.abs(at[j] - now);
       const steps = `${far.toLocaleString("en")} ${far === 1 ? "step" : "steps"} ${at[j] > now ? "later" : "before"}`,
         when = far ? steps : this.first + i ? "now" : "before the first step";
