@@ -34,11 +34,17 @@ function fill() {
   draw();
 }
 
+// Add values to a query, except for empty and usual ones.
+function add(query, values) {
+  for (const [name, value] of Object.entries(values)) if (value && value !== USUAL[name]) query.set(name, value);
+  return query;
+}
+
 function change(values, keep = true) {
   for (const [name, value] of Object.entries(values)) fields[name].value = value ?? "";
   const query = new URLSearchParams(location.search);
   for (const { name } of fields) query.delete(name);
-  for (const [name, value] of new FormData(form)) if (value && value !== USUAL[name]) query.set(name, value);
+  add(query, chosen());
   history[keep ? "pushState" : "replaceState"](null, "", query.size ? `?${query}` : location.pathname);
 }
 
@@ -69,12 +75,10 @@ function complain(text) {
 
 // --- data -----------------------------------------------------------------------------------------------
 
-// Return the query for curves over the axis, with values that are neither empty nor usual.
+// Return the query for curves over the axis.
 function queryOf(values) {
   const axis = new URLSearchParams(location.search).get("axis") ?? USUAL.axis;
-  const query = new URLSearchParams([["axis", axis], ...new URLSearchParams(box.dataset.charts)]); // the runs
-  for (const [name, value] of Object.entries(values)) if (value && value !== USUAL[name]) query.set(name, value);
-  return query;
+  return add(new URLSearchParams([["axis", axis], ...new URLSearchParams(box.dataset.charts)]), values); // of the runs
 }
 
 async function draw() {
@@ -138,12 +142,11 @@ function show() {
 
 // --- numbers --------------------------------------------------------------------------------------------
 
-const known = (value) => value !== null && value !== undefined;
 const exact = (value) => value?.toLocaleString("en", { maximumSignificantDigits: 6 }) ?? "";
 const axisLabel = () => last.axes.find(({ name }) => name === last.axis).label;
 
 function tick(value) {
-  if (!known(value)) return "";
+  if (value === null) return "";
   const size = Math.abs(value);
   if (size >= 1e15 || (size > 0 && size < 1e-4)) return value.toExponential(0);
   const notation = size < 1e4 ? "standard" : "compact";
@@ -164,7 +167,7 @@ function seriesOf(curves) {
       base = { stroke, dash: DASHES[dash % DASHES.length], width: 1.8, label: "", spanGaps: true, points: { show: false } },
       values = curve.smoothed ? { stroke: `${stroke}55`, width: 1 } : { label, points: { show: size > 0, size } };
     const drawn = [
-      [curve.high, { width: 0, fill: `${stroke}33` }],
+      [curve.high, { width: 0, band: `${stroke}33` }],
       [curve.low, { width: 0 }],
       ...curve.runs.map((run, i) => [run, { width: 0.7, stroke: `${stroke}aa`, label: curve.run_labels[i] }]),
       [curve.values, values],
@@ -172,7 +175,7 @@ function seriesOf(curves) {
     ];
     return drawn
       .filter(([values]) => values)
-      .map(([values, look]) => ({ ...base, positions: curve.positions, values, ...look }));
+      .map(([values, look]) => ({ look: { ...base, ...look }, points: [curve.positions, values] }));
   });
 }
 
@@ -180,8 +183,8 @@ function plot(metric, curves, isPinned) {
   const { log_x, log_y } = chosen(),
     { title, unit } = curves[0],
     series = seriesOf(curves),
-    looks = series.map(({ positions, values, ...look }) => look),
-    points = uPlot.join(series.map(({ positions, values }) => [positions, values])),
+    looks = series.map(({ look }) => look),
+    points = uPlot.join(series.map(({ points }) => points)),
     logX = log_x && points[0].length > 0,
     logY = log_y && points.slice(1).some((values) => values.some((value) => value > 0));
   const one = shown.get(metric) ?? figureOf(metric, title);
@@ -242,13 +245,13 @@ function legend(chart, key, looks) {
 
 // While the cursor is over a plot, its key shows the position and the values there.
 function readOut(chart, key) {
-  const at = chart.cursor.left >= 0 ? chart.cursor.idx : null,
-    [position, ...outputs] = [...key.querySelectorAll("output")].reverse();
-  const value = ({ dataset }) => exact(chart.data[dataset.series][at]);
-  for (const output of outputs) output.textContent = value(output);
-  const alone = outputs.length === 1 && value(outputs[0]);
-  if (position)
-    position.textContent = known(at) ? `${axisLabel()} ${exact(chart.data[0][at])}${alone ? `: ${alone}` : ""}` : "";
+  const value = (series) => exact(chart.data[series][chart.cursor.idx]),
+    outputs = [...key.querySelectorAll("output")],
+    position = outputs.pop();
+  for (const output of outputs) output.textContent = value(output.dataset.series);
+  const alone = outputs.length === 1 && outputs[0].textContent,
+    at = value(0);
+  if (position) position.textContent = at && `${axisLabel()} ${at}${alone ? `: ${alone}` : ""}`;
 }
 
 function options(unit, series, logX, logY, { place, key }) {
@@ -276,8 +279,8 @@ function options(unit, series, logX, logY, { place, key }) {
       x: logX ? { time: false, distr: 3 } : { time: false, range: across },
       y: logY ? { distr: 3 } : { range: up },
     },
-    series: [{}, ...series.map(({ fill, ...look }) => look)],
-    bands: series.flatMap(({ fill }, i) => (fill ? [{ series: [i + 1, i + 2], fill }] : [])),
+    series: [{}, ...series],
+    bands: series.flatMap(({ band }, i) => (band ? [{ series: [i + 1, i + 2], fill: band }] : [])),
     axes: [
       { ...axis, size: 28, label: axisLabel(), labelSize: 18, labelGap: 0, labelFont: axis.font },
       { ...axis, size: wide },
@@ -319,17 +322,14 @@ form.addEventListener("change", ({ target: { name } }) => {
   if (["from", "to", "smooth"].includes(name)) return;
   change(name === "axis" ? { from: "", to: "" } : {});
   draw();
-  if (name === "axis") document.dispatchEvent(new Event("axischange"));
 });
 box.querySelector("[data-reset]").addEventListener("click", () => go("", ""));
 plots.addEventListener("dblclick", () => go("", ""));
 addEventListener("popstate", fill);
 
-let width = plots.clientWidth;
 new ResizeObserver(() => {
-  if (plots.clientWidth === width) return;
-  width = plots.clientWidth;
-  for (const { chart, place } of shown.values()) chart.setSize({ width: place.clientWidth, height: HEIGHT });
+  for (const { chart, place } of shown.values())
+    if (chart.width !== place.clientWidth) chart.setSize({ width: place.clientWidth, height: HEIGHT });
 }).observe(plots);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   if (last) show();
