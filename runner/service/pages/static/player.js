@@ -3,8 +3,8 @@ import { json, request } from "./page.js";
 
 const BEFORE = 250; // steps before the requested one, as in pages/replay.py
 const BLOCK = 64,
-  KEPT = 1500,
-  AHEAD = 256; // pictures
+  AHEAD = 256, // pictures
+  KEPT = 12; // blocks before and after the picture that is shown
 
 // Return the replay of the episode at `data-source`, at a step.
 export async function open(root, at = 0, moved) {
@@ -13,7 +13,7 @@ export async function open(root, at = 0, moved) {
   const pictures = picturesOf(root, at);
   const episode = await part(at).finally(() => root.removeAttribute("aria-busy"));
   const replay = new Replay(root, { load: part, moved, pictures });
-  await replay.begin(episode, Math.min(at, episode.length));
+  await replay.begin(episode, at);
   return replay;
 }
 
@@ -40,7 +40,7 @@ export function listen(bar) {
 function picturesOf(root, at) {
   const source = root.dataset.pictures;
   if (!source) return null;
-  const kept = new Map(), // the address of the picture at a step
+  const blocks = new Map(), // by number, with the address of the picture at each step
     messages = new Map(); // or why there is none
   let note = root.querySelector(".frame-note").textContent,
     wanted = at,
@@ -49,25 +49,22 @@ function picturesOf(root, at) {
     timer = null,
     last = Infinity;
 
-  const known = (k) => kept.has(k) || messages.has(k) || k > last;
-  const isRead = (k) => reading && k >= reading.next && k < reading.stop;
+  const numberOf = (k) => Math.floor(k / BLOCK);
+  const addressOf = (k) => blocks.get(numberOf(k))?.[k % BLOCK] ?? "";
+  const known = (k) => addressOf(k) || messages.has(k) || k > last;
 
-  function keep(k, address) {
-    kept.set(k, address);
-    if (kept.size <= KEPT) return;
-    const far = [...kept.keys()].reduce((a, b) => (Math.abs(a - wanted) > Math.abs(b - wanted) ? a : b));
-    const gone = kept.get(far);
-    kept.delete(far);
-    if (![kept.get(far - 1), kept.get(far + 1)].includes(gone)) URL.revokeObjectURL(gone);
+  function drop(number) {
+    blocks.get(number).forEach((address) => URL.revokeObjectURL(address));
+    blocks.delete(number);
   }
 
   function tell() {
-    if (kept.has(wanted)) show(kept.get(wanted), note);
-    else show("", messages.get(wanted) ?? "This picture is being made …");
+    const address = addressOf(wanted);
+    show(address, address ? note : (messages.get(wanted) ?? "This picture is being made …"));
   }
 
   async function read(start) {
-    const steps = kept.size ? BLOCK - (start % BLOCK) : 1,
+    const steps = blocks.size ? BLOCK - (start % BLOCK) : 1,
       own = { next: start, stop: start + steps, control: new AbortController() };
     reading = own;
     try {
@@ -79,15 +76,17 @@ function picturesOf(root, at) {
       const addresses = head.sizes.map((size) => URL.createObjectURL(new Blob([body.slice(end, (end += size))])));
       note = head.note || note;
       last = head.last;
-      for (const number of head.shown) keep(own.next++, addresses[number]);
-      if (wanted >= start && wanted < own.next) tell();
+      const block = blocks.get(numberOf(start)) ?? [];
+      for (const picture of head.shown) block[own.next++ % BLOCK] = addresses[picture];
+      blocks.set(numberOf(start), block);
       if (head.problem) throw new Error(head.problem);
     } catch (error) {
       if (error.name === "AbortError") return;
       for (let k = own.next; k < own.stop; k++) messages.set(k, error.message);
-      if (isRead(wanted)) tell();
       if (error.status === 503) setTimeout(retry, 2500); // others are looking
     }
+    tell();
+    for (const number of blocks.keys()) if (Math.abs(number - numberOf(wanted)) > KEPT) drop(number);
     if (reading === own) {
       reading = null;
       more();
@@ -103,20 +102,19 @@ function picturesOf(root, at) {
   function more() {
     clearTimeout(timer);
     if (reading) {
-      if (known(wanted) || isRead(wanted)) return;
+      if (known(wanted) || (wanted >= reading.next && wanted < reading.stop)) return;
       reading.control.abort();
       reading = null;
     }
     let k = wanted;
     while (known(k) && k < wanted + AHEAD) k++;
-    if (k <= last && k < wanted + AHEAD && !messages.has(k) && root.isConnected)
-      timer = setTimeout(read, k === wanted && kept.size > 1 ? 60 : 0, k);
+    if (k < wanted + AHEAD && root.isConnected) timer = setTimeout(read, k === wanted && blocks.size ? 60 : 0, k);
   }
 
   function close() {
     reading?.control.abort();
     clearTimeout(timer);
-    new Set(kept.values()).forEach((address) => URL.revokeObjectURL(address));
+    [...blocks.keys()].forEach(drop);
   }
 
   addEventListener("pagehide", () => reading?.control.abort());
