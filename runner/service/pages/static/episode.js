@@ -23,17 +23,13 @@ const { bar } = await open(root, Number(root.dataset.at), moved);
 listen(bar);
 
 // Marks: a tick at the slider and a link for each; the key M leads to the text of another.
-const ticks = make("datalist", { id: "mark-ticks" });
-for (const link of root.querySelectorAll("[data-mark]")) {
-  ticks.append(make("option", { value: link.dataset.mark, label: link.parentElement.textContent.trim() }));
+for (const link of root.querySelectorAll("[data-mark]"))
   link.addEventListener("click", (event) => {
     event.preventDefault();
     bar.go(Number(link.dataset.mark));
   });
-}
-bar.slider.after(ticks);
-bar.slider.setAttribute("list", ticks.id);
-const mark = root.querySelector("[data-step=now]")?.form.elements.text;
+bar.slider.setAttribute("list", "mark-ticks");
+const mark = root.querySelector(".marks [name=text]");
 document.addEventListener("keydown", (event) => {
   if (event.key.toLowerCase() !== "m" || isTaken(event) || !mark) return;
   event.preventDefault();
