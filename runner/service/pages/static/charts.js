@@ -4,10 +4,8 @@
 import { json } from "./page.js";
 
 const box = document.querySelector("[data-charts]");
-const [form, template, plots, restore] = ["form", "template", "[data-plots]", "[data-hidden]"].map((selector) =>
-  box.querySelector(selector),
-);
-const message = Object.assign(document.createElement("p"), { className: "hint wide", role: "status" });
+const selectors = ["form", "template", "[data-plots]", "[data-hidden]", "[role=status]"];
+const [form, template, plots, restore, message] = selectors.map((selector) => box.querySelector(selector));
 const fields = form.elements;
 const USUAL = { axis: "episodes", smooth: "0" };
 const COLOURS = 7; // of lines, in the style
@@ -103,10 +101,8 @@ async function draw() {
     fields.logged.parentElement.hidden = found.names.length < 2;
     fields.lines.parentElement.hidden = found.groups.every((group) => group.runs.length < 2);
     for (const [i, group] of found.groups.entries())
-      for (const id of group.runs) {
-        const swatch = document.querySelector(`.swatch[data-run="${id}"]`); // of the runs above
-        if (swatch) swatch.className = `swatch line-${i % COLOURS}`;
-      }
+      for (const id of group.runs) // the swatches of the runs above
+        document.querySelector(`[data-run="${id}"]`)?.setAttribute("class", `swatch line-${i % COLOURS}`);
     show();
   } catch (error) {
     complain(error.message);
@@ -118,15 +114,15 @@ function show() {
   const metrics = Object.groupBy(last.curves, ({ metric }) => metric),
     hidden = remembered(HIDDEN),
     pinned = remembered(PINNED);
-  const [left, visible] = [true, false].map((is) => Object.keys(metrics).filter((name) => hidden.has(name) === is));
-  const ranked = visible.sort((one, other) => pinned.has(other) - pinned.has(one)); // else in the order of the server
+  const names = Object.keys(metrics).sort((one, other) => pinned.has(other) - pinned.has(one)), // else as the server
+    left = names.filter((name) => hidden.has(name)),
+    ranked = names.filter((name) => !hidden.has(name));
   for (const metric of ranked) plot(metric, metrics[metric], pinned.has(metric));
   const order = [...ranked.map((metric) => shown.get(metric).figure), message];
-  if (order.some((node, i) => plots.children[i] !== node)) plots.append(...order);
+  if (order.some((node, i) => plots.children[i] !== node)) plots.replaceChildren(...order);
   for (const [metric, one] of shown)
     if (!ranked.includes(metric)) {
       one.chart.destroy();
-      one.figure.remove();
       shown.delete(metric);
     }
   restore.hidden = !left.length;
@@ -164,7 +160,7 @@ function seriesOf(curves) {
     const { label, colour, dash } = curve,
       stroke = style(`--line-${colour % COLOURS}`),
       size = curve.positions.length > 80 ? 0 : curve.positions.length > 1 ? 4 : 9,
-      base = { stroke, dash: DASHES[dash % DASHES.length], width: 1.8, label: "", spanGaps: true, points: { show: false } },
+      base = { stroke, dash: DASHES[dash % DASHES.length], width: 1.8, spanGaps: true, points: { show: false } },
       values = curve.smoothed ? { stroke: `${stroke}55`, width: 1 } : { label, points: { show: size > 0, size } };
     const drawn = [
       [curve.high, { width: 0, band: `${stroke}33` }],
@@ -180,7 +176,7 @@ function seriesOf(curves) {
 }
 
 function plot(metric, curves, isPinned) {
-  const { log_x, log_y } = chosen(),
+  const { smooth, lines, log_x, log_y } = chosen(),
     { title, unit } = curves[0],
     series = seriesOf(curves),
     looks = series.map(({ look }) => look),
@@ -191,12 +187,12 @@ function plot(metric, curves, isPinned) {
   const { caption, place, key, picture, table, pin } = one,
     kinds = JSON.stringify([looks, logX, logY, last.axis, plots.clientWidth < 500]);
   pin.setAttribute("aria-pressed", isPinned);
-  picture.href = `/api/v1/curves.svg?${queryOf({ metric, smooth: fields.smooth.value, log_x, log_y })}`;
-  table.href = `/api/v1/curves.csv?${queryOf({ metric, lines: fields.lines.checked })}`;
+  picture.href = `/api/v1/curves.svg?${queryOf({ metric, smooth, log_x, log_y })}`;
+  table.href = `/api/v1/curves.csv?${queryOf({ metric, lines })}`;
   const parts = [unit, curves.some((curve) => curve.thinned) && "thinned", !points[0].length && "no point in this part"];
   caption.textContent = parts.filter(Boolean).join(", ");
   place.setAttribute("aria-label", `${title}, ${unit}: ${curves.map(({ summary }) => summary).join("; ")}`);
-  if (one.chart && one.kinds === kinds) return one.chart.setData(points);
+  if (one.kinds === kinds) return one.chart.setData(points);
   one.chart?.destroy();
   one.kinds = kinds;
   one.chart = new uPlot(options(unit, looks, logX, logY, one), points, place);
@@ -205,7 +201,9 @@ function plot(metric, curves, isPinned) {
 
 function figureOf(metric, title) {
   const figure = template.content.firstElementChild.cloneNode(true),
-    [pin, hide, picture, table] = figure.querySelectorAll(".tools > *");
+    [heading, place, key, tools] = figure.children,
+    [name, caption] = heading.children,
+    [pin, hide, picture, table] = tools.children;
   for (const tool of [pin, hide]) tool.setAttribute("aria-label", `${tool.textContent} ${title}`);
   for (const tool of [picture, table]) tool.setAttribute("aria-label", `${title} as ${tool.textContent}`);
   pin.onclick = () => remember(PINNED, metric);
@@ -213,8 +211,7 @@ function figureOf(metric, title) {
   picture.download = `${metric}.svg`;
   table.download = `${metric}.csv`;
   figure.classList.toggle("wide", metric === "training.reward");
-  figure.querySelector("b").textContent = title;
-  const [caption, place, key] = ["span", "[role=img]", ".key"].map((selector) => figure.querySelector(selector));
+  name.textContent = title;
   const one = { figure, caption, place, key, picture, table, pin };
   shown.set(metric, one);
   plots.append(figure);
@@ -270,7 +267,6 @@ function options(unit, series, logX, logY, { place, key }) {
   const whole = unit.startsWith("percent") ? 100 : null,
     ends = { min: { pad: 0.05, soft: 0, mode: 1 }, max: { pad: 0.05, soft: whole, mode: 1 } };
   const up = (_, low, high) => (low || high ? uPlot.rangeNum(Math.min(0, low), high, ends) : [0, whole ?? 1]);
-  const wide = (_, ticks) => 18 + 7.2 * Math.max(3, ...(ticks ?? []).map((text) => text.length));
   return {
     width: place.clientWidth,
     height: HEIGHT,
@@ -283,7 +279,7 @@ function options(unit, series, logX, logY, { place, key }) {
     bands: series.flatMap(({ band }, i) => (band ? [{ series: [i + 1, i + 2], fill: band }] : [])),
     axes: [
       { ...axis, size: 28, label: axisLabel(), labelSize: 18, labelGap: 0, labelFont: axis.font },
-      { ...axis, size: wide },
+      { ...axis, size: (_, ticks) => 18 + 7.2 * Math.max(3, ...(ticks ?? []).map((text) => text.length)) },
     ],
     legend: { show: false },
     cursor: { drag: { x: true, y: false, setScale: false }, sync: { key: "metrics", setSeries: false } },
@@ -293,23 +289,25 @@ function options(unit, series, logX, logY, { place, key }) {
 
 // --- events ---------------------------------------------------------------------------------------------
 
-function go(from, to) {
-  change({ from, to });
+function go(values) {
+  change(values);
   draw();
 }
+
+const showAll = () => go({ from: "", to: "" });
 
 function zoom(chart) {
   const { left, width } = chart.select,
     round = fields.axis.value === "time" ? [Number, Number] : [Math.floor, Math.ceil];
   if (width < 4) return;
   const [from, to] = [left, left + width].map((at, i) => round[i](chart.posToVal(at, "x")));
-  go(Math.max(0, from), to);
+  go({ from: Math.max(0, from), to });
   chart.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
 }
 
 form.addEventListener("submit", (event) => {
   event.preventDefault();
-  go(fields.from.value, fields.to.value);
+  go({});
 });
 let sliding = 0;
 form.addEventListener("input", ({ target }) => {
@@ -320,11 +318,11 @@ form.addEventListener("input", ({ target }) => {
 });
 form.addEventListener("change", ({ target: { name } }) => {
   if (["from", "to", "smooth"].includes(name)) return;
-  change(name === "axis" ? { from: "", to: "" } : {});
-  draw();
+  if (name === "axis") showAll();
+  else go({});
 });
-box.querySelector("[data-reset]").addEventListener("click", () => go("", ""));
-plots.addEventListener("dblclick", () => go("", ""));
+box.querySelector("[data-reset]").addEventListener("click", showAll);
+plots.addEventListener("dblclick", showAll);
 addEventListener("popstate", fill);
 
 new ResizeObserver(() => {
