@@ -274,7 +274,7 @@ const rowOf = (tag, [name, ...cells], kind = "") =>
 for (const root of document.querySelectorAll("[data-replay]")) {
   const episodes = JSON.parse(document.getElementById(root.dataset.replay).textContent),
     choose = root.querySelector(".episode"),
-    chosen = () => episodes[Number(choose.value)];
+    chosen = () => episodes[choose.value];
   const pictures = (k, show) => {
     const { pictures: addresses, picture, picture_note: note } = chosen(),
       isMade = k < picture.length && addresses.length && picture[k] < addresses.length - 1;

@@ -1,7 +1,7 @@
 // What all pages do: load parts that take long, reload parts that change, keep ages up to date, show the open tab.
 
 // Fetch from this service; an error has the message of the response.
-export async function request(address, options = {}) {
+export async function request(address, options) {
   const response = await fetch(address, { headers: { accept: "application/json" }, ...options });
   if (response.ok) return response;
   const body = await response.json().catch(() => null);

@@ -34,7 +34,7 @@ async function open() {
     if (handle.has_panicked()) throw new Error(`The viewer has crashed: ${handle.panic_message()}`);
     try {
       await handle.viewer_control(command);
-      document.body.dataset.opened = place.step;
+      place.opened = place.step;
       return;
     } catch (error) {
       if (error.name !== "ViewerControlError") throw error; // the recording is not there yet

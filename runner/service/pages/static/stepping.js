@@ -2,7 +2,6 @@
 import { keepAddress, listen, open } from "./player.js";
 
 const box = document.querySelector("[data-together]");
-const offset = ({ root }) => Number(root.dataset.offset ?? 0);
 
 const opened = [...document.querySelectorAll("[data-source]")].map(async (root) => {
   const description = root.querySelector(".description");
@@ -14,7 +13,7 @@ const opened = [...document.querySelectorAll("[data-source]")].map(async (root) 
 const replays = (await Promise.all(opened)).filter(Boolean);
 
 const bar = new Scrubber(box, "all", (k) => {
-  for (const replay of replays) replay.bar.show(k - offset(replay));
+  for (const replay of replays) replay.bar.show(k - replay.root.dataset.offset);
   keepAddress(box.dataset.address + k);
 });
 bar.length = Number(box.dataset.length) || Math.max(0, ...replays.map(({ bar }) => bar.length));
