@@ -440,9 +440,12 @@ def label(
 
 
 def command_for(run: Run, verb: str, *options: str) -> str:
-    """Return the command line of a verb for a run, with --recordings if its folder is not the default."""
-    words = ["dualtaxi", verb, run.run_id, *options]
-    root = run.folder.parent
-    if root.absolute() != recordings_folder().absolute():
-        words += ["--recordings", shlex.quote(os.fspath(root))]
-    return " ".join(words)
+    """Return the command line of a verb for a run."""
+    return command_in(run.folder.parent, verb, run.run_id, *options)
+
+
+def command_in(folder: Path, *words: str) -> str:
+    """Return a command line, with --recordings if the folder of runs is not the default."""
+    is_default = folder.absolute() == recordings_folder().absolute()
+    chosen = () if is_default else ("--recordings", shlex.quote(os.fspath(folder)))
+    return " ".join(("dualtaxi", *words, *chosen))

@@ -25,7 +25,7 @@ from runner.cli.output import Reply, console, facts, say
 from runner.cli.parameter_types import ConfigName
 from runner.cli.progress import seldom
 from runner.errors import ExitCode
-from runner.runs.run import recordings_folder
+from runner.runs.run import command_in, recordings_folder
 from runner.util.humanize import UNKNOWN, amount, duration, size
 from runner.util.values import checked_name
 
@@ -129,7 +129,9 @@ def run(
             planned=planned,
         )
     code = ExitCode.DIFFERENT if status.stopped or status.failed else ExitCode.OK
-    return _results(sweep, trials, status, ExitCode.INTERRUPTED if code and interrupt.came else code)
+    following = command_in(folder, "sweep", "show", sweep.name)
+    code = ExitCode.INTERRUPTED if code and interrupt.came else code
+    return _results(sweep, trials, status, following, code)
 
 
 @contextlib.contextmanager
@@ -194,7 +196,7 @@ def _range_text(parameter: Parameter) -> str:
     return f"{parameter.low:g} to {parameter.high:g}{kind}"
 
 
-def _results(sweep: Sweep, trials: Trials, status: SweepStatus, exit_code: int) -> Reply:
+def _results(sweep: Sweep, trials: Trials, status: SweepStatus, following: str, exit_code: int) -> Reply:
     from runner.analysis.compare.statistics import bounded
     from runner.sweep.results import objective_text, values_text
 
@@ -216,5 +218,5 @@ def _results(sweep: Sweep, trials: Trials, status: SweepStatus, exit_code: int) 
     notes = [f"Failed: trial {trial.number}, {error}" for trial in failed for error in trial.errors]
     if status.stopped:
         notes.append(f"Stopped: {status.stopped}. --resume continues from there.")
-    text = [rows | {"next": f"dualtaxi sweep show {sweep.name}"}]
+    text = [rows | {"next": following}]
     return Reply(values, text, notes=notes, exit_code=exit_code)
