@@ -104,6 +104,7 @@ class Input:
     label: str = ""
     """Label of the field; empty if the page has none."""
     placeholder: str = ""
+    """What an empty field says, or the choice of none of its values."""
     button: str = ""
     """Text of a button that sends the form with this flag."""
     values: tuple[str, ...] = ()
