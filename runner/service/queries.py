@@ -84,6 +84,7 @@ async def find_page(request: Request, search: SearchOf) -> Response:
         "given": asked,
         "problem": "",
         "found": None,
+        "left_out": (),
         "max_pictures": MAX_PICTURES,
     }
     try:
@@ -93,7 +94,8 @@ async def find_page(request: Request, search: SearchOf) -> Response:
             answer = await _answer(request, computed.find, *asked.values())
             found = TypeAdapter(Found).validate_json(answer)
             kept = link("", asked).removeprefix("?")
-            shown |= {"found": found, "links": [link(hit.replay, {"found": kept}) for hit in found.hits]}
+            links = [link(hit.replay, {"found": kept}) for hit in found.hits]
+            shown |= {"found": found, "left_out": found.left_out, "links": links}
     except RunnerError as error:
         shown["problem"] = error
     return Page("find.html", shown)

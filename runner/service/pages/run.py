@@ -150,7 +150,7 @@ async def archive(
 @acts.post("/film")
 async def film(run: RecordedRun, form: Form, compute: ComputationOf) -> Response:
     """Return a film of an episode as a download."""
-    return await files.film(run, compute, form.get("at", "").strip() or TYPICAL, form.get("ending", ""))
+    return await files.film(run, compute, form.get("at", "").strip() or TYPICAL, form.get("ending", ".mp4"))
 
 
 @router.get("/status")
