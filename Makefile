@@ -22,8 +22,10 @@ serve: $(VENV)/.installed-service  ## open the runs in the browser
 
 # By name: where pytest finds a plugin in a package by itself, as in `runner`, it compiles all modules of that package again.
 PLUGINS := $(addprefix -p ,xdist.plugin pytest_timeout _hypothesis_pytestplugin runner.golden.plugin)
-test: export PYTHONDONTWRITEBYTECODE :=  # the tests start hundreds of processes: compile modules for them once
-test: export OPENBLAS_NUM_THREADS := 1  # else NumPy starts a thread in each of them that waits busily
+# The tests start hundreds of processes: compile modules for them once.
+test: export PYTHONDONTWRITEBYTECODE :=
+# Else NumPy starts threads in each of them that wait busily.
+test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/.installed-dev  ## run all tests
 	$(BIN)/python -m pytest --disable-plugin-autoload $(PLUGINS) -n 3 --dist worksteal
 

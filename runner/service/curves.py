@@ -116,7 +116,7 @@ class ShownCurve:
 
 @dataclass(frozen=True)
 class AxisInfo:
-    """An axis that all of the runs have, or values that one of them logged."""
+    """An axis that all of the runs have, or logged values, which are none where they decrease."""
 
     name: str
     title: str

@@ -169,7 +169,7 @@ class PictureStreams:
             stream.thread.join(_JOIN_SECONDS)
 
     def open(self, key: Hashable, make: Make, start: int) -> PictureStream:
-        """Return a kept stream that has not passed step `start`, or a new one.
+        """Return a kept stream that comes to step `start` soon, or a new one.
 
         Raises:
             Busy: there are too many.
@@ -178,10 +178,10 @@ class PictureStreams:
             stream for stream in self._streams if stream.thread.is_alive() or stream.can_continue
         ]
         for stream in [stream for stream in self._streams if stream.key == key and stream.can_continue]:
-            if stream.next <= start:
+            if stream.next <= start <= stream.next + AHEAD:
                 stream.idle_since = None
                 return stream
-            self._close(stream)  # it would have to go back
+            self._close(stream)  # it would have to go back, or to draw much that nobody sees
         alive = [stream for stream in self._streams if stream.thread.is_alive()]
         if sum(not stream.is_closed for stream in alive) >= MAX_STREAMS:
             kept = [stream for stream in alive if stream.can_continue]

@@ -6,7 +6,6 @@ A process needs them for its first kernel, even for one from the cache; loading 
 from __future__ import annotations
 
 import contextlib
-import gc
 
 from numba.core.registry import cpu_target
 
@@ -15,4 +14,3 @@ import runner.learning  # noqa: F401 - keeps SciPy out of them
 with contextlib.suppress(AttributeError):  # internals of Numba, which may change
     cpu_target.typing_context.refresh()
     cpu_target.target_context.refresh()
-gc.freeze()  # no child searches what it shares with the others, nor does this process at its end

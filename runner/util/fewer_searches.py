@@ -1,6 +1,6 @@
-"""Import this module first where thousands of objects are created that stay, as by the imports of a process.
+"""Raise the threshold of Python's garbage collector; import this module first.
 
-Python then searches for cycles of objects that nobody uses after 50,000 new objects, instead of 700.
+Imports create many objects that stay, so Python searches them after 50,000 new objects instead of 700.
 """
 
 import gc

@@ -44,7 +44,9 @@ def find(
         "Maximum number of rows, 0 for all.  [default: 20]",
         kind=int,
         default=20,
+        maximum=1000,
         label="Show at most",
+        placeholder="0 to 1,000; 0 shows 1,000",
     ),
     mark: str | None = view_input(
         "mark", "Mark the first step of the episodes shown, as `dualtaxi mark` does.", metavar="TEXT"
@@ -122,8 +124,9 @@ VIEW: Final = View(
     find,
     subject="folders",
     button="Find",
-    lead="A condition on episodes. In functions of their steps, C is a condition on a step and V a value of "
-    "it: `reward`, `action`, `next_state`, `next_observation[0]`, or an event such as `collision`.",
+    lead="A condition on episodes. C and D are conditions on a step, and V is a value of a step: `reward`, "
+    "`t`, `action`, `state`, `next_state`, `next_observation[0]`, `extra.NAME`, `explored`, or an event such "
+    "as `collision` or `taxi_1.pickup`.",
     list_title="What the condition may contain",
     forms=("quiet", "json", "markdown"),
 )

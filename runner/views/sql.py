@@ -122,7 +122,8 @@ VIEW: Final = View(
     sql,
     subject="folders",
     button="Ask",
-    lead="One SELECT in the SQL of DuckDB. Each view has a column `run`; `DESCRIBE steps` lists columns.",
+    lead="One SELECT in the SQL of DuckDB. Each view has a column `run`; `DESCRIBE steps` lists the columns "
+    "of `steps`.",
     list_title="Views",
     forms=("csv", "json", "markdown"),
     file_ending=".parquet",

@@ -104,7 +104,7 @@ class Input:
     label: str = ""
     """Label of the field; empty if the page has none."""
     placeholder: str = ""
-    """What an empty field says, or the choice of none of its values."""
+    """Hint in an empty field; of one with values, the text for none of them."""
     button: str = ""
     """Text of a button that sends the form with this flag."""
     values: tuple[str, ...] = ()

@@ -73,10 +73,10 @@ function complain(text) {
 
 // --- data -----------------------------------------------------------------------------------------------
 
-// Return the query for curves over the axis.
+// Return the query for curves of the runs over the axis.
 function queryOf(values) {
   const axis = new URLSearchParams(location.search).get("axis") ?? USUAL.axis;
-  return add(new URLSearchParams([["axis", axis], ...new URLSearchParams(box.dataset.charts)]), values); // of the runs
+  return add(new URLSearchParams([["axis", axis], ...new URLSearchParams(box.dataset.charts)]), values);
 }
 
 async function draw() {
@@ -114,7 +114,7 @@ function show() {
   const metrics = Object.groupBy(last.curves, ({ metric }) => metric),
     hidden = remembered(HIDDEN),
     pinned = remembered(PINNED);
-  const names = Object.keys(metrics).sort((one, other) => pinned.has(other) - pinned.has(one)), // else as the server
+  const names = Object.keys(metrics).sort((one, other) => pinned.has(other) - pinned.has(one)), // pinned first, otherwise in the server's order
     left = names.filter((name) => hidden.has(name)),
     ranked = names.filter((name) => !hidden.has(name));
   for (const metric of ranked) plot(metric, metrics[metric], pinned.has(metric));
@@ -261,8 +261,8 @@ function options(unit, series, logX, logY, { place, key }) {
   };
   // To the only position where there is one: uPlot proposes an axis to twice that.
   const across = ({ data: [positions] }, low, high) => {
-    const [first, last] = positions.length > 1 ? [low, high] : [0, positions[0] || 1];
-    return [Number(fields.from.value || first), Number(fields.to.value || last)];
+    const [start, end] = positions.length > 1 ? [low, high] : [0, positions[0] || 1];
+    return [Number(fields.from.value || start), Number(fields.to.value || end)];
   };
   const whole = unit.startsWith("percent") ? 100 : null,
     ends = { min: { pad: 0.05, soft: 0, mode: 1 }, max: { pad: 0.05, soft: whole, mode: 1 } };
@@ -282,7 +282,11 @@ function options(unit, series, logX, logY, { place, key }) {
       { ...axis, size: (_, ticks) => 18 + 7.2 * Math.max(3, ...(ticks ?? []).map((text) => text.length)) },
     ],
     legend: { show: false },
-    cursor: { drag: { x: true, y: false, setScale: false }, sync: { key: "metrics", setSeries: false } },
+    cursor: {
+      drag: { x: true, y: false, setScale: false },
+      // The plots share the position of the cursor; a drag zooms once.
+      sync: { key: "metrics", setSeries: false, filters: { pub: (type) => !["mousedown", "mouseup"].includes(type) } },
+    },
     hooks: { setSelect: [zoom], setCursor: [(chart) => readOut(chart, key)] },
   };
 }

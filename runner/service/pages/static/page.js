@@ -45,6 +45,7 @@ const seen = new IntersectionObserver((entries) => {
 const overAxis = () => document.querySelectorAll("[data-over-axis]").forEach((place) => seen.observe(place));
 document.querySelectorAll("[data-later]:not([data-over-axis])").forEach(load);
 document.addEventListener("change", ({ target }) => target.name === "axis" && overAxis());
+addEventListener("popstate", overAxis);
 overAxis();
 
 // A part that changes is fetched repeatedly, until the whole page must be loaded again; of a list with ids only what

@@ -81,7 +81,10 @@ function picturesOf(root, at) {
       blocks.set(numberOf(start), block);
       if (head.problem) throw new Error(head.problem);
     } catch (error) {
-      if (error.name === "AbortError") return;
+      if (error.name === "AbortError") {
+        if (reading === own) reading = null;
+        return;
+      }
       for (let k = own.next; k < own.stop; k++) messages.set(k, error.message);
       if (error.status === 503) setTimeout(retry, 2500); // others are looking
     }
@@ -118,6 +121,7 @@ function picturesOf(root, at) {
   }
 
   addEventListener("pagehide", () => reading?.control.abort());
+  addEventListener("pageshow", more); // the browser may have kept the page
   more();
   return Object.assign(
     (k, display) => {
