@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import math
 import os
 import shutil
 from collections.abc import AsyncIterator
@@ -142,7 +141,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         )
         app.state.spooling = anyio.CapacityLimiter(1)
         app.state.sweep_processes = stack.enter_context(
-            ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=math.inf)
+            ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=None)
         )
         if any(sweeps_in(folder) for folder in settings.recordings):
             app.state.sweep_processes.submit(limits.work_seconds, load_sweep_libraries)

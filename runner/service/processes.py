@@ -13,14 +13,20 @@ import asyncio
 import contextlib
 import os
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import forkserver
 from typing import Final, Self, TypeVar, TypeVarTuple
 
 from runner.service.errors import Busy
-from runner.util.processes import CallFailed, ChildProcess, ProcessDied, process_context, starting_processes
+from runner.util.processes import (
+    CallFailed,
+    ChildProcess,
+    OutOfMemory,
+    ProcessDied,
+    process_context,
+    starting_processes,
+)
 
 Args = TypeVarTuple("Args")
 Result = TypeVar("Result")
@@ -57,6 +63,8 @@ loads `numpy.ma` only when a process needs it, as nearly all of these do.
 """
 
 
+KEEP_SECONDS: Final = 60.0
+"""How long a process may serve further calls, which need not wait for one to start."""
 _STOP_SECONDS: Final = 5.0
 """How long a process may take to end when nobody waits for its call any more."""
 
@@ -99,7 +107,7 @@ class ProcessPool:
         processes: how many run at the same time.
         seconds: the time limit of a call, after which its process is killed.
         memory_bytes: how much a call may allocate; not limited on Windows.
-        keep_seconds: how long after a call its process may serve the next one; 0 for a new one each time.
+        keep_seconds: how long after a call its process may serve the next one; see `ChildProcess`.
         max_waiting: how many calls may wait for a process; more are refused.
     """
 
@@ -108,7 +116,7 @@ class ProcessPool:
         processes: int,
         seconds: float,
         memory_bytes: int,
-        keep_seconds: float = 0.0,
+        keep_seconds: float | None = KEEP_SECONDS,
         max_waiting: int = 32,
     ) -> None:
         self._seconds = seconds
@@ -121,7 +129,7 @@ class ProcessPool:
         self._lock = threading.Lock()
         self._children: set[ChildProcess] = set()
         self._thread = threading.local()
-        """The process of each thread, as `child`, and the time of its last call, as `used`."""
+        """The process of each thread, as `child`."""
         self._closed = threading.Event()
 
     def __enter__(self) -> Self:
@@ -188,33 +196,29 @@ class ProcessPool:
     def _call(self, call: Callable[[ChildProcess], Result]) -> Result:
         """Return the result of a call in the process of this thread, or in a new one."""
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
-        if child is not None and time.monotonic() - self._thread.used < self._keep_seconds:
-            with contextlib.suppress(ProcessDied):  # perhaps while it was idle; a new process shows why
+        if child is not None:
+            with contextlib.suppress(
+                ProcessDied, OutOfMemory
+            ):  # perhaps of earlier calls: a new one shows why
                 return self._call_in(child, call)
-        elif child is not None:
-            self._end(child)
         return self._call_in(self._start(), call)
 
     def _call_in(self, child: ChildProcess, call: Callable[[ChildProcess], Result]) -> Result:
-        is_reusable = self._keep_seconds > 0
+        self._thread.child = child
         try:
             return call(child)
         except CallFailed:
-            is_reusable = False
+            del self._thread.child
+            self._end(child)
             if self._closed.is_set():
                 raise Busy("the service is stopping; try again when it was started again.") from None
             raise
-        finally:
-            if is_reusable:
-                self._thread.child, self._thread.used = child, time.monotonic()
-            else:
-                self._end(child)
 
     def _start(self) -> ChildProcess:
         if self._closed.is_set():
             raise Busy("the service is stopping; try again when it was started again.")
         try:
-            child = ChildProcess(self._memory_bytes, self._context)
+            child = ChildProcess(self._memory_bytes, self._context, keep_seconds=self._keep_seconds)
         except OSError as error:
             raise Busy(f"the system has no process for it ({error.strerror}); try again.") from error
         with self._lock:

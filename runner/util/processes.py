@@ -19,13 +19,14 @@ import threading
 import time
 import traceback
 import types
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from multiprocessing import process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
 from runner.errors import RunnerError
+from runner.util.files import is_installed
 from runner.util.humanize import size
 
 _RESERVE_BYTES: Final = 64 << 20
@@ -187,6 +188,8 @@ class ChildProcess:
         memory_bytes: how much its calls may allocate; not limited on Windows.
         on_progress: called with what functions pass to `report_progress`.
         hash_seed: makes it a fresh interpreter with this hash seed.
+        keep_seconds: how long it waits for its next call before it ends, as it does at once after a call
+            that imported modules of the user, whose files may change. By default it waits without end.
 
     Raises:
         OSError: the system cannot start another process.
@@ -198,6 +201,7 @@ class ChildProcess:
         context: Any = None,
         on_progress: Callable[[Any], None] = lambda _: None,
         hash_seed: int | None = None,
+        keep_seconds: float | None = None,
     ) -> None:
         self._memory_bytes = memory_bytes
         self._on_progress = on_progress
@@ -205,8 +209,8 @@ class ChildProcess:
             context = multiprocessing.get_context("spawn")
         context = context or process_context()
         self._pipe, theirs = context.Pipe()
-        variables = _own_variables()
-        self._process = context.Process(target=_serve, args=(theirs, memory_bytes, variables), daemon=True)
+        served = (theirs, memory_bytes, _own_variables(), keep_seconds)
+        self._process = context.Process(target=_serve, args=served, daemon=True)
         try:
             with starting_processes(with_main=False, hash_seed=hash_seed):
                 self._process.start()
@@ -317,7 +321,7 @@ def _own_variables() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name.startswith("DUALTAXI_")}
 
 
-def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str]) -> None:
+def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str], keep_seconds: float | None) -> None:
     """Call functions that come through a pipe, and send what they return, until it is closed."""
     for name in _own_variables():  # as they were when the fork server began
         del os.environ[name]
@@ -328,10 +332,24 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str]) -> None:
     # Temporary files are removed. A call in compiled code ends first: who stops it kills it after a while.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit())
     _limit_memory(memory_bytes)
+    path = list(sys.path)
+    before = set(sys.modules)
     with contextlib.suppress(EOFError, BrokenPipeError):
-        while True:
+        while pipe.poll(keep_seconds):
             function, args, keywords = pipe.recv()
             pipe.send(_outcome(function, args, keywords))
+            if keep_seconds is not None and (sys.path != path or _has_of_user(sys.modules.keys() - before)):
+                break
+
+
+def _has_of_user(names: Iterable[str]) -> bool:
+    """Return whether a module is neither this package's nor installed."""
+    files = [
+        getattr(sys.modules[name], "__file__", None)
+        for name in names
+        if name.partition(".")[0] not in ("runner", "dualtaxi")
+    ]
+    return not all(is_installed(file) for file in files if file)
 
 
 def _outcome(

@@ -37,8 +37,6 @@ MEMORY_BYTES: Final = 10**9
 """Memory limit of a check; the arrays of an environment may have 134 MB."""
 QUEUE_SECONDS: Final = 30.0
 """Time until a check that has not begun is refused."""
-KEEP_SECONDS: Final = 60.0
-"""How long a process may serve further checks: it keeps the environments that it has imported."""
 DEFAULT_SOURCE: Final = "job.yaml"
 """The name of a text that was submitted without one."""
 MAX_RUNS: Final = 10_000
@@ -117,7 +115,7 @@ class JobChecker:
 
     def __init__(self, recordings: Path) -> None:
         self._recordings = recordings
-        self._pool = ProcessPool(PROCESSES, CHECK_SECONDS, MEMORY_BYTES, KEEP_SECONDS)
+        self._pool = ProcessPool(PROCESSES, CHECK_SECONDS, MEMORY_BYTES)
         self.close = self._pool.close
 
     async def check(self, text: str, source: str = DEFAULT_SOURCE) -> CheckedJob:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import os
+import pkgutil
 import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from anyio import CapacityLimiter
 from starlette.requests import ClientDisconnect
@@ -20,6 +22,7 @@ from runner.service.errors import Busy
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.util.processes import OutOfMemory, ProcessDied, TimedOut
+from tests.waiting import until
 
 MEMORY = 256 << 20
 
@@ -77,18 +80,36 @@ def test_a_process_has_what_kernels_need_from_its_start(pool):
     assert not pool.submit(30, is_loaded, "scipy.linalg").result()
 
 
-def test_a_process_can_be_reused():
-    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
+def test_a_process_can_be_reused_until_it_was_idle_for_long():
+    with ProcessPool(1, 30, MEMORY) as pool:
         assert pool.submit(60, os.getpid).result() == pool.submit(60, os.getpid).result()
+    with ProcessPool(1, 30, MEMORY, keep_seconds=0.01) as pool:
+        first = pool.submit(60, os.getpid).result()
+        until(bool, lambda: not psutil.pid_exists(first))
+        assert pool.submit(60, os.getpid).result() != first
+
+
+def test_a_process_that_imported_a_module_of_the_user_reads_it_anew(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    with ProcessPool(1, 30, MEMORY) as pool:
+        for size in (10, 9):  # a file of another length, so Python does not take the old one from its cache
+            (tmp_path / "theirs.py").write_text("ones = " + "1" * size)
+            assert pool.submit(60, pkgutil.resolve_name, "theirs:ones").result() == int("1" * size)
+
+
+def test_a_call_for_which_a_reused_process_has_no_memory_left_gets_a_new_one():
+    with ProcessPool(1, 30, MEMORY) as pool:
+        pool.submit(60, exec, f"import sys; sys.kept = bytearray({MEMORY // 4 * 3})").result()
+        pool.submit(60, exec, f"bytearray({MEMORY // 2})").result()
 
 
 def test_calls_of_a_reused_process_leak_no_threads():
-    with ProcessPool(1, 30, MEMORY, keep_seconds=60) as pool:
+    with ProcessPool(1, 30, MEMORY) as pool:
         pool.submit(60, os.getpid).result()
         before = threading.active_count()
         for _ in range(20):
             pool.submit(60, os.getpid).result()
-        assert threading.active_count() <= before + 2  # a cancelled timer may still be ending
+        assert threading.active_count() <= before
 
 
 def fill_a_folder(noted):
