@@ -42,7 +42,7 @@ SWEEP = {
     "name": "small",
     "base": CONFIG | LONGER | {"name": "base"},
     "strategy": "tpe",
-    "trials": 8,
+    "trials": 6,
     "batch": 2,
     "parameters": {"step_size": {"low": 0.1, "high": 1.0}},
     "seeds": [0],
@@ -120,7 +120,7 @@ def test_a_new_server_waits_for_a_worker_that_has_not_stopped_yet(tmp_path, undi
 
 
 def test_a_stopped_server_leaves_its_job_resumable_and_ends_event_streams(tmp_path):
-    config = CONFIG | {"evaluation": {"every": 100, "trials": 3500}, "recording": {"steps": "none"}}
+    config = CONFIG | {"evaluation": {"every": 100, "trials": 2500}, "recording": {"steps": "none"}}
     with Served(tmp_path, "--workers", "1") as server:
         server.post("/jobs", json.dumps(config))
         server.until(is_under_way)
@@ -189,7 +189,7 @@ def test_a_killed_sweep_ends_as_if_it_never_was(tmp_path):
         server.kill()
         server.start()  # at once, while the old sweep still closes its recordings
         server.until(are_finished)
-    assert len(list_runs(killed)) == len(tried(calm)) == 8
+    assert len(list_runs(killed)) == len(tried(calm)) == 6
     assert tried(killed) == tried(calm)
 
 

@@ -30,8 +30,8 @@ for module in ("ray", "aiohttp_cors"):  # the second is of `ray[default]`, which
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future defaults and open files
 
-LONG = ENDLESS | {"name": "long", "episodes": 16_000, "seeds": [0]}
-"""Eight seconds."""
+LONG = ENDLESS | {"name": "long", "episodes": 10_000, "seeds": [0]}
+"""Five seconds."""
 SWEEP = {
     "name": "small",
     "base": ICY | {"name": "base", "seeds": [0]},
