@@ -162,13 +162,13 @@ def maps(path: Path, state: Sequence[str] = ()) -> bytes:
     with open_recording(path) as recording:
         form, number = "", 0
         if recording.tabular and svg.drawing_of(recording.mdp) is not None:
-            problem = ""
+            problems = []
             number = start_of(recording, EpisodeRef.parse(TYPICAL))
             try:
                 number = state_of(recording.mdp, ", ".join(state)) if state else number
             except ConfigError:
-                problem = f"There is no state with {shortened(', '.join(state), 200)}."
-            form = partials().situation(situations(recording.mdp, number), problem)
+                problems.append(f"There is no state with {shortened(', '.join(state), 200)}.")
+            form = partials().situation(situations(recording.mdp, number), problems)
         section = replace(learned_section(recording, number), title="")
         return f"<h2>What was learned</h2>{form}{partials().answer([section])}".encode()
 

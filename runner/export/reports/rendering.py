@@ -70,6 +70,7 @@ def environment_of(folders: Sequence[Traversable]) -> Environment:
     filters: dict[str, Callable[..., str]] = {
         "number": humanize.number,
         "count": lambda value: humanize.number(value, 0),
+        "counted": humanize.counted,
         "code": code,
         "duration": humanize.duration,
         "sentence": humanize.sentence,

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from itertools import islice
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, Query, Response
 from fastapi.responses import RedirectResponse
@@ -108,18 +108,17 @@ async def chosen_replay(
     run: RecordedRun,
     compute: ComputationOf,
     catalogue: CatalogueOf,
-    phase: Literal["train", "eval"] | None = None,
-    episode: str = "",
+    episode: str | None = None,
     after: str = "",
     trial: str = "",
     at: At = "",
 ) -> Response:
-    """Redirect to the step `at`, to the episode that a form names, or to a typical one."""
+    """Redirect to the step `at`, to the episode or trial that a form names, or to a typical one."""
     reference = at or TYPICAL
-    if phase == "train":
-        reference = episode or "0"
-    elif phase == "eval" and after:
+    if after:
         reference = f"eval:{after}:{trial or 0}"
+    elif episode is not None:
+        reference = episode or "0"
     try:
         step = await step_of(run, compute, reference)
     except RunnerError as error:

@@ -330,8 +330,8 @@ def test_pages_take_every_reference_to_a_step(client, recordings):
 @pytest.mark.parametrize(
     "address",
     [
-        "/runs/first/replay?phase=train&episode=x",
-        "/runs/first/replay?phase=eval&after=60&trial=-1",
+        "/runs/first/replay?episode=x",
+        "/runs/first/replay?after=60&trial=-1",
         "/runs/first/replay?at=step:999999",
         "/compare/replay?run=first&run=second&at=x",
     ],
@@ -339,16 +339,16 @@ def test_pages_take_every_reference_to_a_step(client, recordings):
 def test_a_replay_that_there_is_not_keeps_tabs_and_form(client, address):
     answer = client.get(address, headers=ACCEPT_HTML)
     assert answer.status_code in (400, 404)
-    for part in ('<form class="episode-form"', 'class="tabs"', 'class="problem"'):
+    for part in ('<div class="episode-forms"', 'class="tabs"', 'class="problem"'):
         assert part in answer.text
 
 
 def test_the_fields_of_a_replay_lead_to_an_episode(client):
     for query, path in (
-        ("phase=train&episode=5", "train/5"),
-        ("phase=train", "train/0"),
-        ("phase=eval&after=60&trial=2", "eval/60/2"),
-        ("phase=eval&after=60", "eval/60/0"),
+        ("episode=5", "train/5"),
+        ("episode=", "train/0"),
+        ("trial=2&after=60", "eval/60/2"),
+        ("trial=&after=60", "eval/60/0"),
     ):
         answer = client.get(f"/runs/first/replay?{query}", follow_redirects=False)
         assert answer.headers["location"].endswith(f"/replay/{path}")

@@ -204,8 +204,7 @@ function figureOf(metric, title) {
     [heading, place, key, tools] = figure.children,
     [name, caption] = heading.children,
     [pin, hide, picture, table] = tools.children;
-  for (const tool of [pin, hide]) tool.setAttribute("aria-label", `${tool.textContent} ${title}`);
-  for (const tool of [picture, table]) tool.setAttribute("aria-label", `${title} as ${tool.textContent}`);
+  for (const tool of tools.children) tool.setAttribute("aria-label", `${tool.textContent}: ${title}`);
   pin.onclick = () => remember(PINNED, metric);
   hide.onclick = () => remember(HIDDEN, metric);
   picture.download = `${metric}.svg`;

@@ -7,7 +7,7 @@ const search = document.querySelector("[data-focus]");
 function update() {
   const button = form.querySelector("[data-compare]"),
     boxes = [...form.querySelectorAll("tbody input:checked")],
-    count = boxes.reduce((runs, box) => runs + Number(box.dataset.runs ?? 1), 0);
+    count = boxes.reduce((runs, box) => runs + Number(box.dataset.runs), 0);
   button.disabled = count < 2;
   button.textContent = count < 2 ? "Select two or more runs to compare" : `Compare ${count} runs`;
 }
