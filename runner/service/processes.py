@@ -197,9 +197,8 @@ class ProcessPool:
         """Return the result of a call in the process of this thread, or in a new one."""
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
         if child is not None:
-            with contextlib.suppress(
-                ProcessDied, OutOfMemory
-            ):  # perhaps of earlier calls: a new one shows why
+            # It may have ended while it was idle, or be full of earlier calls; a new one shows why.
+            with contextlib.suppress(ProcessDied, OutOfMemory):
                 return self._call_in(child, call)
         return self._call_in(self._start(), call)
 
