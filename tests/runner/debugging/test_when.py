@@ -121,7 +121,9 @@ class History:
         return [(state,) for state in self.states] + list(itertools.product(self.states, actions))
 
     def _delivers(self, state: int) -> bool:
-        for _ in range(self.mdp.step_limit):
+        seen = set()  # who comes back walks in a circle
+        while state not in seen and len(seen) < self.mdp.step_limit:
+            seen.add(state)
             action = self.twin._joint([self.twin._greedy(i, state) for i in range(self.twin.learners)])
             if self.mdp.events[state, action, 0] & self.mdp.success_mask:
                 return True
