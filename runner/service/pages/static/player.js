@@ -64,11 +64,15 @@ function picturesOf(root, at) {
   }
 
   async function read(start) {
-    const steps = blocks.size ? BLOCK - (start % BLOCK) : 1,
-      own = { next: start, stop: start + steps, control: new AbortController() };
+    let stop = start + 1;
+    if (blocks.size) {
+      while (stop % BLOCK && !addressOf(stop)) stop++;
+      if (stop % BLOCK) while (start % BLOCK && !addressOf(start - 1)) start--; // a user who steps back
+    }
+    const own = { next: start, stop, control: new AbortController() };
     reading = own;
     try {
-      const response = await request(`${source}?start=${start}&steps=${steps}`, { signal: own.control.signal });
+      const response = await request(`${source}?start=${start}&steps=${stop - start}`, { signal: own.control.signal });
       const body = await response.arrayBuffer(),
         begin = 4 + new DataView(body).getUint32(0),
         head = JSON.parse(new TextDecoder().decode(body.slice(4, begin)));
