@@ -214,20 +214,19 @@ def _problem(mixing: Mixing, mixture: int) -> RunnerError | None:
         config = mixing.config(mixture)
     except ConfigError as error:
         return error
-    return _environment_problem(
-        config.env.id, json.dumps(config.to_mapping()["env"]["kwargs"], sort_keys=True), config.rewards
-    )
-
-
-@cache
-def _environment_problem(env_id: str, kwargs: str, rewards: str) -> RunnerError | None:
-    from runner.environments.loading import load_mdp
-
+    kwargs = json.dumps(config.to_mapping()["env"]["kwargs"], sort_keys=True)
     try:
-        load_mdp(env_id, json.loads(kwargs), rewards)
+        _require_environment(config.env.id, kwargs, config.rewards)
     except (ConfigError, EnvironmentNotUsable) as error:
         return error
     return None
+
+
+@cache
+def _require_environment(env_id: str, kwargs: str, rewards: str) -> None:
+    from runner.environments.loading import load_mdp
+
+    load_mdp(env_id, json.loads(kwargs), rewards)
 
 
 def _branches(value: object) -> str:

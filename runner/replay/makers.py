@@ -43,7 +43,13 @@ from runner.replay.trust import (
     why_not_imported,
 )
 from runner.runs.trust_marks import own_mark
-from runner.util.processes import CallFailed, ChildProcess, TimedOut, raise_if_out_of_memory
+from runner.util.processes import (
+    CallFailed,
+    ChildProcess,
+    TimedOut,
+    end_after_call,
+    raise_if_out_of_memory,
+)
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -349,7 +355,8 @@ def _quietly(function: Callable[..., None], *arguments: object, **keywords: obje
 
 
 def silence() -> None:
-    """Leave out what environments print, in a child process."""
+    """Leave out what environments print, in a child process, which therefore ends after its call."""
+    end_after_call()
     warnings.simplefilter("ignore")
     with open(os.devnull, "wb") as nothing:  # noqa: PTH123 - a device
         for stream in (1, 2):

@@ -107,11 +107,11 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> Records:
             f"{recording.path}: {phase} episode {episode} has {len(steps):,} steps, too many to rerun for "
             f"an array; `dualtaxi rerecord {recording.run_id}` records them."
         )
-    return _whole_steps(recording.path, recording.file.size, phase, episode)
+    return _whole_steps(recording.path, recording.path.stat().st_mtime_ns, phase, episode)
 
 
 @lru_cache(4)
-def _whole_steps(path: Path, _size: int, phase: str, episode: int) -> Records:
+def _whole_steps(path: Path, _changed: int, phase: str, episode: int) -> Records:
     from runner.replay.environment import rerun_in_child  # loads Gymnasium
 
     with open_recording(path) as recording:

@@ -43,7 +43,7 @@ API: Final = "/api/v1"
 THREADS: Final = 8
 """Requests that are worked on at the same time; the others wait."""
 PROCESSES: Final = 2
-"""Comparisons, plots and exports that are computed at the same time, each in a process of its own."""
+"""Comparisons, plots and exports that are computed at the same time, in as many processes."""
 MIN_FREE_BYTES: Final = 100_000_000
 """Free disk space below which the service is not ready: it could not store a recording."""
 

@@ -1,4 +1,4 @@
-"""What every process would do first, done: the process that others are forked from imports this module last.
+"""Work that every process needs, done once: the process that others are forked from imports this module last.
 
 That is loading Numba's rules of compilation, which it needs for its first kernel, even for one from the cache
 (0.3 s), and compiling the template of answers (0.05 s).

@@ -14,7 +14,7 @@ import contextlib
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from multiprocessing import forkserver
 from typing import Final, Self, TypeVar, TypeVarTuple
 
@@ -64,7 +64,7 @@ loads `numpy.ma` only when a process needs it, as nearly all of these do.
 
 
 KEEP_SECONDS: Final = 60.0
-"""How long a process may serve further calls, which need not wait for one to start."""
+"""How long an idle process waits for its next call, which then need not wait for one to start."""
 _STOP_SECONDS: Final = 5.0
 """How long a process may take to end when nobody waits for its call any more."""
 
@@ -75,29 +75,44 @@ def lower_priority() -> None:
         os.nice(5)
 
 
-class _Doing:
-    """A call that may be stopped, from when its process begins it."""
+class _Call:
+    """A call that may be stopped, before and while a process does it."""
 
-    _child: ChildProcess | None = None
-    _is_stopped = False
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._child: ChildProcess | None = None
+        self._is_stopped = False
 
-    def by(self, child: ChildProcess) -> ChildProcess:
-        """Note which process does it; return the process."""
-        self._child = child
-        if self._is_stopped:
-            child.stop()
-        return child
+    def by(
+        self, child: ChildProcess, function: Callable[[*Args], Result], seconds: float, *args: *Args
+    ) -> Result:
+        """Return what a function returns in a process; `CancelledError` if it was stopped."""
+        with self._lock:
+            if self._is_stopped:
+                raise CancelledError
+            self._child = child
+        try:
+            return child.call(function, seconds, *args)
+        except ProcessDied:
+            if self._is_stopped:
+                raise CancelledError from None
+            raise
+        finally:
+            with self._lock:
+                self._child = None  # which may serve the next call now
 
     def stop(self) -> None:
-        """Have its process remove its temporary files and end."""
-        self._is_stopped = True
-        if self._child is not None:
-            self._child.stop()
+        """Have its process, if it has one, remove its temporary files and end."""
+        with self._lock:
+            self._is_stopped = True
+            if self._child is not None:
+                self._child.stop()
 
     def kill(self) -> None:
-        """Kill its process, if that has not ended."""
-        if self._child is not None:
-            self._child.kill()
+        """Kill its process, if it has one."""
+        with self._lock:
+            if self._child is not None:
+                self._child.kill()
 
 
 class ProcessPool:
@@ -159,17 +174,17 @@ class ProcessPool:
 
         Arguments and errors are as for `submit`; by default it has the time of the pool.
         """
-        doing = _Doing()
+        call = _Call()
         limit = seconds or self._seconds
-        future = self._submit(lambda child: doing.by(child).call(function, limit, *args))
+        future = self._submit(lambda child: call.by(child, function, limit, *args))
         waiting = asyncio.wrap_future(future)
         try:
             return await asyncio.shield(waiting)
         except asyncio.CancelledError:
             if not future.cancel():
-                doing.stop()
+                call.stop()
                 if not (await asyncio.wait({waiting}, timeout=_STOP_SECONDS))[0]:
-                    doing.kill()
+                    call.kill()
             waiting.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody asks
             raise
 
@@ -197,7 +212,7 @@ class ProcessPool:
         """Return the result of a call in the process of this thread, or in a new one."""
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
         if child is not None:
-            # It may have ended while it was idle, or be full of earlier calls; a new one shows why.
+            # It may have ended while it was idle, or have too little memory left after earlier calls.
             with contextlib.suppress(ProcessDied, OutOfMemory):
                 return self._call_in(child, call)
         return self._call_in(self._start(), call)

@@ -42,7 +42,7 @@ from runner.service.processes import ProcessPool, lower_priority
 from runner.service.settings import ServiceLimits, without_folders
 from runner.service.tokens import Digest
 from runner.util.files import hash_of, require_room, storage_errors, write_all, write_object
-from runner.util.processes import CallFailed
+from runner.util.processes import CallFailed, end_after_call
 
 FOLDER: Final = ".uploads"
 STATE_FILE: Final = "upload.json"
@@ -322,12 +322,13 @@ class Uploads:
 
 
 def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
-    """Return an upload that has become a run, or its checkpoint; for a process of its own.
+    """Return an upload that has become a run, or its checkpoint; in a process that ends after it.
 
     Raises:
         StorageError: the disk prevents it for now.
         RunnerError: it can never be a run.
     """
+    end_after_call()
     lower_priority()
     with contextlib.suppress(AttributeError):  # not on Windows
         # A signal to stop may go to all processes of the service, which then kills this one itself: its end

@@ -66,12 +66,19 @@ _RESTARTS: Final = 3
 _RESTART_SECONDS: Final = 0.1
 """Time in which the system learns that a fork server was killed."""
 _pipe_to_parent: Any = None
+_must_end = False
 _starting: Final = threading.Lock()
 
 
 def report_progress(value: object) -> None:
     """Pass a value to the caller's `on_progress`; for functions that are called in a child process."""
     _pipe_to_parent.send(("progress", value))
+
+
+def end_after_call() -> None:
+    """Have a child process end after its call, which leaves traces in it that the next one must not meet."""
+    global _must_end  # noqa: PLW0603 - of the whole process
+    _must_end = True
 
 
 @contextlib.contextmanager
@@ -188,8 +195,9 @@ class ChildProcess:
         memory_bytes: how much its calls may allocate; not limited on Windows.
         on_progress: called with what functions pass to `report_progress`.
         hash_seed: makes it a fresh interpreter with this hash seed.
-        keep_seconds: how long it waits for its next call before it ends, as it does at once after a call
-            that imported modules of the user, whose files may change. By default it waits without end.
+        keep_seconds: how long it waits for its next call before it ends. It ends at once after a call that
+            imported modules of the user, whose files may change, or called `end_after_call`. By default it
+            serves all calls, and waits without end.
 
     Raises:
         OSError: the system cannot start another process.
@@ -209,8 +217,8 @@ class ChildProcess:
             context = multiprocessing.get_context("spawn")
         context = context or process_context()
         self._pipe, theirs = context.Pipe()
-        served = (theirs, memory_bytes, _own_variables(), keep_seconds)
-        self._process = context.Process(target=_serve, args=served, daemon=True)
+        arguments = (theirs, memory_bytes, _own_variables(), keep_seconds)
+        self._process = context.Process(target=_serve, args=arguments, daemon=True)
         try:
             with starting_processes(with_main=False, hash_seed=hash_seed):
                 self._process.start()
@@ -301,12 +309,14 @@ class ChildProcess:
     def stop(self) -> None:
         """Have the process end as by `sys.exit`, while another thread may be waiting for it."""
         with contextlib.suppress(ValueError):  # closed meanwhile
-            self._process.terminate()
+            if self._process.is_alive():  # else another one may have its number
+                self._process.terminate()
 
     def kill(self) -> None:
         """Kill the process, while another thread may be waiting for it."""
-        with contextlib.suppress(ValueError):  # closed meanwhile
-            self._process.kill()
+        with contextlib.suppress(ValueError):
+            if self._process.is_alive():
+                self._process.kill()
 
     def end(self) -> None:
         """Kill the process and release its resources."""
@@ -338,15 +348,17 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str], keep_seco
         while pipe.poll(keep_seconds):
             function, args, keywords = pipe.recv()
             pipe.send(_outcome(function, args, keywords))
-            if keep_seconds is not None and (sys.path != path or _has_of_user(sys.modules.keys() - before)):
+            is_changed = _must_end or sys.path != path or _are_of_user(sys.modules.keys() - before)
+            if is_changed and keep_seconds is not None:
                 break
+    pipe.close()  # the process may live on, if a module of the user has started a thread
 
 
-def _has_of_user(names: Iterable[str]) -> bool:
-    """Return whether a module is neither this package's nor installed."""
+def _are_of_user(modules: Iterable[str]) -> bool:
+    """Return whether any of these modules is neither this package's nor installed."""
     files = [
         getattr(sys.modules[name], "__file__", None)
-        for name in names
+        for name in modules
         if name.partition(".")[0] not in ("runner", "dualtaxi")
     ]
     return not all(is_installed(file) for file in files if file)

@@ -97,6 +97,38 @@ def test_a_process_that_imported_a_module_of_the_user_reads_it_anew(tmp_path, mo
             assert pool.submit(60, pkgutil.resolve_name, "theirs:ones").result() == int("1" * size)
 
 
+def test_a_process_that_must_end_does_so_although_a_thread_of_the_user_runs_on(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    source = "import threading, time; threading.Thread(target=time.sleep, args=(600,)).start(); ok = True"
+    (tmp_path / "threaded.py").write_text(source)
+    with ProcessPool(1, 30, MEMORY) as pool:
+        assert pool.submit(60, pkgutil.resolve_name, "threaded:ok").result()
+        assert pool.submit(5, os.getpid).result()
+
+
+@pytest.mark.parametrize("name", ["runner.replay.makers:silence", "runner.util.processes:end_after_call"])
+def test_a_call_that_leaves_traces_is_the_last_of_its_process(name):
+    with ProcessPool(1, 30, MEMORY) as pool:
+        before = pool.submit(60, os.getpid).result()
+        pool.submit(60, pkgutil.resolve_name(name)).result()
+        assert pool.submit(60, os.getpid).result() != before
+
+
+def test_a_late_cancel_stops_nobody_elses_call(tmp_path):
+    async def calls(pool):
+        for _ in range(20):
+            hasty = asyncio.create_task(pool(os.getpid))
+            await asyncio.sleep(0.001)
+            patient = asyncio.create_task(pool(append_and_wait, str(tmp_path / "begun")))
+            await asyncio.sleep(0)
+            hasty.cancel()
+            await patient
+
+    with ProcessPool(1, 30, MEMORY) as pool:
+        asyncio.run(calls(pool))
+    assert (tmp_path / "begun").read_text() == "x" * 20
+
+
 def test_a_call_for_which_a_reused_process_has_no_memory_left_gets_a_new_one():
     with ProcessPool(1, 30, MEMORY) as pool:
         pool.submit(60, exec, f"import sys; sys.kept = bytearray({MEMORY // 4 * 3})").result()
@@ -110,6 +142,12 @@ def test_calls_of_a_reused_process_leak_no_threads():
         for _ in range(20):
             pool.submit(60, os.getpid).result()
         assert threading.active_count() <= before
+
+
+def append_and_wait(path):
+    with open(path, "a", encoding="utf-8") as file:  # noqa: PTH123
+        file.write("x")
+    time.sleep(0.02)
 
 
 def fill_a_folder(noted):

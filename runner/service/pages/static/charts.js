@@ -65,7 +65,7 @@ function remember(kind, metric) {
   }
 }
 
-// Notes on what is drawn stand below the charts, which therefore stay where they are; an error stands above them.
+// Notes stand below the charts, so these stay where they are; an error stands above.
 function complain(text) {
   message.textContent = text;
   plots.prepend(message);
@@ -114,7 +114,7 @@ function show() {
   const metrics = Object.groupBy(last.curves, ({ metric }) => metric),
     hidden = remembered(HIDDEN),
     pinned = remembered(PINNED);
-  const names = Object.keys(metrics).sort((one, other) => pinned.has(other) - pinned.has(one)), // pinned first, otherwise in the server's order
+  const names = Object.keys(metrics).sort((one, other) => pinned.has(other) - pinned.has(one)), // pinned ones first
     left = names.filter((name) => hidden.has(name)),
     ranked = names.filter((name) => !hidden.has(name));
   for (const metric of ranked) plot(metric, metrics[metric], pinned.has(metric));

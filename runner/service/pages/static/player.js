@@ -35,7 +35,7 @@ export function listen(bar) {
 //
 // A block is the length of its head (32 bits, big-endian), the head as JSON, and the pictures: `sizes` has their bytes,
 // `shown` the number of the picture at each step, `last` the last step of the episode, `note` a sentence on all
-// pictures, `problem` the reason why there are no further ones. Blocks end at multiples of 64 steps, so that a browser
+// pictures, `problem` the reason why there are no further ones. Most end at multiples of 64 steps, so that a browser
 // finds them in its cache; the first has only the picture that is shown.
 function picturesOf(root, at) {
   const source = root.dataset.pictures;
@@ -67,7 +67,8 @@ function picturesOf(root, at) {
     let stop = start + 1;
     if (blocks.size) {
       while (stop % BLOCK && !addressOf(stop)) stop++;
-      if (stop % BLOCK) while (start % BLOCK && !addressOf(start - 1)) start--; // a user who steps back
+      // Where later pictures are known, the user steps back.
+      while (stop % BLOCK && stop - start < 16 && start % BLOCK && !addressOf(start - 1)) start--;
     }
     const own = { next: start, stop, control: new AbortController() };
     reading = own;
