@@ -27,6 +27,7 @@ test: export PYTHONDONTWRITEBYTECODE :=
 # Else NumPy starts threads in each of them that wait busily.
 test: export OPENBLAS_NUM_THREADS := 1
 test: $(VENV)/.installed-dev  ## run all tests
+	@$(BIN)/python -m compileall -q -j 0 dualtaxi runner
 	$(BIN)/python -m pytest --disable-plugin-autoload $(PLUGINS) -n 3 --dist worksteal
 
 test-integrations: $(VENV)-integrations/.installed  ## test the adapters against the real libraries (8 GB of them)
