@@ -63,37 +63,42 @@ def version() -> Version | None:
 def open_index(report: Tell) -> sqlite3.Connection:
     """Open the index; create it first if it is missing, foreign or of another version."""
     path = index_path()
-    if not path.exists():
-        renew()
     for _ in range(2):
+        if (seen := identity()) is None:
+            renew(None)
+            seen = identity()
         database = _connected(os.fspath(path))
         pragmas = [pragma(database, name) for name in ("application_id", "user_version")]
         if pragmas == [_APPLICATION, _VERSION]:
             return database
         database.close()
         report(f"The index {path} is of another version; it is rebuilt.")
-        renew()
+        renew(seen)
     raise OSError("another process keeps replacing it")
 
 
-def renew() -> None:
-    """Replace the index by an empty one, unless another process just did."""
+def renew(seen: tuple[int, int] | None) -> None:
+    """Replace the index by an empty one, unless another process did since it was seen.
+
+    Args:
+        seen: its identity before it was found to be unusable; None if there was none.
+    """
     from filelock import FileLock
 
     path = index_path()
     path.parent.mkdir(parents=True, exist_ok=True)
-    before = _identity(path)
     with FileLock(path.with_suffix(".lock"), timeout=_BUSY_SECONDS):
-        if _identity(path) != before:
+        if identity() != seen:
             return
         with replacing(path) as fresh:
             create(os.fspath(fresh)).close()
             path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
+def identity() -> tuple[int, int] | None:
+    """Return what tells the file of the index from one that replaces it; None if there is no index."""
     with contextlib.suppress(OSError):
-        facts = path.stat()
+        facts = index_path().stat()
         return facts.st_ino, facts.st_ctime_ns
     return None
 

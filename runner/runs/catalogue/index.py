@@ -19,6 +19,7 @@ from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, ColumnKind, IndexRow, field_of, with_same_as
 from runner.runs.catalogue.database import (
     create,
+    identity,
     index_path,
     open_index,
     pragma,
@@ -280,7 +281,7 @@ def look(
     for place in places:
         check_folder_name(place)
     for _ in range(2):
-        before = version()
+        before, seen = version(), identity()
         try:
             with contextlib.closing(open_index(report)) as database:
                 if cached and before is not None and before.file == (version() or before).file:
@@ -288,11 +289,13 @@ def look(
                         return work(CatalogueIndex(database, places))
                 return _look(database, places, work, quick, rebuild)
         except (sqlite3.OperationalError, OSError) as error:
+            if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_READONLY_DBMOVED:
+                continue  # another process replaced it
             report(f"The index {index_path()} cannot be used ({error}); the folders are read without it.")
             break
         except sqlite3.DatabaseError as error:
             report(f"The index {index_path()} is damaged ({error}); it is rebuilt.")
-            renew()
+            renew(seen)
             cached = False
     with contextlib.closing(create(":memory:")) as database:
         return _look(database, places, work, quick, rebuild)

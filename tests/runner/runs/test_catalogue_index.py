@@ -115,6 +115,23 @@ def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, reco
     assert json.loads(whole["settings"]) == json.loads(alone["settings"])
 
 
+def test_an_index_that_another_process_replaces_is_opened_again(folder, monkeypatch):
+    made = [create_run(folder, CONFIG, seed).run_id for seed in range(2)]
+    ids(folder)
+    made.append(create_run(folder, CONFIG, 2).run_id)
+    differences = Folders.differences
+
+    def replaced_first(self):
+        monkeypatch.setattr(Folders, "differences", differences)
+        index_path().unlink()
+        return differences(self)
+
+    monkeypatch.setattr(Folders, "differences", replaced_first)
+    found, messages = rows(folder)
+    assert ({row["id"] for row in found}, messages) == (set(made), [])
+    assert index_path().exists()
+
+
 def test_the_index_is_never_needed(folder):
     runs = [create_run(folder, CONFIG, seed) for seed in range(3)]
     change_labels(runs[1].folder, lambda _: Labels("patient", ("keep",), "why"))
