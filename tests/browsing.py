@@ -24,7 +24,8 @@ ARGUMENTS: Final = (
 
 def chromium_programs() -> tuple[str | None, str | None]:
     """Return the paths of Chromium and its driver; skip the test where they are not installed."""
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
+    names = ("chromium-headless-shell", "chromium", "chromium-browser")  # the first needs a fifth less time
+    program = next(filter(None, map(shutil.which, names)), None)
     driver = shutil.which("chromedriver")
     if (program is None or driver is None) and "DUALTAXI_CI" not in os.environ:
         pytest.skip("needs Debian's chromium and chromium-driver")
