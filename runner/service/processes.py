@@ -83,7 +83,7 @@ class _Call:
         self._child: ChildProcess | None = None
         self._is_stopped = False
 
-    def by(
+    def run_in(
         self, child: ChildProcess, function: Callable[[*Args], Result], seconds: float, *args: *Args
     ) -> Result:
         """Return what a function returns in a process; `CancelledError` if it was stopped."""
@@ -176,7 +176,7 @@ class ProcessPool:
         """
         call = _Call()
         limit = seconds or self._seconds
-        future = self._submit(lambda child: call.by(child, function, limit, *args))
+        future = self._submit(lambda child: call.run_in(child, function, limit, *args))
         waiting = asyncio.wrap_future(future)
         try:
             return await asyncio.shield(waiting)

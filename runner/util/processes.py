@@ -348,13 +348,14 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str], keep_seco
         while pipe.poll(keep_seconds):
             function, args, keywords = pipe.recv()
             pipe.send(_outcome(function, args, keywords))
-            is_changed = _must_end or sys.path != path or _are_of_user(sys.modules.keys() - before)
-            if is_changed and keep_seconds is not None:
+            if keep_seconds is not None and (
+                _must_end or sys.path != path or _any_of_user(sys.modules.keys() - before)
+            ):
                 break
     pipe.close()  # the process may live on, if a module of the user has started a thread
 
 
-def _are_of_user(modules: Iterable[str]) -> bool:
+def _any_of_user(modules: Iterable[str]) -> bool:
     """Return whether any of these modules is neither this package's nor installed."""
     files = [
         getattr(sys.modules[name], "__file__", None)

@@ -12,6 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
+from runner.service.processes import PRELOADED
+from runner.util.processes import process_context
 from tests.browsing import chromium
 from tests.inventory.comparing import ADVICE, differences, gone_pattern, read, write
 from tests.inventory.taking import FILES, Shop, screenshots
@@ -23,6 +25,7 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write the inventory")
     parser.add_argument("--screenshots", type=Path, metavar="FOLDER", help="write pictures of every page")
     options = parser.parse_args()
+    process_context(PRELOADED)  # as the service does it; else each child of a command imports them itself
     problems, gone = [], gone_pattern()
     with tempfile.TemporaryDirectory() as folder, Shop(Path(folder)) as shop, chromium() as browser:
         if options.screenshots:
