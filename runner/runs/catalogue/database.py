@@ -77,7 +77,7 @@ def open_index(report: Tell) -> sqlite3.Connection:
     raise OSError("another process keeps replacing it")
 
 
-def renew(seen: tuple[int, int] | None) -> None:
+def renew(seen: int | None) -> None:
     """Replace the index by an empty one, unless another process did since it was seen.
 
     Args:
@@ -95,11 +95,10 @@ def renew(seen: tuple[int, int] | None) -> None:
             path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
 
 
-def identity() -> tuple[int, int] | None:
+def identity() -> int | None:
     """Return what tells the file of the index from one that replaces it; None if there is no index."""
     with contextlib.suppress(OSError):
-        facts = index_path().stat()
-        return facts.st_ino, facts.st_ctime_ns
+        return index_path().stat().st_ino
     return None
 
 
