@@ -19,4 +19,5 @@ INLINED: Final = {
 inlined = numba.njit(**INLINED)
 """Compiles a function that takes arrays and is called by loops alone. LLVM inlines it; if Numba did so first
 (`inline="always"`), a loop would be as fast and take two to four times as long to compile. Cached, so that
-loops of another algorithm, in another process, take half as long to compile."""
+loops of another algorithm, in another process, take half as long to compile. A literal argument, such as 0,
+has a type of its own, for which all is compiled again; `np.int64(0)` has that of any number."""

@@ -87,10 +87,19 @@ an algorithm that chooses ahead the joint action to take there, and which learne
 
 @inlined
 def _start_state(model: Model, bits: np.uint64) -> int:
-    """Return the start state that these bits select."""
-    return Index(
-        model.start_states[np.searchsorted(model.start_cumulative, draws.uniform(bits), side="right")]
-    )
+    """Return the start state that these bits select.
+
+    For `np.searchsorted`, comparisons of complex numbers would be compiled, which takes half a second.
+    """
+    u = draws.uniform(bits)
+    low, high = Index(0), Index(len(model.start_states) - 1)
+    while low < high:
+        middle = (low + high) >> Index(1)
+        if u < model.start_cumulative[middle]:
+            high = middle
+        else:
+            low = middle + Index(1)
+    return Index(model.start_states[low])
 
 
 @inlined
@@ -173,7 +182,7 @@ def train(
     epsilon = exploring(rules, episode, step)
     place = step % window
     filled = 0
-    ended = 0
+    ended = np.int64(0)
     while filled < len(steps) and ended < len(ends.counts) and episode < until_episode and step < until_step:
         if t == 0:
             state = _start_state(model, draws.draw(draws.key(seed, draws.START, episode), 0))
@@ -278,7 +287,7 @@ def evaluate(
     every_learner = (1 << learners) - 1
     chance = draws.key(seed, draws.EVALUATION_OUTCOME, episode)
     filled = 0
-    ended = 0
+    ended = np.int64(0)
     while filled < len(steps) and ended < len(ends.counts) and episode < until_episode:
         if t == 0:
             if start >= 0:
@@ -383,7 +392,7 @@ def recall(seed: np.uint64, model: Model, tables: Tables, rules: Rules, steps: R
     """Remember recorded training steps, in order, as when they were learned from; only the memory changes."""
     for k in range(len(steps)):
         for i in range(len(model.width)):
-            remember(rules, model, tables, _recorded(seed, model, rules, steps[k], i, 0, 0.0))
+            remember(rules, model, tables, _recorded(seed, model, rules, steps[k], i, np.int64(0), 0.0))
 
 
 @inlined
@@ -457,7 +466,7 @@ def replay_probed(
             read_states(tables, states[at], value[at], greedy[at])
             at += 1
         _read_rows(model, tables, rows, k, steps[k].state)
-        relearn(seed, model, tables, rules, steps[k], 0)
+        relearn(seed, model, tables, rules, steps[k], np.int64(-1))
 
 
 @numba.njit(cache=True)

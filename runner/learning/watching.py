@@ -150,7 +150,7 @@ def replay_watched(
     for k in range(len(steps)):
         state = Index(steps[k].state)
         before = _joint_greedy(model, tables, state)
-        relearn(seed, model, tables, rules, steps[k], 0)
+        relearn(seed, model, tables, rules, steps[k], np.int64(-1))
         is_turned = _joint_greedy(model, tables, state) != before
         is_changed = watch.states[state] or _is_remembered(model, tables, watch.states)
         for p in range(len(watch.starts)):
