@@ -34,7 +34,6 @@ def pytest_collection_finish() -> None:
     """Leave what the collected tests consist of, millions of objects, out of every search for garbage."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(50_000)
 
 
 @pytest.fixture(autouse=True, scope="session")

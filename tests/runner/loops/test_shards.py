@@ -216,7 +216,7 @@ def test_texts_infos_options_frames_and_checkpoints_come_along(tmp_path):
 @pytest.mark.parametrize("after", [0.0, 0.3, 1.2])
 def test_a_killed_shard_loses_its_last_second_at_most(tmp_path, after):
     with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="killed") as rec:
-        process = started(rec.run.folder, "victim", 10**7, 1)
+        process = started(rec.run.folder, "victim", 10**7, 1, 0.02)
         deadline = time.monotonic() + 30
         while not shards_of(rec.run) and time.monotonic() < deadline:
             time.sleep(0.01)
