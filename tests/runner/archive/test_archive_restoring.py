@@ -216,12 +216,12 @@ def test_rows_without_end_are_refused_before_they_are_read(archive, tmp_path):
     shutil.copytree(archive, folder)
     zeros = pa.table({name: pa.repeat(steps[name][0], n) for name in steps.schema.names}, steps.schema)
     with pq.ParquetWriter(folder / layout.STEPS, steps.schema, compression="zstd") as writer:
-        for _ in range(20):
+        for _ in range(8):
             writer.write_table(zeros, n)
 
     def with_as_many(manifest):
         others = manifest.topics["/eval/step"].size
-        return replace(manifest, topics={**manifest.topics, "/train/step": Entry(20 * n - others, "0" * 64)})
+        return replace(manifest, topics={**manifest.topics, "/train/step": Entry(8 * n - others, "0" * 64)})
 
     sealed(folder, with_as_many)
     with pytest.raises(RecordingError, match="made to exhaust the disk"):

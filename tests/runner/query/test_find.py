@@ -626,12 +626,12 @@ def test_hits_are_marked(tmp_path, folder):
 
 def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch):
     run = find_run("pole", folder)
-    for k in range(20):
+    for k in range(14):
         place = tmp_path / f"run{k:05d}"
         shutil.copytree(run.folder, place)
         facts = json.loads((place / "run.json").read_text()) | {"run_id": place.name, "name": f"pole{k % 2}"}
         (place / "run.json").write_text(json.dumps(facts))
-    shutil.rmtree(cache_folder() / EPISODES)
+    shutil.rmtree(cache_folder() / EPISODES, ignore_errors=True)  # no test may have searched before
     monkeypatch.setattr(episode_index, "_LEAST", 2)
     expressions = ("length > 20 and any(action == 1)", "then(action == 1, action == 0, within=1)")
 
@@ -643,13 +643,13 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
     monkeypatch.setattr(episode_index, "_PACKED", 1 << 70)
     loose = hits()
     assert all(found.count for found in loose)
-    for size in (1, 7, 2):  # where packs are cut depends on inodes; two of twenty files stay together at 2
+    for size in (1, 7, 2):  # where packs are cut depends on inodes; two of fourteen files stay together at 2
         monkeypatch.setattr(episode_index, "_PACKED", size)
         for _ in range(2):
             assert hits() == loose
     assert list((cache_folder() / EPISODES / "packs").iterdir())
     shutil.rmtree(tmp_path / "run00011")
-    assert [found.runs for found in hits()] == [19, 19, 9]
+    assert [found.runs for found in hits()] == [13, 13, 6]
 
 
 def test_a_number_to_sort_by_is_checked_as_a_condition_is(folder):
