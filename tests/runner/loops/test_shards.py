@@ -305,7 +305,7 @@ def test_the_last_process_folds_when_the_owner_was_killed(tmp_path):
 
 def test_the_next_command_folds_when_all_were_killed(tmp_path):
     process, run = owner(tmp_path)
-    worker = started(run.folder, "w", 10**7, 1)
+    worker = started(run.folder, "w", 10**7, 1, 0.02)
     deadline = time.monotonic() + 30
     while not shards_of(run) and time.monotonic() < deadline:
         time.sleep(0.01)
