@@ -181,10 +181,11 @@ def train(
     while filled < len(steps) and ended < len(ends.counts) and episode < until_episode and step < until_step:
         if t == 0:
             state = _start_state(model, draws.draw(draws.key(seed, draws.START, episode), 0))
-        if t == 0 or filled == 0:
+        begins = t == 0 or filled == 0  # the episode, or this call
+        if begins:
             exploration = draws.key(seed, draws.EXPLORATION, episode)
             chance = draws.key(seed, draws.OUTCOME, episode)
-        if t == 0 or filled == 0 or rules.by_step:
+        if begins or rules.by_step:
             step_size = schedule_value(rules.step_size, episode, step)
             discount = schedule_value(rules.discount, episode, step)
             epsilon = exploring(rules, episode, step)
