@@ -28,7 +28,10 @@ from tests.waiting import until
 for module in ("ray", "aiohttp_cors"):  # the second is of `ray[default]`, which has the job API
     pytest.importorskip(module)
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future defaults and open files
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.filterwarnings("ignore"),  # Ray's own, about its future defaults and open files
+]
 
 LONG = ENDLESS | {"name": "long", "episodes": 10_000, "seeds": [0]}
 """Five seconds."""

@@ -11,7 +11,10 @@ from runner.sweep.task import Task
 pytest.importorskip("ray")
 from runner.sweep.cluster import RayWorkers
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, about its future defaults and open files
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.filterwarnings("ignore"),  # Ray's own, about its future defaults and open files
+]
 
 
 def test_a_task_that_raises_counts_as_one_whose_worker_died():
