@@ -175,17 +175,20 @@ def train(
     learners = len(model.width)
     joint_actions = len(model.own_action)
     window, lengths = len(tally.recent_outcomes), len(tally.recent_lengths)
+    exploration = draws.key(seed, draws.EXPLORATION, episode)
+    chance = draws.key(seed, draws.OUTCOME, episode)
+    step_size = schedule_value(rules.step_size, episode, step)
+    discount = schedule_value(rules.discount, episode, step)
+    epsilon = exploring(rules, episode, step)
     place = step % window
     filled = 0
     ended = np.int64(0)
     while filled < len(steps) and ended < len(ends.counts) and episode < until_episode and step < until_step:
         if t == 0:
             state = _start_state(model, draws.draw(draws.key(seed, draws.START, episode), 0))
-        begins = t == 0 or filled == 0  # the episode, or this call
-        if begins:
             exploration = draws.key(seed, draws.EXPLORATION, episode)
             chance = draws.key(seed, draws.OUTCOME, episode)
-        if begins or rules.by_step:
+        if t == 0 or rules.by_step:
             step_size = schedule_value(rules.step_size, episode, step)
             discount = schedule_value(rules.discount, episode, step)
             epsilon = exploring(rules, episode, step)
