@@ -279,7 +279,7 @@ def _environment(recording: Recording) -> str:
         return ""
     kwargs = recording.config.get("env", {}).get("kwargs", {})
     name = recording.environment["env_id"].rpartition(":")[2]
-    return " ".join([name, *(f"{key}={value}" for key, value in kwargs.items())])
+    return " ".join([name] + [f"{key}={value}" for key, value in kwargs.items()])
 
 
 def evaluation_readings(record: EvaluationRecord) -> Readings:

@@ -90,7 +90,7 @@ def measures(recording: Recording) -> Iterator[Measures]:
 
 def episodes(recording: Recording, phase: str) -> Iterator[Measures]:
     """Yield length and return of each episode of a phase, at its last step: `episode/return/AGENT`."""
-    names = ["episode/length", *(f"episode/return/{agent}" for agent in recording.agents)]
+    names = ["episode/length"] + [f"episode/return/{agent}" for agent in recording.agents]
     for block in recording.phase(phase).episodes.blocks():
         columns = (
             block[field].tolist() for field in ("log_time", "episode", "last_step", "length", "returns")

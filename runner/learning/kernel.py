@@ -364,6 +364,8 @@ def relearn(
 ) -> tuple[int, bool]:
     """Apply the updates of a recorded training step; return what `learn` returns of learner `traced`.
 
+    `traced` is -1 if no learner's update is asked for.
+
     A recorded step and the run's draws hold all inputs of its update, so the update is equal to `train`'s,
     to the last bit. A memory of earlier steps is one of these inputs: see `recall`.
     """

@@ -106,7 +106,7 @@ def read_repository(
     git = _Git(program, folder, time.monotonic() + seconds, seconds)
     done = git.run("rev-parse", "--show-toplevel", "HEAD", "--abbrev-ref", "HEAD", may_fail=True)
     lines = done.splitlines()
-    if not lines or not lines[0].startswith(("/", *(f"{letter}:" for letter in "CDEFGH"))):
+    if not lines or not Path(lines[0]).is_absolute():
         raise NotRecorded(_reason(git.message))
     root = Path(lines[0])
     if not folder.resolve().is_relative_to(root.resolve()):

@@ -31,11 +31,8 @@ EXPLANATION: Final = (
 def sections(comparison: Comparison) -> list[Section]:
     """Return the text of a comparison."""
     rows = [(label, str(len(ids)), listed(ids)) for label, ids in comparison.groups.items()]
-    sentences = [
-        *summary(comparison),
-        f"Values are read: {comparison.moment}.",
-        *(f"Note: {note}." for note in comparison.notes),
-    ]
+    notes = [f"Note: {note}." for note in comparison.notes]
+    sentences = [*summary(comparison), f"Values are read: {comparison.moment}.", *notes]
     first = Section("Groups", sentences, [Grid(("group", "runs", ""), rows)])
     return [
         first,

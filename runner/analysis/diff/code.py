@@ -76,7 +76,7 @@ def _compared(a: str | None, b: str | None, path: str) -> list[str]:
     ours, theirs = a or "", b or ""
     if max(ours.count("\n"), theirs.count("\n")) < _MAX_COMPARED:
         return unified_diff(a, b, path)
-    return [*(f"-{line}" for line in ours.splitlines()), *(f"+{line}" for line in theirs.splitlines())]
+    return [f"-{line}" for line in ours.splitlines()] + [f"+{line}" for line in theirs.splitlines()]
 
 
 def _patches(a: str | None, b: str | None) -> list[str]:

@@ -65,7 +65,7 @@ def _runs(difference: RunDiff) -> Section:
     if difference.ignored:
         notes.append(f"ignored, though it differs: {', '.join(difference.ignored)}")
     grid = Grid(("", "id", "name", "seed", "status"), rows)
-    return Section("Runs", [summary(difference), *(f"Note: {note}." for note in notes)], [grid])
+    return Section("Runs", [summary(difference)] + [f"Note: {note}." for note in notes], [grid])
 
 
 def summary(difference: RunDiff) -> str:

@@ -62,7 +62,7 @@ class GridLabels:
         self._riding = self._add([""], palette.PASSENGER)
         """A passenger that is carried: the label of its carrier shows it."""
         self._longest = min(mdp.step_limit or MAX_T, MAX_T)
-        self._t = self._add([*(f"t = {k}" for k in range(self._longest)), f"t ≥ {self._longest}"])
+        self._t = self._add([f"t = {k}" for k in range(self._longest)] + [f"t ≥ {self._longest}"])
         self._rewards: list[tuple[int, int, Floats]] = []
         """Learner, first label, and the rewards it can get, ascending."""
         rewards = mdp.rewards_of(len(learners))

@@ -209,7 +209,7 @@ def test_tables_of_another_kind_are_refused(archive, tmp_path, forge, message):
 
 
 def test_rows_without_end_are_refused_before_they_are_read(archive, tmp_path):
-    """A few kilobytes that declare a billion rows, in a manifest that agrees."""
+    """A few kilobytes that declare 17 million rows, in a manifest that agrees."""
     steps = pq.read_table(archive / layout.STEPS).slice(0, 1)
     n = 1 << 21
     folder = tmp_path / "endless"
