@@ -29,9 +29,8 @@ def _do_job(context: click.Context, _parameter: click.Parameter, folder: Path | 
         return
     from runner.api import interruptible
     from runner.client.jobs import EventData, JobEvent
-    from runner.service.jobs.channel import JobChannel, JobSpec
     from runner.service.jobs.store import STATE_FILE, read_job
-    from runner.service.jobs.worker import do_job
+    from runner.service.jobs.worker import JobChannel, JobSpec, do_job
 
     if not (folder / STATE_FILE).is_file():
         raise click.BadParameter(

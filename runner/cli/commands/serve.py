@@ -85,7 +85,7 @@ def serve_command(
         ray=ray,
     )
     if ray is not None:
-        from runner.service.jobs.cluster import require_job_api
+        from runner.service.jobs.worker import require_job_api
 
         require_job_api()
     missing = [str(folder) for folder in recordings if not folder.is_dir()]

@@ -11,8 +11,7 @@ from runner.client.jobs import JobStatus
 from runner.runs.run import Run
 from runner.service.api.jobs import created
 from runner.service.dependencies import JobsOf, RecordedRun, require_written
-from runner.service.jobs.branches import BranchQuestion, check_branch
-from runner.service.jobs.explanations import ExplainQuestion, check_explanation
+from runner.service.jobs.checking import BranchQuestion, ExplainQuestion, check_branch, check_explanation
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob, QueuedJob
 from runner.util.yaml_text import write_yaml

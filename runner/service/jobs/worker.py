@@ -2,32 +2,227 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import math
+import os
+import shlex
 import signal
 import threading
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
-from runner.client.jobs import EventData, LogEvent, RunEvent, RunProgress, StateEvent
+from runner.analysis.episodes import EpisodeRef
+from runner.archive.places import at_hand
+from runner.client.jobs import (
+    BestTrial,
+    EventData,
+    JobEvent,
+    LogEvent,
+    RunEvent,
+    RunProgress,
+    StateEvent,
+    SweepProgress,
+)
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
+from runner.debugging.explain import (
+    EPISODES,
+    RUNS,
+    ExplanationBusy,
+    answer,
+)
+from runner.debugging.explanation import summary
+from runner.debugging.mixtures import Measurement, MixtureResult
 from runner.errors import RunnerError, full_message
 from runner.execution.branching import train_branch
 from runner.execution.resume import resume
 from runner.execution.session import Progress, Report, evaluation_brief, run_job
 from runner.recording.reader import open_recording
 from runner.runs.listing import run_at
+from runner.runs.locking import locked
+from runner.runs.resolve import run_of_id
 from runner.runs.run import Run, create_run
-from runner.service.jobs.branches import parent_in, run_episode_job
-from runner.service.jobs.channel import JobChannel, JobSpec, wait_for_owners
-from runner.service.jobs.cluster import do_on_cluster
-from runner.service.jobs.explanations import run_explain_job
-from runner.service.jobs.sweeps import run_sweep_job
+from runner.service.jobs.checking import BranchQuestion, ExplainQuestion
+from runner.service.jobs.store import QueuedJob, read_values
 from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
+from runner.sweep import state
+from runner.sweep.cluster import worker_pool
+from runner.sweep.loading import from_values
+from runner.sweep.local import Workers
+from runner.sweep.running import SweepStatus
+from runner.sweep.whole import run_whole_sweep
 from runner.util.compilation import MESSAGE, announced
-from runner.util.values import as_utf8
+from runner.util.extras import require
+from runner.util.processes import OWN_ONLY
+from runner.util.values import Json, as_utf8, finite
+
+T = TypeVar("T")
+REPORT_SECONDS: Final = 0.25
+OTHER_OWNER_SECONDS: Final = 60.0
+"""Time limit for another owner to release a run; on another host it counts as dead after 15 s."""
+
+
+@dataclass(frozen=True)
+class JobSpec:
+    """A job, its folder, and where to do it."""
+
+    folder: Path
+    job: QueuedJob
+    ray: str | None = None
+    """The address of the Ray cluster that this process belongs to; None if it belongs to none."""
+
+    @property
+    def recordings(self) -> Path:
+        """The recordings folder of the job."""
+        return self.folder.parents[1]
+
+    @property
+    def workers(self) -> int | None:
+        """How many processes may train at once; None for as many as the cluster has."""
+        return self.job.workers if self.ray is None else None
+
+    def values(self) -> dict[str, object]:
+        """Return the configuration, sweep or question, with every value."""
+        return read_values(self.folder)
+
+
+@dataclass(frozen=True)
+class JobChannel:
+    """Where a job sends its events, and learns that it must stop."""
+
+    send: Callable[[EventData], None]
+    stop: Callable[[], bool]
+    """Returns whether the job must stop; called every few milliseconds."""
+
+
+def until_free(
+    attempt: Callable[[], T],
+    busy: type[RunnerError],
+    stop: Callable[[], bool],
+    seconds: float = math.inf,
+    waiting: Callable[[], None] = lambda: None,
+) -> T:
+    """Return the result of a call that is repeated as long as it raises `busy`; `waiting` is called then.
+
+    The error is raised when the job must stop, or after this time.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            return attempt()
+        except busy:
+            if stop() or time.monotonic() > deadline:
+                raise
+            waiting()
+            time.sleep(REPORT_SECONDS)
+
+
+def wait_for_owners(runs: Iterable[Run], stop: Callable[[], bool]) -> None:
+    """Wait until no process owns one of these runs: the workers of a server that was killed are stopping.
+
+    Raises:
+        RunnerError: one is still owned after a minute, or when the job must stop.
+    """
+    for run in runs:
+        if run.status == "running":
+            until_free(partial(_require_free, run), RunnerError, stop, OTHER_OWNER_SECONDS)
+
+
+def _require_free(run: Run) -> None:
+    with locked(run):
+        pass
+
+
+POLL_SECONDS: Final = 0.5
+CLOSE_SECONDS: Final = 10
+"""How long the command may take to close its recording before Ray kills it."""
+START_SECONDS: Final = 60
+"""How long to wait for a cluster that has just started, or whose machines are all busy, to take a job."""
+LOG_SECONDS: Final = 5.0
+"""How long to wait for the rest of the log of a command that has ended."""
+COMMAND: Final = "python -P -m runner run --job"
+"""The command without the folder of its job; `-P` imports nothing from the current folder."""
+
+
+def require_job_api() -> Any:
+    """Return the module of Ray's job API, with all that it needs."""
+    return require("ray.job_submission", "aiohttp", extra="ray", purpose="`serve --ray`")
+
+
+def do_on_cluster(spec: JobSpec, address: str, channel: JobChannel) -> StateEvent | None:
+    """Have a cluster do what is left of a job, and forward its events; return its outcome.
+
+    None if the command died, perhaps with its machine. What a killed server left on the cluster is stopped.
+    """
+    folder = os.fspath(spec.folder)
+    try:
+        client = require_job_api().JobSubmissionClient(address)
+        for job in client.list_jobs():
+            if (job.metadata or {}).get("folder") == folder and not job.status.is_terminal():
+                client.stop_job(job.submission_id)
+        submission = _submitted(
+            client,
+            channel,
+            entrypoint=f"{COMMAND} {shlex.quote(folder)}",
+            entrypoint_num_cpus=1 if spec.job.run_ids else 0,
+            runtime_env={"env_vars": {OWN_ONLY: "1", "RAY_JOB_STOP_WAIT_TIME_S": str(CLOSE_SECONDS)}},
+            metadata={"folder": folder},
+        )
+        return asyncio.run(_follow(client, submission, channel))
+    except (OSError, RuntimeError, RunnerError) as error:
+        return StateEvent("failed", f"--ray: the cluster at {address} does not do this job: {error}")
+
+
+def _submitted(client: Any, channel: JobChannel, **job: object) -> str:
+    """Submit a job and return its number; where Ray asks for another try later, try for a minute."""
+    end = time.monotonic() + START_SECONDS
+    while True:
+        try:
+            return str(client.submit_job(**job))
+        except RuntimeError as error:
+            if "try again later" not in str(error) or channel.stop() or time.monotonic() > end:
+                raise
+        time.sleep(POLL_SECONDS)
+
+
+async def _follow(client: Any, submission: str, channel: JobChannel) -> StateEvent | None:
+    """Forward the events of a command until it has ended; return its outcome."""
+    log = asyncio.create_task(_forward(client, submission, channel))
+    while not client.get_job_status(submission).is_terminal():
+        if channel.stop():
+            client.stop_job(submission)
+        await asyncio.sleep(POLL_SECONDS)
+    with contextlib.suppress(OSError, RuntimeError):  # the machine with the log is gone
+        async with asyncio.timeout(LOG_SECONDS):
+            if (outcome := await log) is not None:
+                return outcome
+    if channel.stop():
+        return StateEvent("interrupted")
+    channel.send(LogEvent(f"Ray: {client.get_job_info(submission).message}"))
+    return None
+
+
+async def _forward(client: Any, submission: str, channel: JobChannel) -> StateEvent | None:
+    """Send the events in the log of a command, whose other lines are what libraries print."""
+    rest, outcome = "", None
+    async for text in client.tail_job_logs(submission):
+        *lines, rest = (rest + text).split("\n")
+        for line in lines:
+            with contextlib.suppress(RunnerError):
+                data = JobEvent.from_line(line).data
+                if isinstance(data, StateEvent):
+                    outcome = data
+                else:
+                    channel.send(data)
+    return outcome
+
 
 MAX_TEXT: Final = 4000
 """The length of a log line."""
@@ -64,15 +259,13 @@ def do_job(spec: JobSpec, channel: JobChannel) -> StateEvent:
     """Do what is left of a job, and return its outcome; a worker and the option --job call this."""
     try:
         with announced(lambda: channel.send(LogEvent(MESSAGE))):
-            _DOING.get(spec.job.kind, run_config_job)(spec, channel)
+            kinds = {"sweep": run_sweep_job, "explain": run_explain_job, "episode": run_episode_job}
+            kinds.get(spec.job.kind, run_config_job)(spec, channel)
         return StateEvent("finished")
     except (RunnerError, OSError, KeyboardInterrupt) as error:
         if channel.stop():  # whatever else was the matter, the next worker meets it again
             return StateEvent("interrupted")
         return StateEvent("failed", as_utf8(without_folders(full_message(error), spec.recordings)))
-
-
-_DOING: Final = {"sweep": run_sweep_job, "explain": run_explain_job, "episode": run_episode_job}
 
 
 def run_config_job(spec: JobSpec, channel: JobChannel) -> None:
@@ -141,3 +334,136 @@ def _reporter(channel: JobChannel, run_id: str, config: ExperimentConfig, seed: 
 
     channel.send(RunEvent(run_id, seed))
     return report
+
+
+def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
+    """Play the episode on, unless that is done, and log where it led."""
+    from runner.debugging.branch import EpisodeBranch, branch_episode  # slow to import
+
+    values: Json = spec.values()
+    parent = parent_in(spec, values.pop("run"))
+    question = BranchQuestion.model_validate(values)
+    ((seed, run_id),) = spec.job.run_ids.items()
+
+    def report(steps: int) -> None:
+        if channel.stop():
+            raise KeyboardInterrupt
+        channel.send(RunProgress(run_id, seed, train_steps=steps))
+
+    if not (spec.recordings / run_id).is_dir():
+        task = EpisodeBranch(
+            at=EpisodeRef.parse(question.at),
+            action=question.action,
+            policy=question.policy,
+            seed=question.seed,
+            name=question.name,
+            run_id=run_id,
+        )
+        report(0)  # the environment is made, and brought to the step
+        branch = branch_episode(parent, task, spec.recordings, report)
+        if branch.is_recorded_action:
+            channel.send(LogEvent(f"the action is the one that was recorded at {task.at}"))
+        channel.send(LogEvent(f"recorded: {branch.parent}; with the change: {branch.outcome}"))
+    channel.send(RunEvent(run_id, seed))
+
+
+def parent_in(spec: JobSpec, run_id: str) -> Run:
+    """Return the run that a job branches, with its recording at hand.
+
+    Raises:
+        RunnerError: it is no longer there.
+    """
+    parent = run_of_id(run_id, spec.recordings)
+    if parent is None:
+        raise RunnerError(
+            f"run {run_id}, the parent of this branch, is no longer there; import it, and resume the job."
+        )
+    return at_hand(parent)
+
+
+def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
+    """Run what is left of a sweep, once no other process runs it."""
+    until_free(partial(_run_rest, spec, channel), state.SweepBusy, channel.stop, OTHER_OWNER_SECONDS)
+
+
+def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
+    sweep = from_values(spec.values())
+    recordings = spec.recordings
+    wait_for_owners(state.runs_of(sweep.name, recordings).values(), channel.stop)
+    _, status = run_whole_sweep(
+        sweep,
+        recordings,
+        spec.workers,
+        spec.ray,
+        resume=True,
+        retry_failed=spec.job.retry,
+        accept_changes=spec.job.accept_changes,
+        stop=channel.stop,
+        report=_sweep_reporter(channel),
+    )
+    if status.stopped:
+        raise RunnerError(f"stopped: {status.stopped}")
+    if status.failed:
+        raise RunnerError(
+            f"{status.failed:,} of {status.runs:,} runs failed; `dualtaxi sweep show {sweep.name}` says why."
+        )
+
+
+def _sweep_reporter(channel: JobChannel) -> Callable[[SweepStatus], None]:
+    """Return the function that sends a sweep's progress, and each trial that is the best one yet."""
+    last = -1
+
+    def report(status: SweepStatus) -> None:
+        nonlocal last
+        best = status.best
+        shown = None
+        if best is not None:
+            if best.number != last:
+                last = best.number
+                channel.send(LogEvent(f"trial {best.number} is the best so far: {best.value:g}"))
+            # A level that was never reached is infinite or None; JSON has no infinity.
+            shown = BestTrial(best.number, finite(best.value), best.values)
+        event = SweepProgress(
+            done=status.done,
+            runs=status.runs,
+            running=status.running,
+            pruned=status.pruned,
+            failed=status.failed,
+            bytes=status.bytes,
+            best=shown,
+        )
+        channel.send(event)
+
+    return report
+
+
+BUSY: Final = "busy"
+LINES: Final = {
+    BUSY: "another job or command is explaining the same two; waiting for it",
+    EPISODES: "two short runs are recorded to find the first step that differs",
+}
+"""Lines of the log, each at the first report of a stage."""
+
+
+def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
+    """Train what is left of an explanation, and store it."""
+    question = ExplainQuestion.model_validate(spec.values()).resolved(spec.recordings)
+    stages = set[str]()
+
+    def report(done: int, total: int, what: str) -> None:
+        if what == RUNS:
+            channel.send(SweepProgress(done, total))
+        elif what not in stages:
+            stages.add(what)
+            channel.send(LogEvent(LINES[what]))
+
+    workers: Workers[Measurement, MixtureResult]
+    with worker_pool(spec.workers, spec.ray, question.mixtures[1]) as workers:
+        result = until_free(
+            partial(answer, question, workers, report, stop=channel.stop),
+            ExplanationBusy,  # another job or command asks for another metric, or more seeds
+            channel.stop,
+            waiting=lambda: report(0, 0, BUSY),
+        )
+    for line in summary(result):
+        channel.send(LogEvent(line))

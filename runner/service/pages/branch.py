@@ -21,7 +21,7 @@ from runner.replay.makers import why_not_rerun
 from runner.runs.run import Run
 from runner.service.api.questions import queue_branch
 from runner.service.dependencies import At, JobsOf, RecordedRun, require_written
-from runner.service.jobs.branches import BranchQuestion, known_space
+from runner.service.jobs.checking import BranchQuestion, known_space
 from runner.service.pages.frame import RunPage
 from runner.service.pages.rendering import Form, to_job
 from runner.service.problems import filled

@@ -15,7 +15,7 @@ from runner.errors import RunnerError
 from runner.service.api.comparing import Part, found_explanation
 from runner.service.api.questions import queue_explanation
 from runner.service.dependencies import JobsOf, SettingsOf
-from runner.service.jobs.explanations import ExplainQuestion
+from runner.service.jobs.checking import ExplainQuestion
 from runner.service.pages.rendering import Form, Page, to_job
 from runner.service.problems import filled
 

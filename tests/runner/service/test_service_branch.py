@@ -17,10 +17,9 @@ from runner.client.jobs import RunProgress
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
-from runner.service.jobs.branches import BranchQuestion, check_branch, run_episode_job
-from runner.service.jobs.channel import JobChannel, JobSpec
+from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.store import JobStore
-from runner.service.jobs.worker import do_job
+from runner.service.jobs.worker import JobChannel, JobSpec, do_job, run_episode_job
 from runner.service.settings import ServiceSettings
 from tests.waiting import until
 

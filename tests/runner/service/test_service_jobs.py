@@ -22,7 +22,7 @@ from runner.client.jobs import LogEvent
 from runner.config import from_mapping
 from runner.runs.listing import list_runs
 from runner.service.api.jobs import POLL_SECONDS
-from runner.service.jobs import queue, workers
+from runner.service.jobs import queue
 from runner.service.jobs.checking import check
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob, JobStore
@@ -302,8 +302,7 @@ def test_a_job_that_is_too_large_is_refused_and_a_full_disk_delays_jobs(client, 
     refused = client.post("/api/v1/jobs", content=json.dumps(CONFIG))
     assert refused.status_code == 507
     assert "its recordings need about" in refused.json()["error"]["message"]
-    for module in (queue, workers):
-        monkeypatch.setattr(module, "free_bytes", lambda _: workers.RESERVE_BYTES - 1)
+    monkeypatch.setattr(queue, "free_bytes", lambda _: queue.RESERVE_BYTES - 1)
     number = submit(CONFIG | {"seeds": [0]})
     time.sleep(0.5)
     assert job(client, number)["state"] == "queued"
@@ -381,7 +380,7 @@ def test_a_worker_that_cannot_be_started_is_retried_and_readiness_reports_it(
     def refused(_):
         raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
 
-    monkeypatch.setattr(workers, "RETRY_SECONDS", 0.05)
+    monkeypatch.setattr(queue, "RETRY_SECONDS", 0.05)
     with monkeypatch.context() as full:
         full.setattr(BaseProcess, "start", refused)
         number = jobs_of(client).store.add(one_seed(), "").number

@@ -529,7 +529,7 @@ def test_an_error_that_is_no_text_is_no_fault(client, recordings, error):
 
 
 def test_the_page_of_a_run_is_live_once_a_job_will_resume_it(client, recordings, monkeypatch):
-    monkeypatch.setattr("runner.service.jobs.workers.RESERVE_BYTES", 1 << 62)  # so that no job is begun
+    monkeypatch.setattr("runner.service.jobs.queue.RESERVE_BYTES", 1 << 62)  # so that no job is begun
     run = find_run("first", recordings).update(status="interrupted")
     assert "data-live" not in page_of(client, "/runs/first")
     assert client.get("/runs/first/status?status=interrupted").status_code == 204

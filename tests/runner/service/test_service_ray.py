@@ -18,11 +18,10 @@ import runner
 from runner.client.jobs import LogEvent
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs, run_at
-from runner.service.jobs import cluster as cluster_jobs
-from runner.service.jobs.channel import JobChannel
+from runner.service.jobs import worker as worker_jobs
 from runner.service.jobs.checking import check
-from runner.service.jobs.cluster import require_job_api
 from runner.service.jobs.queue import JobQueue
+from runner.service.jobs.worker import JobChannel, require_job_api
 from tests.waiting import until
 
 for module in ("ray", "aiohttp_cors"):  # the second is of `ray[default]`, which has the job API
@@ -161,12 +160,12 @@ def test_a_cluster_that_has_no_agent_yet_is_asked_again(tmp_path, monkeypatch):
         async def tail_job_logs(self, _):
             yield ""
 
-    monkeypatch.setattr(cluster_jobs, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr(worker_jobs, "POLL_SECONDS", 0.01)
     monkeypatch.setattr(
-        cluster_jobs, "require_job_api", lambda: SimpleNamespace(JobSubmissionClient=lambda _: Client())
+        worker_jobs, "require_job_api", lambda: SimpleNamespace(JobSubmissionClient=lambda _: Client())
     )
     events = []
     spec = SimpleNamespace(folder=tmp_path, job=SimpleNamespace(run_ids=()))
-    cluster_jobs.do_on_cluster(spec, "http://127.0.0.1:1", JobChannel(events.append, lambda: False))
+    worker_jobs.do_on_cluster(spec, "http://127.0.0.1:1", JobChannel(events.append, lambda: False))
     assert not answers
     assert events == [LogEvent("Ray: first is over")]
