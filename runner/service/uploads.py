@@ -6,12 +6,22 @@
 An upload is received, in pieces and in order. When it has all of its bytes it is verified, by a child
 process; then it is stored, which is one renaming, or refused. A server that was killed continues from these
 folders. A stored upload is kept so that its sender learns the result; an idle upload is dropped.
+
+A run that is pushed while it is recorded is listed as running before its upload is complete, by a preview:
+
+    recordings/k3v9m2xq/run.json          with the id of the upload
+    recordings/k3v9m2xq/recording.mcap    a link to the bytes that have been received
+    recordings/k3v9m2xq/stop              if the loop is requested to stop
+
+Nothing of it is verified: readers take any recording as hostile input. When the upload is verified and
+stored, its run replaces the preview.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 import shutil
 import signal
@@ -30,19 +40,21 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 from runner.client.uploads import UploadStatus
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.recording.marks import marks_from
-from runner.runs.importing import import_recording, merge_marks
+from runner.recording.reader import open_recording
+from runner.runs.importing import checked_facts, import_recording, merge_marks
+from runner.runs.listing import run_in
 from runner.runs.resolve import run_of_id
-from runner.runs.run import Run
+from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run
 from runner.runs.store import Store
 from runner.service.errors import Busy, LimitReached, StateConflict, UploadTooLarge, expecting
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG
-from runner.service.previews import remove_preview, update_preview
 from runner.service.processes import ProcessPool, lower_priority
 from runner.service.settings import ServiceLimits, without_folders
 from runner.service.tokens import Digest
 from runner.util.files import hash_of, require_room, storage_errors, write_all, write_object
 from runner.util.processes import CallFailed, end_after_call
+from runner.util.values import NAME_PATTERN
 
 FOLDER: Final = ".uploads"
 STATE_FILE: Final = "upload.json"
@@ -350,3 +362,48 @@ def verify(upload: Upload, body: Path, recordings: Path) -> Upload:
             return replace(upload, state="stored", run_id=run.run_id)
         imported = import_recording(body, recordings, source.run or None)
         return replace(upload, state="stored", run_id=imported.run.run_id, already=imported.already)
+
+
+_DESCRIPTION_BYTES: Final = 64 << 20
+"""A description of a run that takes more is not waited for."""
+
+
+def preview_of(recordings: Path, upload_id: str, run_id: str) -> Run | None:
+    """Return the run that shows an upload; None without one, or if the id is another run's."""
+    run = run_in(recordings / run_id) if re.fullmatch(NAME_PATTERN, run_id) else None
+    return run if run is not None and run.facts.get(PREVIEW) == upload_id else None
+
+
+def update_preview(recordings: Path, upload_id: str, run_id: str, body: Path) -> Run | None:
+    """Note that the sender of an upload goes on; return the run that shows it, if its bytes describe it.
+
+    A run of another upload, or one that is stored, stays as it is.
+    """
+    if (run := preview_of(recordings, upload_id, run_id)) is not None:
+        run.beat()
+        return run
+    target = recordings / run_id
+    if not re.fullmatch(NAME_PATTERN, run_id) or os.path.lexists(target):
+        return None
+    with contextlib.suppress(RunnerError, OSError):  # its description is not complete, or no run's
+        if body.stat().st_size > _DESCRIPTION_BYTES:
+            return None
+        with open_recording(body) as recording:
+            facts = checked_facts(recording, {})
+        if facts["run_id"] != run_id:
+            return None
+        # The owner is no process of this machine, so the run counts as running by its heartbeat.
+        facts |= {"status": "running", "owner": {"host": "upload"}, PREVIEW: upload_id}
+        hidden = body.with_name("preview")
+        shutil.rmtree(hidden, ignore_errors=True)
+        hidden.mkdir()
+        os.link(body, hidden / RECORDING_FILE)
+        write_object(hidden / RUN_FILE, facts)
+        hidden.rename(target)
+    return preview_of(recordings, upload_id, run_id)
+
+
+def remove_preview(recordings: Path, upload_id: str, run_id: str) -> None:
+    """Remove the run that shows an upload, if it exists."""
+    if (run := preview_of(recordings, upload_id, run_id)) is not None:
+        shutil.rmtree(run.folder, ignore_errors=True)
