@@ -1,39 +1,53 @@
-"""The application: middleware, routes, health, and what lives as long as the service."""
+"""The application: middleware, routes, errors, login, health, and what lives as long as the service."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import shutil
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from functools import cache
 from http import HTTPStatus
-from typing import Final
+from types import MappingProxyType
+from typing import Annotated, Any, Final
 
 import anyio
 import anyio.to_thread
-from fastapi import APIRouter, Depends, FastAPI, Request, Response
-from fastapi.responses import JSONResponse
+from fastapi import APIRouter, Depends, FastAPI, Query, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, RedirectResponse
 from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute
 
 from runner.errors import RunnerError
-from runner.service import login, pages, queries, views
+from runner.service import pages, queries, views
 from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
 from runner.service.dependencies import CatalogueOf, SettingsOf
-from runner.service.error_handlers import add_error_handlers, error_response
+from runner.service.errors import RequestError
 from runner.service.guard import Guard
 from runner.service.jobs.queue import JobQueue
 from runner.service.logs import LOG, AccessLog
+from runner.service.pages.rendering import Form, Page
 from runner.service.pictures import PictureStreams
-from runner.service.problems import ERROR_DOCS, known_query
+from runner.service.problems import (
+    ERROR_DOCS,
+    ErrorBody,
+    as_config_error,
+    error_body,
+    known_query,
+    requests_page,
+    status_of,
+)
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
 from runner.service.sweep_fragments import load_sweep_libraries
-from runner.service.tokens import Sessions, Tokens
+from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
 from runner.service.uploads import Upload, Uploads
 from runner.sweep import sweeps_in
 from runner.util import __version__
@@ -47,7 +61,18 @@ PROCESSES: Final = 2
 MIN_FREE_BYTES: Final = 100_000_000
 """Free disk space below which the service is not ready: it could not store a recording."""
 
+ERRORS: Final = (
+    RunnerError,
+    HTTPException,
+    RequestValidationError,
+    OSError,
+    ClientDisconnect,
+    Exception,
+)
+"""The kinds of errors that become responses."""
+
 health = APIRouter(tags=["health"])
+login_pages = APIRouter(include_in_schema=False)
 
 
 class Ready(BaseModel):
@@ -82,6 +107,7 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         redoc_url=None,
         routes=_routes(),
         lifespan=_lifespan,
+        exception_handlers=dict.fromkeys(ERRORS, respond_to_error),
     )
     app.state.settings = settings
     app.state.catalogue = Catalogue(settings.recordings, LOG.warning)
@@ -93,8 +119,54 @@ def create_app(settings: ServiceSettings) -> FastAPI:
         Guard, settings=settings, tokens=tokens, sessions=app.state.sessions, refusal=error_response
     )
     app.add_middleware(AccessLog)
-    add_error_handlers(app)
     return app
+
+
+def error_response(request: Request, error: RunnerError) -> Response:
+    """Return the response to a request that raised one of the project's errors."""
+    headers = error.headers if isinstance(error, RequestError) else {}
+    return _response(request, status_of(error), error_body(error, request.app.state.settings), headers)
+
+
+async def respond_to_error(request: Request, error: Exception) -> Response:
+    """Return the response to any error: JSON in one form, or a page where a browser requested one."""
+    match error:
+        case RunnerError():
+            return error_response(request, error)
+        case RequestValidationError():
+            return error_response(request, as_config_error(error))
+        case HTTPException():
+            status = HTTPStatus(error.status_code)
+            if status == HTTPStatus.NO_CONTENT:
+                return Response(status_code=status)
+            messages = {
+                HTTPStatus.NOT_FOUND: f"there is nothing at {request.url.path}.",
+                HTTPStatus.METHOD_NOT_ALLOWED: f"{request.method} is not supported at {request.url.path}.",
+            }
+            body = ErrorBody(message=messages.get(status, str(error.detail)))
+            return _response(request, status, body, error.headers or {})
+        case ClientDisconnect():
+            status, message = HTTPStatus.BAD_REQUEST, "the client closed the connection."
+        case OSError() if error.errno in (errno.ENOSPC, getattr(errno, "EDQUOT", None)):
+            status = HTTPStatus.INSUFFICIENT_STORAGE
+            message = (
+                f"the disk is full ({error.strerror}); free some of it: `dualtaxi du` lists what uses it."
+            )
+        case _:
+            LOG.error("error", exc_info=error, extra={"path": request.url.path, "method": request.method})
+            status = HTTPStatus.INTERNAL_SERVER_ERROR
+            message = "something unexpected went wrong; see the service's log."
+    return _response(request, status, ErrorBody(message=message))
+
+
+def _response(
+    request: Request, status: HTTPStatus, body: ErrorBody, headers: Mapping[str, str] = MappingProxyType({})
+) -> Response:
+    if not requests_page(request):
+        return JSONResponse({"error": body.model_dump()}, status, headers)
+    page = Page("problem.html", {"title": status.phrase.capitalize(), "message": body.message}, status)
+    page.headers.update(headers)
+    return page
 
 
 @cache
@@ -104,7 +176,7 @@ def _routes() -> list[BaseRoute]:
     parts = (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads)
     for router in (*(part.router for part in parts), views.api, queries.api):
         whole.include_router(router, prefix=API, responses=ERROR_DOCS, dependencies=[Depends(known_query)])
-    for router in (health, login.router, views.pages, queries.pages, pages.router):
+    for router in (health, login_pages, views.pages, queries.pages, pages.router):
         whole.include_router(router)
     return whole.routes
 
@@ -180,3 +252,48 @@ def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
     ready = all(checks.values())
     status = HTTPStatus.OK if ready else HTTPStatus.SERVICE_UNAVAILABLE
     return JSONResponse({"ready": ready, "checks": checks}, status)
+
+
+@login_pages.get("/login")
+def ask(request: Request, next: Annotated[str, Query(max_length=4000)] = "/") -> Response:  # noqa: A002
+    """Ask for a token, where one is needed."""
+    if not request.app.state.settings.needs_token:
+        return RedirectResponse(_local(next), HTTPStatus.SEE_OTHER)
+    return Page("login.html", {"next": next, "problem": ""})
+
+
+@login_pages.post("/login")
+def login(request: Request, sent: Form) -> Response:
+    """Begin a session if the token is right, and redirect to the page that was requested."""
+    secret, target = (sent.get(name, "").strip() for name in ("token", "next"))
+    tokens: Tokens = request.app.state.tokens
+    sessions: Sessions = request.app.state.sessions
+    try:
+        session = sessions.begin(tokens.find(secret))
+    except RunnerError as error:
+        return Page("login.html", {"next": target, "problem": error}, status_of(error))
+    response = RedirectResponse(_local(target), HTTPStatus.SEE_OTHER)
+    response.set_cookie(COOKIE, session, max_age=SESSION_SECONDS, **_cookie_options(request))
+    return response
+
+
+@login_pages.post("/logout")
+def logout(request: Request) -> Response:
+    """End the session."""
+    sessions: Sessions = request.app.state.sessions
+    if session := request.cookies.get(COOKIE):
+        sessions.end(session)
+    response = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
+    response.delete_cookie(COOKIE, **_cookie_options(request))
+    return response
+
+
+def _local(target: str) -> str:
+    """Return an address of this service, or the first page in place of any other address."""
+    # Browsers take `//host` and `/\host` for addresses of other sites.
+    is_local = target.startswith("/") and not target.startswith(("//", "/\\")) and target.isprintable()
+    return target if is_local else "/"
+
+
+def _cookie_options(request: Request) -> dict[str, Any]:
+    return {"httponly": True, "samesite": "lax", "secure": request.url.scheme == "https"}

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from runner.service import login, pages
-from runner.service.app import create_app
+from runner.service import pages
+from runner.service.app import create_app, login_pages
 from runner.service.settings import ServiceSettings
 from tests.browsing import chromium_programs
 from tests.doors import commands, routes
@@ -38,7 +38,7 @@ def without(paths, addresses):
 
 
 def test_every_page_is_inventoried():
-    paths = {path for method, path in routes([pages.router, login.router]) if method == "GET"}
+    paths = {path for method, path in routes([pages.router, login_pages]) if method == "GET"}
     assert without(paths - {*PARTS}, ADDRESSES) == [], "add an address to PAGES, or the route to PARTS"
 
 
