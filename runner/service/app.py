@@ -27,6 +27,7 @@ from runner.errors import RunnerError
 from runner.service import pages, queries, views
 from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
 from runner.service.catalogue import Catalogue
+from runner.service.computed import load_sweep_libraries
 from runner.service.dependencies import CatalogueOf, SettingsOf
 from runner.service.errors import RequestError
 from runner.service.guard import Guard
@@ -46,7 +47,6 @@ from runner.service.problems import (
 from runner.service.processes import ProcessPool
 from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
-from runner.service.sweep_fragments import load_sweep_libraries
 from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
 from runner.service.uploads import Upload, Uploads
 from runner.sweep import sweeps_in

@@ -1,40 +1,76 @@
-"""Responses that take long to compute, for child processes."""
+"""What child processes compute for responses: JSON, files, and parts of pages as HTML."""
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import importlib
 import io
 import json
 import os
+import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Literal
+from urllib.parse import urlencode
+
+from markupsafe import Markup, escape
 
 from runner.analysis.axes import axis_of
-from runner.analysis.episodes import EpisodeRef
+from runner.analysis.compare.score_table import scores_of
+from runner.analysis.compare.tasks import compare_algorithms
+from runner.analysis.diff import diff, with_seconds, without_ignored
+from runner.analysis.diff.divergence import Divergence
+from runner.analysis.diff.sections import made_sections, summary
+from runner.analysis.episodes import TYPICAL, EpisodeRef, StepLike
 from runner.analysis.evaluations import training_records
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import histograms
-from runner.analysis.sections import Answer
+from runner.analysis.sections import Answer, Figure, Grid, Link, Section
+from runner.analysis.series import series_of
+from runner.analysis.summary import random_policy_sentence
 from runner.archive.places import default_target
-from runner.errors import ConfigError, RunnerError
+from runner.debugging.what_if import branch_playback, what_if
+from runner.drawing import svg
+from runner.environments.naming import actions_in_words, joint_action, state_of
+from runner.errors import ConfigError, RunnerError, shortened
+from runner.export.encoded import picture_note
 from runner.export.encoder import FORMATS
 from runner.export.film import Shot, usual_speed, write_film
 from runner.export.pictures import Pictures
+from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
 from runner.export.plugin import installed_export
+from runner.export.reports.compare import drawn_task_sections
+from runner.export.reports.diff import difference_sections
+from runner.export.reports.maps import learned_section, situations, start_of
+from runner.export.reports.playback import playback_of
+from runner.export.reports.player_data import Playback
+from runner.export.reports.rendering import partials
 from runner.export.reports.report import render_report
 from runner.export.rerun.cache import cached_export
+from runner.export.rerun.location import locate
 from runner.export.rerun.selection import Request
 from runner.export.rerun.viewer import require_rerun
+from runner.export.thumbnail import thumbnail
 from runner.recording import schema
-from runner.recording.reader import open_recording
+from runner.recording.messages import media_type
+from runner.recording.reader import Recording, open_recording
+from runner.runs.branches import BranchOrigin, origin_in
 from runner.runs.run import Run
-from runner.service.settings import ServiceSettings
+from runner.service.settings import ServiceSettings, without_folders
+from runner.sweep.charts import best_section, learning, learning_section, parameters_section, picture_of
+from runner.sweep.results import Results, effects_sections, ranking_sections
 from runner.util.extras import require
+from runner.util.humanize import sentence
 from runner.util.values import finite
+from runner.views.sweep_show import sweep_show
 from runner.views.view import Given
 
 MAX_ROWS: Final = 1000
@@ -42,6 +78,7 @@ MAX_ROWS: Final = 1000
 MAX_FILM_STEPS: Final = 5_000
 """The most steps of a film, as one film is made at a time."""
 RecordKind = Literal["training", "optimality"]
+Form = Literal["json", "html", "file"]
 
 
 def run_histograms(path: Path, axis: str) -> bytes:
@@ -73,17 +110,20 @@ def require_few(found: int, limit: int) -> None:
         )
 
 
-def answer(subject: Path | Sequence[Run], question: Callable[..., Answer], values: Given) -> bytes:
-    """Return the answer to a question about a recording or some runs, as --json prints it."""
+def answer(
+    subject: Path | Run | Sequence[Run], question: Callable[..., Answer], form: Form, values: Given
+) -> bytes:
+    """Return an answer about a recording or runs: as --json prints it, as HTML, or as a file."""
     with open_recording(subject) if isinstance(subject, Path) else nullcontext(subject) as content:
-        return as_json(question(content, **dict(values)).as_json())
-
-
-def answer_file(path: Path, question: Callable[..., Answer], values: Given) -> bytes:
-    """Return the file of the answer to a question about a recording."""
-    with open_recording(path) as recording, io.BytesIO() as stream:
-        question(recording, **dict(values)).write(stream)
-        return stream.getvalue()
+        found = question(content, **dict(values))
+        if form == "html":
+            assert isinstance(content, Recording | Run)  # a page is about one run
+            return str(partials().answer(found.sections(), f"/runs/{content.run_id}/")).encode()
+        if form == "json":
+            return as_json(found.as_json())
+        with io.BytesIO() as stream:
+            found.write(stream)
+            return stream.getvalue()
 
 
 def installed_file(path: Path, name: str) -> bytes:
@@ -192,3 +232,313 @@ def find(settings: ServiceSettings, expression: str, runs: str, phase: str, sort
 def as_json(value: object) -> bytes:
     """Return a value as JSON; NaN and infinity become null."""
     return json.dumps(finite(value), allow_nan=False, ensure_ascii=False).encode(errors="replace")
+
+
+def link(path: str, values: Mapping[str, object]) -> str:
+    """Return an address with a query of the values that are not empty."""
+    query = [(key, value) for key, value in values.items() if value not in ("", None, [], ())]
+    return f"{path}?{urlencode(query, doseq=True)}" if query else path
+
+
+def places_in(runs: Sequence[Run], step: EpisodeRef) -> list[EpisodeRef]:
+    """Return the step in each of two runs: a branch of a loop has its parent's episode as its only one."""
+    alone = EpisodeRef(0, step.t, None if step.after is None else 0)
+    origins = [origin_in(run.file.config) for run in runs]
+    return [
+        alone if isinstance(origin, BranchOrigin) and origin.run == other.run_id else step
+        for origin, other in zip(origins, reversed(runs), strict=True)
+    ]
+
+
+MAX_PICTURES: Final = 48
+"""Logged pictures that a page shows, of `MAX_PICTURE_BYTES` together."""
+MAX_PICTURE_BYTES: Final = 16 << 20
+_STEPS_BEFORE: Final = 1
+"""Steps before the first one of a part, so that it includes the step that led there."""
+
+
+@dataclass(frozen=True)
+class ShownDifference:
+    """What differs between two runs."""
+
+    tabs: Mapping[str, tuple[str, Sequence[str], str]]
+    """Lead, notes and HTML of tabs: where they diverge and what else differs, their Q-tables, their code."""
+    first_frame: str | None = None
+    """The first frame of the replays that differs; None if there is none."""
+
+
+def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:
+    """Return a part of an episode as JSON for `replay.js`."""
+    with open_recording(path) as recording:
+        at = replace(at, t=max(at.t, start))  # the step that an error names
+        episode = playback_of(recording, at, steps, max(0, start - _STEPS_BEFORE))
+        return _part(recording, episode, *picture_note(recording, at.phase))
+
+
+def branch_part(path: Path, at: str, action: str, start: int, steps: int) -> bytes:
+    """Return a part of the episode to which a joint action leads, as `episode_part` does."""
+    with open_recording(path) as recording:
+        return _branch_part(recording, at, action, start, steps)
+
+
+def what_if_page(path: Path, at: EpisodeRef, action: str | None, start: int, steps: int) -> bytes:
+    """Return a part as `branch_part` does, with its action and, as HTML, where each joint action leads.
+
+    It is the branch of `action`, None for the recorded one.
+    """
+    with open_recording(path) as recording:
+        found = what_if(recording, at=at)
+        base = f"/runs/{recording.run_id}/"
+        number = next(row.action for row in found.actions if row.is_recorded)
+        if action is not None:
+            number = joint_action(recording.mdp, action)
+        *before, after = found.sections(base)
+        texts = {
+            "action": str(number),
+            "name": str(actions_in_words(recording.mdp)[number]),
+            "before": str(partials().notes(found.notes) + partials().answer(before, base)),
+            "after": str(partials().answer([after], base)),
+        }
+        return _branch_part(recording, at, str(number), start, steps, texts)
+
+
+def _branch_part(
+    recording: Recording,
+    at: StepLike,
+    action: str,
+    start: int,
+    steps: int,
+    texts: Mapping[str, str] = MappingProxyType({}),
+) -> bytes:
+    episode = branch_playback(recording, at, action, steps, max(0, start - _STEPS_BEFORE))
+    note = "" if episode.grid else "The environment has no scene to draw."
+    return _part(recording, episode, False, note, texts)
+
+
+def _part(
+    recording: Recording,
+    episode: Playback,
+    has_pictures: bool,
+    note: str,
+    texts: Mapping[str, str] = MappingProxyType({}),
+) -> bytes:
+    """Return a part of an episode as JSON without blanks; its numbers are finite."""
+    part = {
+        "episode": episode.as_json(),
+        "scene": recording.environment["scene"] if episode.grid else None,
+        "has_pictures": has_pictures,
+        "picture_note": note,
+        **texts,
+    }
+    return json.dumps(part, separators=(",", ":"), ensure_ascii=False).encode(errors="replace")
+
+
+def random_policy(path: Path) -> bytes:
+    """Return what a random policy achieves in a recording's environment, as HTML; empty if unknown."""
+    with open_recording(path) as recording:
+        return str(escape(random_policy_sentence(recording))).encode()
+
+
+def resolved_step(path: Path, at: EpisodeRef) -> bytes:
+    """Return a step as JSON, with an episode of the recording in place of a word."""
+    with open_recording(path) as recording:
+        return as_json(at.resolved(recording))
+
+
+def episode_thumbnail(path: Path, at: EpisodeRef) -> bytes:
+    """Return an episode as a small SVG picture."""
+    with open_recording(path) as recording:
+        step = at.resolved(recording)
+        return thumbnail(recording, step.phase, step.number_in(recording), step.heading).encode()
+
+
+def latest_episode(path: Path) -> bytes:
+    """Return the address of the training episode that ended last, as `train/120`; empty without one."""
+    with open_recording(path) as recording:
+        ended = recording.train.episodes.count()
+        has_one = ended and any(phase.steps for phase in recording.phases)
+        return EpisodeRef(ended - 1).episode_path.encode() if has_one else b""
+
+
+def maps(path: Path, state: Sequence[str] = ()) -> bytes:
+    """Return the maps of policy and values at stages of learning, as HTML.
+
+    They are of the situation of a state, given by the parts of its name; of a typical one by default.
+    """
+    with open_recording(path) as recording:
+        form, number = "", 0
+        if recording.tabular and svg.drawing_of(recording.mdp) is not None:
+            problems = []
+            number = start_of(recording, EpisodeRef.parse(TYPICAL))
+            try:
+                number = state_of(recording.mdp, ", ".join(state)) if state else number
+            except ConfigError:
+                problems.append(f"There is no state with {shortened(', '.join(state), 200)}.")
+            form = partials().situation(situations(recording.mdp, number), problems)
+        section = replace(learned_section(recording, number), title="")
+        return f"<h2>What was learned</h2>{form}{partials().answer([section])}".encode()
+
+
+def distributions(path: Path, axis: str) -> bytes:
+    """Return the histograms of a run's training over an axis, as HTML."""
+    with open_recording(path) as recording:
+        result, notes = histograms(recording, axis_of(axis))
+    if not result:
+        return b""
+    text = " ".join([EXPLANATION, *constants_in(result), *notes])
+    section = Section("Distributions", [text], figures=heatmap_plots(result))
+    return str(partials().answer([section])).encode()
+
+
+def tasks(paths: Sequence[Path], axis: str, scores: str) -> bytes:
+    """Return the comparison of runs over environments as HTML; `scores` is a table as CSV, or empty.
+
+    Where nobody asked for scores, a reason why the runs cannot be compared is an answer, not an error.
+    """
+    table = scores_of(scores) if scores.strip() else None
+    try:
+        comparison = compare_algorithms(series_of(paths, axis_of(axis)), table)
+    except RunnerError as error:
+        if table is not None:
+            raise
+        return f'<p class="hint">{escape(sentence(str(error).removeprefix("normalise: ")))}</p>'.encode()
+    return str(partials().answer(drawn_task_sections(comparison))).encode()
+
+
+def pictures(path: Path) -> bytes:
+    """Return the last pictures and films that were logged under a name, the newest first, as HTML."""
+    figures = list[Figure]()
+    size = 0
+    with open_recording(path) as recording:
+        images = recording.table(schema.IMAGE_TOPIC)
+        for image in images.newest():
+            name = image["frame_id"]
+            data = image["data"]
+            step = image["log_time"] // schema.STEP_NANOSECONDS
+            size += len(data)
+            if len(figures) == MAX_PICTURES or size > MAX_PICTURE_BYTES:
+                break
+            if kind := media_type(data):
+                source = f"data:{kind};base64,{base64.b64encode(data).decode()}"
+                figures.append(Figure(f'<img src="{source}" alt="">', f"{name}, step {step:,}"))
+        total = images.count()
+    texts = [f"The last {len(figures):,} of {total:,} pictures."] if len(figures) < total else []
+    if not total:
+        texts = ["No picture was logged."]
+    return str(partials().answer([Section("", texts, figures=figures, layout="pictures")])).encode()
+
+
+def difference(a: Run, b: Run) -> bytes:
+    """Return `ShownDifference` as JSON."""
+    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+        found = without_ignored(with_seconds(diff(ours, theirs), a, b), ())
+        shown = difference_sections(found, ours, theirs)
+    divergences = {"Training": found.divergence, "Evaluation": found.evaluation_divergence}
+    known = {title: divergence for title, divergence in divergences.items() if divergence is not None}
+    for title, divergence in known.items():
+        shown[title] = replace(shown[title], links=_links([a, b], divergence))
+    body = [section for title, section in shown.items() if title not in ("Metrics", "Q-tables", "Runs")]
+    first = next(iter(known.values()), None)
+    tables = shown.get("Q-tables", Section("Q-tables", ["There are none to compare."]))
+    tabs = {
+        "divergence": (summary(found), found.notes, partials().answer(body)),
+        "tables": ("", [] if "Q-tables" in shown else found.notes, partials().answer([tables])),
+    }
+    return as_json(ShownDifference(tabs, None if first is None else str(first.frame)))
+
+
+def made_difference(a: Run, b: Run) -> bytes:
+    """Return how the code of two runs differs, and how else they were made, as `ShownDifference` in JSON."""
+    with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
+        lead, sections = made_sections(ours, theirs)
+    return as_json(ShownDifference({"code": (lead, [], partials().answer(sections))}))
+
+
+def _links(runs: list[Run], divergence: Divergence) -> list[Link]:
+    """Return links to the replays at the first step that differs."""
+    query = {"run": [run.run_id for run in runs], "at": str(divergence.frame)}
+    places = zip("AB", runs, places_in(runs, divergence.reference), strict=True)
+    return [
+        Link("Both replays at this step", link("/compare/replay", query)),
+        *(
+            Link(f"{letter} in Rerun", link(f"/runs/{run.run_id}/rerun", {"at": str(place)}))
+            for letter, run, place in places
+        ),
+    ]
+
+
+def viewer_place(run: Run, at: EpisodeRef | None) -> bytes:
+    """Return the step of the viewer's timeline at a step, and its trial as a loop counts it, as JSON."""
+    location = locate(run, Request(), at)
+    return as_json({"time": location.time, "trials": location.request.trials})
+
+
+def load_sweep_libraries() -> None:
+    """Import the libraries that the pages of sweeps need, at a low priority where a thread can have one.
+
+    SciPy, scikit-learn and Optuna take seconds to load, which no request should have to wait for.
+    """
+
+    def load() -> None:
+        if sys.platform == "linux":  # elsewhere a priority is that of a whole process
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
+        for module in ("scipy.stats", "sklearn.ensemble", "optuna.samplers", "runner.sweep.results"):
+            with contextlib.suppress(ImportError):  # the function that needs it explains how to install it
+                importlib.import_module(module)
+
+    thread = threading.Thread(target=load)
+    thread.start()
+    thread.join()
+
+
+@lru_cache(maxsize=1)
+def _sweep_results(name: str, recordings: Path, digest: str) -> Results:  # noqa: ARG001
+    """Return the results of a sweep in the state that the digest identifies."""
+    return sweep_show((name, recordings), everything=True)
+
+
+def sweep_part(
+    part: Callable[[Results, Path], Iterable[Section]], name: str, recordings: Path, digest: str
+) -> bytes:
+    """Return a part of the page of a sweep as HTML, without the path of the recordings folder."""
+    shown = [
+        replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
+        for section in part(_sweep_results(name, recordings, digest), recordings)
+    ]
+    return str(partials().answer(shown)).encode()
+
+
+def sweep_ranking(results: Results, _: Path) -> Iterator[Section]:
+    """Yield the ranking of a sweep, with links to its runs, and the best configuration."""
+    first, *others = ranking_sections(results)
+    runs = {str(entry.number): _run_links(entry.runs) for entry in results.ranking}
+    grids = [
+        Grid((*grid.headings, "runs, by seed"), [(*row, runs[row[0]]) for row in grid.rows])
+        for grid in first.grids
+    ]
+    yield replace(first, title="Ranking", grids=grids)
+    yield from others
+    if results.best_yaml:
+        yield best_section(results)
+
+
+def _run_links(runs: Mapping[int, str]) -> str:
+    links = [
+        Markup('<a href="/runs/{0}" title="{0}">{1}</a>').format(run, seed) for seed, run in runs.items()
+    ]
+    return Markup(" ").join(links)
+
+
+def sweep_importance(results: Results, _: Path) -> Iterable[Section]:
+    """Return the importance of a sweep's parameters; nothing if it is unknown."""
+    return effects_sections(results)
+
+
+def sweep_pictures(results: Results, recordings: Path) -> Iterator[Section]:
+    """Yield the charts of a sweep: its parameters, and learning curves of some of its trials."""
+    with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
+        yield parameters_section(picture_of(results))
+    try:
+        yield learning_section(learning(results, recordings))
+    except RunnerError as error:
+        yield Section("Learning curves", [str(error)])

@@ -51,7 +51,6 @@ PRELOADED: Final = (
     "runner.runs.importing",
     "runner.service.computed",
     "runner.service.curves",
-    "runner.service.fragments",
     "runner.service.jobs.worker",
     "runner.service.uploads",
     "runner.service.preloaded",

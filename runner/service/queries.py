@@ -14,7 +14,7 @@ from runner.analysis.sections import Grid
 from runner.errors import RunnerError
 from runner.query.text import cell_of
 from runner.service import computed
-from runner.service.addresses import link
+from runner.service.computed import link
 from runner.service.dependencies import json_response
 from runner.service.pages.rendering import Page
 from runner.views.find import VIEW as FIND

@@ -17,17 +17,16 @@ from runner.analysis.contents import damage_of
 from runner.errors import RecordingError, RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.service import computed, fragments
-from runner.service.addresses import link
+from runner.service import computed
 from runner.service.api.comparing import RunName, RunNames, found_runs
 from runner.service.api.replay import OCTETS
-from runner.service.computed import require_few
+from runner.service.computed import Form, link, require_few
 from runner.service.dependencies import CatalogueOf, Computation, ComputationOf, RecordedRun, SettingsOf
 from runner.service.errors import EXPECTED
 from runner.service.pages.frame import RunPage, StatusName, installed_names
 from runner.service.problems import filled, media_docs, status_of
 from runner.views import shipped_views, view_named
-from runner.views.view import Given, Input, View, rows_in
+from runner.views.view import Input, View, rows_in
 
 api = APIRouter()
 pages = APIRouter(prefix="/runs/{run}", include_in_schema=False)
@@ -42,15 +41,13 @@ PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**9)]
 def _add_routes(view: View) -> None:
     given_type = _type_of(view)
 
-    def add(
-        function: Callable[..., bytes], ending: str, media_type: str, summary: str, **options: Any
-    ) -> None:
+    def add(form: Form, ending: str, media_type: str, summary: str, **options: Any) -> None:
         async def answer(
             run: RecordedRun, compute: ComputationOf, settings: SettingsOf, given: Any
         ) -> Response:
             if view.rows_per_page:
                 require_few(len(rows_in(given.start, given.stop)), settings.limits.page_records)
-            body = await _computed(compute, function, run, view, given)
+            body = await _answer(compute, run, view, form, given)
             return Response(body, media_type=media_type)
 
         answer.__annotations__["given"] = Annotated[given_type, Query()]
@@ -61,7 +58,7 @@ def _add_routes(view: View) -> None:
 
     if view.subject == "recording":
         add(
-            computed.answer,
+            "json",
             "",
             "application/json",
             view.help.partition("\n")[0],
@@ -69,7 +66,7 @@ def _add_routes(view: View) -> None:
         )
     if view.file_ending:
         documented = {"response_class": Response, "responses": media_docs(OCTETS)}
-        add(computed.answer_file, view.file_ending, OCTETS, view.file_help, **documented)
+        add("file", view.file_ending, OCTETS, view.file_help, **documented)
 
     if view.is_live:
 
@@ -83,7 +80,7 @@ def _add_routes(view: View) -> None:
             """Return the answer; 204 if the run no longer has this status."""
             if run.status != status:
                 return Response(status_code=HTTPStatus.NO_CONTENT)
-            return HTMLResponse(await _answered(compute, run, view, given, number))
+            return HTMLResponse(await _answer(compute, run, view, "html", given, number))
 
         part.__annotations__["given"] = Annotated[given_type, Query()]
         pages.get(f"/{view.name}/part")(part)
@@ -99,7 +96,7 @@ def _add_routes(view: View) -> None:
         try:
             if view.has_default or any(form.values()):
                 given = filled(given_type, form)
-                body = await _answered(compute, run, view, given, number)
+                body = await _answer(compute, run, view, "html", given, number)
         except RunnerError as error:
             problem = error
         live = ""
@@ -118,7 +115,7 @@ def _add_route_of_runs(view: View) -> None:
         names = [values.pop(name) for name in _NAMES[view.subject]]
         several = view.subject == "runs"
         runs = await run_in_threadpool(found_runs, catalogue, names[0] if several else names, several)
-        return await compute.json(computed.answer, runs, view.compute, tuple(values.items()))
+        return await compute.json(computed.answer, runs, view.compute, "json", tuple(values.items()))
 
     answer.__annotations__["given"] = Annotated[_type_of(view), Query()]
     api.get(
@@ -131,28 +128,19 @@ def _add_route_of_runs(view: View) -> None:
     )(answer)
 
 
-async def _answered(compute: Computation, run: Run, view: View, given: BaseModel, number: int) -> bytes:
-    """Return the answer on a page; of a long list, the rows of one page."""
-    first = (number - 1) * view.rows_per_page
-    rows = (("start", first), ("stop", first + view.rows_per_page)) if view.rows_per_page else ()
-    more = view.page_values + rows
-    if view.subject == "run":
-        values = tuple((given.model_dump() | dict(more)).items())
-        return await compute.uncached(fragments.answer, run, view.compute, values)
-    return await _computed(compute, fragments.answer, run, view, given, more)
-
-
-async def _computed(
-    compute: Computation,
-    function: Callable[..., bytes],
-    run: Run,
-    view: View,
-    given: BaseModel,
-    more: Given = (),
+async def _answer(
+    compute: Computation, run: Run, view: View, form: Form, given: BaseModel, page: int | None = None
 ) -> bytes:
-    """Return what a function makes of the answer to what is given, and to more values."""
-    values = tuple((given.model_dump() | dict(more)).items())
-    return await compute(function, run.recording, view.compute, values, alone=view.exclusive_spool)
+    """Return the answer to what is given; on a page, with its own values, and of a long list its rows."""
+    values = given.model_dump()
+    if page is not None:
+        values |= view.page_values
+        if view.rows_per_page:
+            values |= {"start": (page - 1) * view.rows_per_page, "stop": page * view.rows_per_page}
+    asked = view.compute, form, tuple(values.items())
+    if view.subject == "run":
+        return await compute.uncached(computed.answer, run, *asked)
+    return await compute(computed.answer, run.recording, *asked, alone=view.exclusive_spool)
 
 
 def _type_of(view: View) -> type[BaseModel]:

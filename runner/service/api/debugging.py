@@ -11,7 +11,7 @@ from pydantic import create_model
 from runner.analysis.episodes import EXPECTED
 from runner.debugging.action_outcomes import WhatIf
 from runner.debugging.what_if import what_if as outcomes_of
-from runner.service import computed, fragments
+from runner.service import computed
 from runner.service.api.replay import STEPS, ReplayPart, Start, Steps
 from runner.service.dependencies import ComputationOf, RecordedRun
 
@@ -43,6 +43,7 @@ async def what_if(
         computed.answer,
         run.recording,
         outcomes_of,
+        "json",
         (("at", at), ("actions", tuple(action or ()))),
     )
 
@@ -61,4 +62,4 @@ async def branch(
     steps: Steps = STEPS,
 ) -> Response:
     """Return steps in the form of a replay: those recorded up to the step, then those played."""
-    return await compute.json(fragments.branch_part, run.recording, at, action, start, steps)
+    return await compute.json(computed.branch_part, run.recording, at, action, start, steps)

@@ -19,7 +19,7 @@ from runner.export.encoded import encoded_pictures
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
-from runner.service import fragments
+from runner.service import computed
 from runner.service.api.files import IfNoneMatch, is_known, tag_of
 from runner.service.dependencies import (
     EPISODES,
@@ -71,7 +71,7 @@ def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: 
         steps: Steps = STEPS,
     ) -> Response:
         """Return steps of an episode: actions, rewards, and states or observations at each frame."""
-        return await compute.json(fragments.episode_part, run.recording, at, start, steps)
+        return await compute.json(computed.episode_part, run.recording, at, start, steps)
 
     @router.get(
         f"{path}/pictures",

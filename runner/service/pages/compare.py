@@ -22,11 +22,10 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.runs.run import Run
-from runner.service import fragments
-from runner.service.addresses import link, places_in, step_in
+from runner.service import computed
 from runner.service.api.reading import AxisOf
+from runner.service.computed import ShownDifference, link, places_in
 from runner.service.dependencies import At, CatalogueOf, ComputationOf, recorded_run
-from runner.service.fragments import ShownDifference
 from runner.service.pages.frame import RunHead, head_of, result_of
 from runner.service.pages.rendering import Page
 from runner.service.pages.replay import panel_of
@@ -44,6 +43,7 @@ TABS: Final[tuple[tuple[str, str], ...]] = (
     ("tables", "Q-tables"),
     ("code", "Code"),
 )
+EXPECTED_STEP: Final = "EPISODE:T such as 120:5, or eval:N:TRIAL:T"
 MAX_LATEST: Final = 4
 """Runs whose latest episodes a page replays."""
 MAX_RUNS: Final = 60
@@ -159,7 +159,7 @@ async def tasks(
     if requests_page(request):
         return RedirectResponse(f"/compare?{request.url.query}#environments")
     paths = [run.recording for run in runs]
-    return HTMLResponse(await compute(fragments.tasks, paths, axis, scores))
+    return HTMLResponse(await compute(computed.tasks, paths, axis, scores))
 
 
 @router.get("/replay")
@@ -168,8 +168,10 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
     step, problem = EpisodeRef(0), None
     try:
         if at:
-            step = step_in(at)
-        elif first := (await compute.shown(ShownDifference, fragments.difference, *runs)).first_frame:
+            step = EpisodeRef.parse(at, EXPECTED_STEP)
+            if step.word:  # which may mean different episodes of two runs
+                raise RunnerError(f"found {at[:60]!r}, expected {EXPECTED_STEP}.")
+        elif first := (await compute.shown(ShownDifference, computed.difference, *runs)).first_frame:
             step = EpisodeRef.parse(first)
     except RunnerError as error:
         problem = error
@@ -208,7 +210,7 @@ async def replay(runs: TwoRuns, compute: ComputationOf, at: At = "") -> Response
 async def difference(request: Request, runs: TwoRuns, compute: ComputationOf) -> Response:
     """Show the first step at which two runs differ, and why; or how their Q-tables differ, or their code."""
     tab = request.url.path.rpartition("/")[2]
-    function = fragments.made_difference if tab == "code" else fragments.difference
+    function = computed.made_difference if tab == "code" else computed.difference
     found = await compute.shown(ShownDifference, function, *runs)
     lead, notes, body = found.tabs[tab]
     return Page(

@@ -21,7 +21,7 @@ from starlette.types import Receive, Scope, Send
 from runner.errors import RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
 from runner.export.reports.rendering import code, environment_of
-from runner.service.addresses import link
+from runner.service.computed import link
 from runner.service.pages import static
 from runner.service.problems import error_body
 from runner.util import humanize

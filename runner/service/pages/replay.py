@@ -25,11 +25,11 @@ from runner.export.encoded import picture_note
 from runner.recording.reader import Recording, open_recording
 from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
-from runner.service import fragments
-from runner.service.addresses import link
+from runner.service import computed
 from runner.service.api.debugging import StepPath
 from runner.service.api.replay import STEPS, prepare_pictures
 from runner.service.catalogue import Catalogue
+from runner.service.computed import link
 from runner.service.dependencies import (
     EPISODES,
     At,
@@ -134,15 +134,13 @@ async def step_of(run: Run, compute: Computation, text: str) -> EpisodeRef:
         RunnerError: the text is no reference, or the run has no episode for the word.
     """
     step = EpisodeRef.parse(text)
-    return (
-        await compute.shown(EpisodeRef, fragments.resolved_step, run.recording, step) if step.word else step
-    )
+    return await compute.shown(EpisodeRef, computed.resolved_step, run.recording, step) if step.word else step
 
 
 @router.get("/replay/thumbnail")
 async def thumbnail(run: RecordedRun, compute: ComputationOf, at: At = TYPICAL) -> Response:
     """Return a small picture of an episode, which takes no environment."""
-    picture = await compute(fragments.episode_thumbnail, run.recording, EpisodeRef.parse(at))
+    picture = await compute(computed.episode_thumbnail, run.recording, EpisodeRef.parse(at))
     return Response(picture, media_type="image/svg+xml")
 
 
@@ -156,7 +154,7 @@ async def latest(
 
     204 if there is none after the one `shown`; with a header if there will be none, as the run is over.
     """
-    path = (await compute(fragments.latest_episode, run.recording)).decode()
+    path = (await compute(computed.latest_episode, run.recording)).decode()
     if path in ("", shown):
         over = {} if run.status == "running" else {"X-Run-Over": "true"}
         return Response(status_code=HTTPStatus.NO_CONTENT, headers=over)
@@ -188,7 +186,7 @@ async def _replay(
     start = max(0, at.t - BEFORE)
     step = at if start else replace(at, t=0)  # one part, cached once, for all of the first steps
     try:
-        part = await compute(fragments.episode_part, run.recording, step, start, STEPS)
+        part = await compute(computed.episode_part, run.recording, step, start, STEPS)
     except RunnerError as error:
         part = error
     await preparing
@@ -273,7 +271,7 @@ async def what_if(
     step = await step_of(run, compute, at)
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
-    found = json.loads(await compute(fragments.what_if_page, run.recording, step, action, start, STEPS))
+    found = json.loads(await compute(computed.what_if_page, run.recording, step, action, start, STEPS))
     return RunPage(
         run,
         "replay",
@@ -326,7 +324,7 @@ def _branches(recording: Recording, run: Run, catalogue: Catalogue) -> list[Link
 
 
 def stage_of(part: JsonView, t: int) -> ReplayStage:
-    """Return the stage of a part of an episode, see `fragments.episode_part`."""
+    """Return the stage of a part of an episode, see `computed.episode_part`."""
     episode = part["episode"]
     at = min(t, episode["length"])
     drawing = svg.SvgDrawing(part["scene"]) if episode["grid"] else None

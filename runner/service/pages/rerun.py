@@ -20,8 +20,8 @@ from filelock import FileLock
 
 from runner.export.rerun import viewer as native_viewer
 from runner.recording.fields import varint
-from runner.service import fragments
-from runner.service.addresses import link
+from runner.service import computed
+from runner.service.computed import link
 from runner.service.dependencies import At, ComputationOf, RecordedRun
 from runner.service.guard import POLICY
 from runner.service.pages.frame import RunPage
@@ -48,7 +48,7 @@ async def viewer(run: RecordedRun, compute: ComputationOf, at: At = "") -> Respo
     """Show the Rerun viewer, opened at a step."""
     step = await step_of(run, compute, at) if at else None
     if step:  # an error is shown here rather than in the frame
-        await compute(fragments.viewer_place, run, step)
+        await compute(computed.viewer_place, run, step)
     content = f"{step.heading}, step {step.t}." if step else OVERVIEW
     back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
@@ -60,7 +60,7 @@ async def viewer(run: RecordedRun, compute: ComputationOf, at: At = "") -> Respo
 async def frame(run: RecordedRun, compute: ComputationOf, at: At = "") -> Response:
     """Show the viewer alone, opened at a step."""
     step = await step_of(run, compute, at) if at else None
-    place = json.loads(await compute(fragments.viewer_place, run, step))
+    place = json.loads(await compute(computed.viewer_place, run, step))
     query: dict[str, object] = {}
     if step:
         query = {"episodes": step.episode} if step.after is None else {"evaluations": step.after}

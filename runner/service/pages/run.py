@@ -35,7 +35,7 @@ from runner.recording.run_file import EvaluationMetrics, Summary, has_environmen
 from runner.runs.catalogue.removal import clean, plan, remove
 from runner.runs.run import Run, label
 from runner.runs.shards import shards_in_words
-from runner.service import fragments
+from runner.service import computed
 from runner.service.api import files, runs
 from runner.service.api.reading import AxisOf
 from runner.service.dependencies import (
@@ -181,7 +181,7 @@ def branches(run: FoundRun, catalogue: CatalogueOf) -> Response:
 async def random_policy(run: FoundRun, compute: ComputationOf) -> Response:
     """Return what a random policy achieves, as a part of the run's page."""
     try:
-        return HTMLResponse(await compute(fragments.random_policy, run.recording))
+        return HTMLResponse(await compute(computed.random_policy, run.recording))
     except (OSError, RunnerError):
         return HTMLResponse("")  # the page itself shows the problem of the recording
 
@@ -189,20 +189,20 @@ async def random_policy(run: FoundRun, compute: ComputationOf) -> Response:
 @router.get("/distributions")
 async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisOf = EPISODES.name) -> Response:
     """Return the histograms of training, as a part of the run's page."""
-    return HTMLResponse(await compute(fragments.distributions, run.recording, axis))
+    return HTMLResponse(await compute(computed.distributions, run.recording, axis))
 
 
 @router.get("/pictures")
 async def pictures(run: RecordedRun, compute: ComputationOf) -> Response:
     """Show the logged pictures."""
-    body = (await compute(fragments.pictures, run.recording)).decode()
+    body = (await compute(computed.pictures, run.recording)).decode()
     return RunPage(run, "pictures", "run_body.html", {"body": body})
 
 
 @router.get("/learned")
 async def learned(run: RecordedRun, compute: ComputationOf, state: StateParts = None) -> Response:
     """Show the maps of what was learned, in the situation of a state."""
-    body = (await compute(fragments.maps, run.recording, tuple(state or ()))).decode()
+    body = (await compute(computed.maps, run.recording, tuple(state or ()))).decode()
     return RunPage(run, "learned", "run_body.html", {"body": body})
 
 

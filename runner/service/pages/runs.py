@@ -27,8 +27,8 @@ from runner.runs.catalogue.columns import (
 from runner.runs.catalogue.filters import Filter, parse
 from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.catalogue.usage import usage_of
-from runner.service.addresses import link
 from runner.service.catalogue import Catalogue
+from runner.service.computed import link
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import Page, message_of, render, viewer_of
 from runner.views.ls import VIEW as LS

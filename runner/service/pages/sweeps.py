@@ -17,9 +17,9 @@ from runner.analysis.sections import Grid
 from runner.debugging.explanation_files import explanations_in
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
-from runner.service import sweep_fragments
-from runner.service.addresses import link
+from runner.service import computed
 from runner.service.catalogue import Catalogue
+from runner.service.computed import link
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
 from runner.service.pages.rendering import Page, message_of
 from runner.service.response_cache import ALWAYS
@@ -31,9 +31,9 @@ router = APIRouter(prefix="/sweeps", include_in_schema=False)
 Name = Annotated[str, InPath(max_length=100)]
 Part = Literal["results", "importance", "pictures"]
 PARTS: Final = {
-    "results": (sweep_fragments.ranking, "Comparing the trials"),
-    "importance": (sweep_fragments.importance, "Computing the importance of parameters"),
-    "pictures": (sweep_fragments.pictures, "Drawing parameters and learning curves"),
+    "results": (computed.sweep_ranking, "Comparing the trials"),
+    "importance": (computed.sweep_importance, "Computing the importance of parameters"),
+    "pictures": (computed.sweep_pictures, "Drawing parameters and learning curves"),
 }
 """Parts of the page of a sweep in the order in which they are computed, the fastest first.
 
@@ -123,7 +123,7 @@ async def sweep_part(state: SweepOf, part: Part, cache: CacheOf, processes: Swee
     make, _ = PARTS[part]
     body = await cache.get_or_await(
         _key(state, part),
-        lambda: processes(sweep_fragments.sweep_part, make, state.name, state.folder, state.digest),
+        lambda: processes(computed.sweep_part, make, state.name, state.folder, state.digest),
         ALWAYS,
     )
     return HTMLResponse(body)
