@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from runner.archive import layout
 from runner.archive.columns import Shape
-from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
+from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.description import RunDescription

@@ -12,11 +12,10 @@ import pyarrow as pa
 from blake3 import blake3
 
 from runner.archive import layout
-from runner.archive.columns import Table
-from runner.archive.manifest import Entry, Manifest
+from runner.archive.batches import bytes_of, records_of
+from runner.archive.columns import Table, numbers
+from runner.archive.layout import Entry, Manifest
 from runner.archive.reading import Archive
-from runner.archive.rows import bytes_of, records_of
-from runner.archive.values import numbers
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -30,8 +29,8 @@ from runner.recording.writer import RecordingFile
 from runner.replay.snapshots import DerivedTables
 from runner.replay.step_replay import StepReplay
 from runner.util.arrays import Records, Unsigned
-from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import storage_errors
+from runner.util.packing import MAX_CHUNK_BYTES
 from runner.util.processes import Report
 from runner.util.values import Json
 

@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from runner.archive.layout import CONTENTS
-from runner.archive.manifest import Manifest
+from runner.archive.layout import CONTENTS, Manifest
 from runner.archive.places import archive_store, restore_to
 from runner.archive.restoring import restore
 from runner.archive.store import ArchiveStore, no_archive, split_place, temporary_folder

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.archive import layout
-from runner.archive.manifest import MAX_MANIFEST_BYTES, Entry, Manifest, is_inside, read_manifest
+from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, is_inside, read_manifest
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.util.extras import require
 from runner.util.files import sync

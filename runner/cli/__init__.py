@@ -26,8 +26,8 @@ from runner.errors import (
     full_message,
 )
 from runner.util import __version__
+from runner.util.extras import VIEWS
 from runner.util.humanize import printable
-from runner.util.plugins import VIEWS
 
 _VIEW: Final = ""
 """Stands for the module of a command that follows from a view, see `runner.views`."""

@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Final
 import click
 
 from runner.errors import nearest
-from runner.util.plugins import plugin_names
+from runner.util.extras import plugin_names
 
 _MAX_SHORT_HELP = 200
 _FORMS: Final = {

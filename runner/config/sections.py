@@ -20,10 +20,11 @@ from pydantic import (
 
 from runner.config.schedules import Probability, StepSize
 from runner.config.values import ConfigSection, Count, FrozenMapping, Optional, frozen, plain, refusal
-from runner.util.codecs import CODECS, Compression
 from runner.util.packing import (
+    CODECS,
     MAX_CHUNK_STEPS,
     MIN_CHUNK_STEPS,
+    Compression,
     Index,
     Packing,
 )

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing import palette
-from runner.environments.mdp import Mdp
-from runner.environments.scene import Landmark, SceneDescription
+from runner.environments.mdp import Landmark, Mdp, SceneDescription
 from runner.util.arrays import Array
 from runner.util.humanize import capitalised
 

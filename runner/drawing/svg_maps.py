@@ -14,7 +14,7 @@ import numpy as np
 from runner.drawing import palette
 from runner.drawing.palette import LEVELS, NO_VALUE, ink_on, ramp_colour
 from runner.drawing.svg import CELL, SvgDrawing, corner, picture
-from runner.environments.scene import SceneAction, SceneDescription
+from runner.environments.mdp import SceneAction, SceneDescription
 from runner.util.arrays import Floats, Ints
 
 _FONT: Final = "font-family:'DejaVu Sans',sans-serif"

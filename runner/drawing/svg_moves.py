@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.drawing.svg import CELL, SvgDrawing, corner, picture
-from runner.environments.scene import SceneDescription
+from runner.environments.mdp import SceneDescription
 
 WIDEST: Final = 20.0
 """Width of the heaviest arrow, in hundredths of a cell."""

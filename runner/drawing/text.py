@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from runner.drawing import palette
+from runner.environments.mdp import SceneDescription, Thing
 from runner.environments.naming import spoken
-from runner.environments.scene import SceneDescription, Thing
 
 if TYPE_CHECKING:
     from rich.text import Text

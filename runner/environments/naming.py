@@ -17,8 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from runner.environments.mdp import Mdp
-from runner.environments.scene import SceneDescription, Thing
+from runner.environments.mdp import Mdp, SceneDescription, Thing
 from runner.errors import ConfigError, nearest
 
 MAX_LISTED: Final = 8

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.config import ExperimentConfig
-from runner.util.codecs import CODECS
+from runner.util.packing import CODECS
 
 CLUMSY_EPISODES: Final = 500
 CLUMSY: Final = 0.5

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from runner.util import plugins
+from runner.util import extras
 
 if TYPE_CHECKING:
     from runner.recording.reader import Recording
@@ -35,4 +35,4 @@ def installed_export(name: str) -> Export:
     Raises:
         RunnerError: it cannot be imported.
     """
-    return plugins.load_plugin(plugins.EXPORTS, name, Export)
+    return extras.load_plugin(extras.EXPORTS, name, Export)

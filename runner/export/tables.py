@@ -1,7 +1,7 @@
 """Steps, episodes and metrics as tables, for spreadsheets and data frames: CSV or Parquet, a file each.
 
 A loop has resets with their options, infos and extras too. A column holds a number or a text; an array of
-more numbers than `runner.archive.values` spreads over columns is a column of bytes, which CSV cannot hold.
+more numbers than `runner.archive.columns` spreads over columns is a column of bytes, which CSV cannot hold.
 """
 
 from __future__ import annotations

@@ -16,8 +16,8 @@ from runner.recording import schema
 from runner.recording.gym_values import SCALARS, only_number
 from runner.recording.spaces import Value
 from runner.util.arrays import Array
-from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.jsonable import as_mapping
+from runner.util.packing import MAX_CHUNK_BYTES
 from runner.util.values import is_utf8
 
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from runner.learning.numba_cache import leave_out_scipy
+from runner.learning.compiling import leave_out_scipy
 from runner.util.arrays import Flags, Floats, Ints, Ints32
 
 leave_out_scipy()

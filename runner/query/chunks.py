@@ -23,11 +23,10 @@ from pyarrow.fs import LocalFileSystem
 
 from runner.analysis.contents import damage_of
 from runner.archive import layout
-from runner.archive.batches import Batches
+from runner.archive.batches import Batches, batch_of
 from runner.archive.columns import Shape, Table
 from runner.archive.places import archive_store
 from runner.archive.reading import Archive, check_table
-from runner.archive.rows import batch_of
 from runner.archive.store import ArchiveStore
 from runner.errors import RecordingError
 from runner.recording import schema

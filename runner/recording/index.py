@@ -59,7 +59,7 @@ from runner.recording.schema import (
     schema_id,
 )
 from runner.util.arrays import Records
-from runner.util.codecs import MAX_CHUNK_BYTES
+from runner.util.packing import MAX_CHUNK_BYTES
 
 K = TypeVar("K")
 T = TypeVar("T")

@@ -33,8 +33,8 @@ from runner.recording.records import (
     read_record,
     walk,
 )
-from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import open_regular
+from runner.util.packing import MAX_CHUNK_BYTES
 
 
 def refuse_foreign(path: Path) -> None:

@@ -22,8 +22,8 @@ from runner.environments.mdp import (
     EnvironmentDescription,
     Mdp,
     from_parts,
+    scene_mistake,
 )
-from runner.environments.scene import scene_mistake
 from runner.errors import OtherVersion, RecordingError
 from runner.recording import schema
 from runner.recording.index import Index, beginning_of, channel_of

@@ -31,8 +31,8 @@ from runner.recording.records import (
     read_record,
     unpack_chunk,
 )
-from runner.util.codecs import MAX_CHUNK_BYTES
 from runner.util.files import open_regular
+from runner.util.packing import MAX_CHUNK_BYTES
 
 N = TypeVar("N", MetadataRecord, AttachmentRecord)
 

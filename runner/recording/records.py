@@ -35,8 +35,7 @@ from runner.recording.blocks import (
     record_dtype,
 )
 from runner.util.arrays import Unsigned
-from runner.util.codecs import CODECS, MAX_CHUNK_BYTES, MCAP_CODECS, UNPACK_ERRORS
-from runner.util.packing import MAX_CHUNK_STEPS, Packing
+from runner.util.packing import CODECS, MAX_CHUNK_BYTES, MAX_CHUNK_STEPS, MCAP_CODECS, UNPACK_ERRORS, Packing
 
 MAX_METADATA_BYTES: Final = 4 << 20
 """The largest metadata record that is read, config and provenance among them."""

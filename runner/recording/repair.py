@@ -37,8 +37,8 @@ from runner.recording.records import (
 )
 from runner.recording.run_file import Summary, parse_result
 from runner.recording.writer import RecordingFile
-from runner.util.codecs import MAX_CHUNK_BYTES, MCAP_CODECS
 from runner.util.files import open_regular
+from runner.util.packing import MAX_CHUNK_BYTES, MCAP_CODECS
 
 _CHUNK_TIMES_AND_SIZE: Final = struct.Struct("<QQQ")
 _MAX_MESSAGES: Final = 2**62

@@ -20,7 +20,7 @@ from runner.recording.record_store import RecordStore
 from runner.recording.records import ChunkEntry, checked_messages
 from runner.recording.schema import TOPIC_OF, MessageType, Topic
 from runner.util.arrays import Ints, RecordDType, Records
-from runner.util.codecs import MAX_CHUNK_BYTES
+from runner.util.packing import MAX_CHUNK_BYTES
 
 M = TypeVar("M")
 FOREVER: Final = 2**63 - 1

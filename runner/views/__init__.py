@@ -1,7 +1,7 @@
 """Views: questions about recorded runs, each asked once. Commands, routes and pages are derived from them.
 
 A view is a module with a `VIEW`. It imports heavy packages in its function, so that help is quick. Installed
-packages add views by entry points, see `runner.util.plugins`.
+packages add views by entry points, see `runner.util.extras`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import cache
 from importlib import import_module
 from typing import Final
 
-from runner.util import plugins
+from runner.util import extras
 from runner.views.view import View
 
 NAMES: Final = (
@@ -53,6 +53,6 @@ def view_named(name: str) -> View:
         RunnerError: it cannot be imported.
     """
     if name not in NAMES:
-        return plugins.load_plugin(plugins.VIEWS, name, View)
+        return extras.load_plugin(extras.VIEWS, name, View)
     view: View = import_module(f"runner.views.{name.replace(' ', '_')}").VIEW
     return view

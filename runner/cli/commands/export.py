@@ -16,8 +16,8 @@ from runner.cli.runs import compilation_notice, recorded_run
 from runner.export.places import new_file, require_new
 from runner.export.plugin import installed_export
 from runner.runs.run import Run
+from runner.util.extras import EXPORTS
 from runner.util.humanize import duration
-from runner.util.plugins import EXPORTS
 
 if TYPE_CHECKING:
     from runner.export.rerun.selection import Request, Selection

@@ -14,9 +14,8 @@ import rerun as rr
 
 from runner.drawing import palette
 from runner.drawing.svg import VEHICLES, wall_ends
-from runner.environments.mdp import Mdp
+from runner.environments.mdp import Mdp, SceneDescription
 from runner.environments.naming import action_names, states_in_words
-from runner.environments.scene import SceneDescription
 from runner.export.rerun.tracks import GREY, Track, TrackView, centred, labels_alone, pairs
 from runner.util.arrays import Ints
 

@@ -31,7 +31,7 @@ from runner.service.dependencies import (
     recording_state,
 )
 from runner.service.tokens import Digest
-from runner.util.plugins import EXPORTS, plugin_names
+from runner.util.extras import EXPORTS, plugin_names
 from runner.util.processes import CallFailed
 from runner.util.values import Ranges, ranges_in
 

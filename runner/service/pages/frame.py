@@ -18,7 +18,7 @@ from runner.recording.reader import open_recording
 from runner.recording.run_file import EvaluationMetrics, has_environment
 from runner.runs.run import Run
 from runner.service.pages.rendering import Page, Values, made
-from runner.util import humanize, plugins
+from runner.util import extras, humanize
 from runner.views import NAMES, shipped_views, view_named
 
 StatusName = Annotated[str, Query(max_length=20, description="The status that the page shows.")]
@@ -38,7 +38,7 @@ TABS: Final = (
 def installed_names() -> list[str]:
     """Return the names of the views that installed packages add, except names of shipped pages."""
     shipped = {*NAMES, *(path for path, *_ in TABS)}
-    return [name for name in plugins.plugin_names(plugins.VIEWS) if name not in shipped]
+    return [name for name in extras.plugin_names(extras.VIEWS) if name not in shipped]
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ from runner.service.pages.frame import RunPage, StatusName, result_of
 from runner.service.pages.rendering import Form, Page, form_of, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
-from runner.util.plugins import EXPORTS, plugin_names
+from runner.util.extras import EXPORTS, plugin_names
 from runner.util.values import Json, JsonView
 
 router = APIRouter(prefix="/runs/{run}", include_in_schema=False)

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from runner.archive import layout
-from runner.archive.manifest import Entry, Manifest, entries_of
+from runner.archive.layout import Entry, Manifest, entries_of
 from runner.archive.reading import Archive
 from runner.archive.restoring import restore
 from runner.archive.runs import archive_run

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from runner.archive import layout, writing
-from runner.archive.manifest import Entry, Manifest
+from runner.archive.layout import Entry, Manifest
 from runner.archive.store import ArchiveStore
 from runner.cli import cli
 from runner.recording.liveness import owner as this_process

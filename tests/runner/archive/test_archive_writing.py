@@ -9,7 +9,7 @@ import pytest
 
 from runner.archive import layout
 from runner.archive.batches import Batches
-from runner.archive.manifest import entry_of, read_manifest
+from runner.archive.layout import entry_of, read_manifest
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError
 from runner.recording import schema

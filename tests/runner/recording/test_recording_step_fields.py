@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import pytest
 
 from runner.archive import layout
+from runner.archive.batches import batch_of, records_of
 from runner.archive.columns import Shape
-from runner.archive.rows import batch_of, records_of
 from runner.recording import schema
 from runner.recording.blocks import blank_records
 from runner.recording.layout import layout_of

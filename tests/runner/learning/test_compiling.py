@@ -8,7 +8,7 @@ import pytest
 from numba.core import caching
 
 from runner.learning import algorithms, kernel, schedules
-from runner.learning.numba_cache import stamp
+from runner.learning.compiling import stamp
 
 
 def test_the_stamp_changes_with_any_file_of_the_folder(tmp_path):
@@ -41,7 +41,7 @@ def test_an_index_with_a_class_that_was_renamed_is_made_anew(tmp_path):
         "if sys.argv[1] != 'Old':\n    del Old\n"
     )
     (tmp_path / "loops.py").write_text(
-        "import runner.learning.numba_cache, numba\n"
+        "import runner.learning.compiling, numba\n"
         "@numba.njit(cache=True)\ndef plus_one(pair):\n    return pair.value + 1\n"
     )
     program = "import sys, kinds; from loops import plus_one; print(plus_one(getattr(kinds, sys.argv[1])(1)))"
