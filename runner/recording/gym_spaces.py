@@ -1,7 +1,7 @@
 """Gymnasium's spaces in a recording: a class for each kind, which describes, encodes and restores the space.
 
-A new kind of space is a class here and an entry in `_KINDS`; a space of a user's own becomes one by
-`register_space`:
+A new kind of space is a class here, and an entry in `_KINDS`, and in `_RESTORE` unless its values are texts;
+a space of a user's own becomes one by `register_space`:
 
     runner.register_space(Board, to_json=lambda board: board.cells, from_json=Board.of_cells)
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import string
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, Generic, TypeVar
 
@@ -68,7 +68,7 @@ def recorded_space(space: Space) -> RecordedSpace[Any]:
         if cls in _KINDS:
             return _KINDS[cls](space)
     is_array = space.shape is not None and space.dtype is not None and np.dtype(space.dtype).kind in "biuf"
-    return _Box(space) if is_array else RecordedSpace(space)
+    return _Numbers(space) if is_array else RecordedSpace(space)
 
 
 def checked_leaves(space: Space, where: str) -> list[tuple[Keys, RecordedSpace[Any]]]:
@@ -93,7 +93,21 @@ def restore_space(description: Description) -> Space:
     Raises:
         AssertionError, KeyError, TypeError, ValueError, OverflowError: Gymnasium has no such space.
     """
-    return _RESTORABLE[description["type"]].restore(description)
+    return _RESTORE[description["type"]](description)
+
+
+def _restored_box(description: Description) -> spaces.Box:
+    dtype = _dtype(description)
+    shape = tuple(description["shape"])
+    if dtype.kind == "f":
+        least, most = -np.inf, np.inf
+    else:
+        least, most = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    low, high = (
+        np.broadcast_to(np.array(widest if bound is None else _numbers_in(bound), dtype), shape)
+        for bound, widest in ((description["low"], least), (description["high"], most))
+    )
+    return spaces.Box(low, high, shape, dtype.type)
 
 
 def value_of(space: Space, text: str) -> object:
@@ -161,11 +175,6 @@ class RecordedSpace(Generic[SpaceT]):
         """Return what describes the space of values that are recorded as text; empty if it is unknown."""
         return {}
 
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        """Return the space that is described."""
-        raise KeyError(description["type"])
-
     def widened(self, value: object) -> Space:  # noqa: ARG002
         """Return an action space in whose dtypes an action, or a batch of actions, is exact.
 
@@ -178,10 +187,18 @@ class RecordedSpace(Generic[SpaceT]):
         return False
 
 
-class _Composite(RecordedSpace[SpaceT]):
-    """A `Dict` or a `Tuple`; `parts` by their keys."""
+class _Composite(RecordedSpace[Space]):
+    """A `Dict` or a `Tuple`."""
 
-    parts: Mapping[Any, RecordedSpace[Any]]
+    def __init__(self, space: spaces.Dict | spaces.Tuple[Any]) -> None:
+        super().__init__(space)
+        self.is_dict = isinstance(space, spaces.Dict)
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        self.parts: dict[Any, RecordedSpace[Any]] = {key: recorded_space(part) for key, part in parts}
+
+    def _composed(self, parts: Iterable[object]) -> Any:
+        """Return a value with these parts, in order."""
+        return dict(zip(self.parts, parts, strict=True)) if self.is_dict else tuple(parts)
 
     def leaves(self, where: str) -> Iterator[tuple[Keys, RecordedSpace[Any]]]:
         for key, part in self.parts.items():
@@ -192,68 +209,42 @@ class _Composite(RecordedSpace[SpaceT]):
             for keys, leaf in part.leaves(where):
                 yield (key, *keys), leaf
 
-    def can_widen(self) -> bool:
-        return any(part.can_widen() for part in self.parts.values())
-
-
-class _Dict(_Composite[spaces.Dict]):
-    def __init__(self, space: spaces.Dict) -> None:
-        super().__init__(space)
-        self.parts = {key: recorded_space(part) for key, part in space.spaces.items()}
-
     def to_json(self, value: Value) -> Value:
-        return {str(key): part.to_json(value[key]) for key, part in self.parts.items()}
-
-    def from_json(self, data: Value) -> Value:
-        return {key: part.from_json(data[str(key)]) for key, part in self.parts.items()}
-
-    def batch(self, values: Value) -> Value:
-        return {key: part.batch([value[str(key)] for value in values]) for key, part in self.parts.items()}
-
-    def describe(self) -> Description:
-        return {"type": "Dict", "spaces": {str(key): part.describe() for key, part in self.parts.items()}}
-
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        return spaces.Dict({name: restore_space(part) for name, part in description["spaces"].items()})
-
-    def widened(self, value: object) -> Space:
-        if not isinstance(value, Mapping):
-            return self.space
-        wide = {
-            key: part.widened(value[key]) if key in value else part.space for key, part in self.parts.items()
-        }
-        is_same = all(wide[key] is part.space for key, part in self.parts.items())
-        return self.space if is_same else spaces.Dict(wide)
-
-
-class _Tuple(_Composite["spaces.Tuple[Any]"]):
-    def __init__(self, space: spaces.Tuple[Any]) -> None:
-        super().__init__(space)
-        self.parts = dict(enumerate(map(recorded_space, space.spaces)))
-
-    def to_json(self, value: Value) -> Value:
+        if self.is_dict:
+            return {str(key): part.to_json(value[key]) for key, part in self.parts.items()}
         return [part.to_json(item) for part, item in zip(self.parts.values(), value, strict=True)]
 
     def from_json(self, data: Value) -> Value:
-        return tuple(part.from_json(item) for part, item in zip(self.parts.values(), data, strict=True))
+        given = [data[str(key)] for key in self.parts] if self.is_dict else data
+        return self._composed(
+            [part.from_json(item) for part, item in zip(self.parts.values(), given, strict=True)]
+        )
 
     def batch(self, values: Value) -> Value:
-        return tuple(part.batch([value[i] for value in values]) for i, part in self.parts.items())
+        names = map(str, self.parts) if self.is_dict else self.parts
+        return self._composed(
+            [
+                part.batch([value[name] for value in values])
+                for part, name in zip(self.parts.values(), names, strict=True)
+            ]
+        )
 
     def describe(self) -> Description:
-        return {"type": "Tuple", "spaces": [part.describe() for part in self.parts.values()]}
+        described = {str(key): part.describe() for key, part in self.parts.items()}
+        kind = "Dict" if self.is_dict else "Tuple"
+        return {"type": kind, "spaces": described if self.is_dict else [*described.values()]}
 
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        return spaces.Tuple(map(restore_space, description["spaces"]))
-
-    def widened(self, value: object) -> Space:
-        if not isinstance(value, Sequence):
+    def widened(self, value: Any) -> Space:
+        if not isinstance(value, Mapping if self.is_dict else Sequence):
             return self.space
-        wide = [part.widened(item) for part, item in zip(self.parts.values(), value, strict=False)]
-        is_same = all(part.space is space for part, space in zip(self.parts.values(), wide, strict=False))
-        return self.space if is_same else spaces.Tuple(wide)
+        items = value if self.is_dict else dict(enumerate(value))
+        wide = [part.widened(items[key]) if key in items else part.space for key, part in self.parts.items()]
+        if all(part.space is space for part, space in zip(self.parts.values(), wide, strict=True)):
+            return self.space
+        return spaces.Dict(self._composed(wide)) if self.is_dict else spaces.Tuple(wide)
+
+    def can_widen(self) -> bool:
+        return any(part.can_widen() for part in self.parts.values())
 
 
 class _Sequence(RecordedSpace[spaces.Sequence]):
@@ -361,19 +352,13 @@ class _Text(RecordedSpace[spaces.Text]):
     def describe(self) -> Description:
         return {"type": "Text", "max_length": int(self.space.max_length)}
 
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        length = max(int(description["max_length"]), 1)
-        return spaces.Text(length, min_length=0, charset=string.printable)
 
+class _Numbers(RecordedSpace[Space]):
+    """A space, also of another library, whose values are numbers or arrays of one shape and dtype."""
 
-class _Box(RecordedSpace[SpaceT]):
-    """A box, and any space of another library whose values are arrays of one shape and dtype."""
-
-    name = "Box"
     dtype: DType
 
-    def __init__(self, space: SpaceT) -> None:
+    def __init__(self, space: Space) -> None:
         super().__init__(space)
         self.dtype = np.dtype((np.dtype(space.dtype).newbyteorder("<"), space.shape or ()))
 
@@ -393,25 +378,15 @@ class _Box(RecordedSpace[SpaceT]):
 
     def describe(self) -> Description:
         layout = {"dtype": self.dtype.base.str, "shape": list(self.dtype.shape)}
-        return {"type": self.name, **layout, **self.details()}
-
-    def details(self) -> Description:
-        """Return what describes the space besides its dtype and shape."""
-        return {name: _bound(getattr(self.space, name, None)) for name in ("low", "high")}
-
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        dtype = _dtype(description)
-        shape = tuple(description["shape"])
-        if dtype.kind == "f":
-            least, most = -np.inf, np.inf
-        else:
-            least, most = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-        low, high = (
-            np.broadcast_to(np.array(widest if bound is None else _numbers_in(bound), dtype), shape)
-            for bound, widest in ((description["low"], least), (description["high"], most))
-        )
-        return spaces.Box(low, high, shape, dtype.type)
+        match self.space:
+            case spaces.Discrete():
+                return {"type": "Discrete", **layout, "n": int(self.space.n), "start": int(self.space.start)}
+            case spaces.MultiDiscrete():
+                return {"type": "MultiDiscrete", **layout, "nvec": np.asarray(self.space.nvec).tolist()}
+            case spaces.MultiBinary():
+                return {"type": "MultiBinary", **layout}
+        bounds = {name: _bound(getattr(self.space, name, None)) for name in ("low", "high")}
+        return {"type": "Box", **layout, **bounds}
 
     def widened(self, value: object) -> Space:
         space: Any = self.space
@@ -428,56 +403,29 @@ class _Box(RecordedSpace[SpaceT]):
         return isinstance(self.space, spaces.Box) and not np.can_cast(np.float64, self.space.dtype)
 
 
-class _Discrete(_Box[spaces.Discrete]):
-    name = "Discrete"
-
-    def details(self) -> Description:
-        return {"n": int(self.space.n), "start": int(self.space.start)}
-
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        return spaces.Discrete(int(description["n"]), start=int(description["start"]))
-
-
-class _MultiDiscrete(_Box[spaces.MultiDiscrete]):
-    name = "MultiDiscrete"
-
-    def details(self) -> Description:
-        return {"nvec": np.asarray(self.space.nvec).tolist()}
-
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        return spaces.MultiDiscrete(np.array(description["nvec"]), dtype=_dtype(description).type)
-
-
-class _MultiBinary(_Box[spaces.MultiBinary]):
-    name = "MultiBinary"
-
-    def details(self) -> Description:
-        return {}
-
-    @classmethod
-    def restore(cls, description: Description) -> Space:
-        shape = tuple(description["shape"])
-        return spaces.MultiBinary(shape[0] if len(shape) == 1 else shape)
-
-
-_RESTORABLE: Final[Mapping[str, type[RecordedSpace[Any]]]] = {
-    "Dict": _Dict,
-    "Tuple": _Tuple,
-    "Text": _Text,
-    "Discrete": _Discrete,
-    "MultiDiscrete": _MultiDiscrete,
-    "MultiBinary": _MultiBinary,
-    "Box": _Box,
-}
-"""The kinds of spaces that a description can have as its `type`; values of the others are texts."""
 _KINDS: Final[dict[type[Space], Callable[[Any], RecordedSpace[Any]]]] = {
+    spaces.Dict: _Composite,
+    spaces.Tuple: _Composite,
     spaces.Graph: _Graph,
     spaces.Sequence: _Sequence,
     spaces.OneOf: _OneOf,
-    **{getattr(spaces, name): kind for name, kind in _RESTORABLE.items()},
+    spaces.Text: _Text,
+    **dict.fromkeys((spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary), _Numbers),
 }
+
+
+_RESTORE: Final[Mapping[str, Callable[[Description], Space]]] = {
+    "Dict": lambda dict_: spaces.Dict({name: restore_space(part) for name, part in dict_["spaces"].items()}),
+    "Tuple": lambda tuple_: spaces.Tuple(map(restore_space, tuple_["spaces"])),
+    "Text": lambda text: spaces.Text(max(int(text["max_length"]), 1), min_length=0, charset=string.printable),
+    "Discrete": lambda discrete: spaces.Discrete(int(discrete["n"]), start=int(discrete["start"])),
+    "MultiDiscrete": lambda many: spaces.MultiDiscrete(np.array(many["nvec"]), dtype=_dtype(many).type),
+    "MultiBinary": lambda binary: spaces.MultiBinary(
+        binary["shape"][0] if len(binary["shape"]) == 1 else tuple(binary["shape"])
+    ),
+    "Box": _restored_box,
+}
+"""The kinds of spaces that a description can have as its `type`; values of the others are texts."""
 
 
 def _dtype(description: Description) -> DType:
