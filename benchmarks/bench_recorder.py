@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import NO_LIMIT, blocks, tutorial_learner
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES
-from runner.recording.layout import layout_of
+from runner.recording.layout import HEADER_BYTES, layout_of
 from runner.recording.messages import file_descriptor_set
 from runner.recording.recorder import Recorder
 from runner.recording.writer import RecordingFile

@@ -12,8 +12,7 @@ from runner.config import load
 from runner.environments.loading import load_mdp
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 
 BLOCK_STEPS = 16_384
 """The default of `recording.chunk_steps`."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runner.errors import RecordingError, RunnerError, nearest
-from runner.recording.clock import read_clock
+from runner.recording.machine import read_clock
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
 from runner.recording.schema import SCALAR_TOPIC, STEP_NANOSECONDS

@@ -30,7 +30,7 @@ from runner.recording import schema
 from runner.recording.extras import filled
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
-from runner.recording.turns import taken
+from runner.recording.steps import taken
 from runner.replay.steps import steps_of
 from runner.runs.listing import run_at
 from runner.runs.run import Run

@@ -22,8 +22,8 @@ from runner.analysis.sections import Answer, Grid, Section
 from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.clock import Clock, read_clock
-from runner.recording.composition import Composition, composition_of
+from runner.recording.environment import Composition, composition_of
+from runner.recording.machine import Clock, read_clock
 from runner.recording.maker import Shard
 from runner.recording.messages import Message
 from runner.recording.reader import Recording, open_recording

@@ -19,7 +19,7 @@ from runner.archive.columns import Shape, Table, numbers
 from runner.archive.layout import PHASES, Entry
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, blank_records, message_record
+from runner.recording.layout import HEADER_BYTES, blank_records, message_record
 from runner.recording.messages import Message, decode, encode, encode_image, encode_log, log_level
 from runner.recording.reader import Recording, extra_layouts
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic

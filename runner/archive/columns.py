@@ -29,11 +29,10 @@ from runner.archive import layout
 from runner.archive.layout import TEXT
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import record_dtype
 from runner.recording.description import RunDescription
 from runner.recording.extras import ExtraLayout
 from runner.recording.fields import Field
-from runner.recording.layout import NUMBERS
+from runner.recording.layout import NUMBERS, record_dtype
 from runner.recording.schema import MessageType, Topic
 from runner.recording.spaces import Leaf, Value, decode, encode_bytes, encode_text, leaves_of, row_dtype
 from runner.util.arrays import Array, RecordDType, Records

@@ -19,7 +19,7 @@ from runner.archive.reading import Archive
 from runner.config.loading import recorded_packing
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import message_record
+from runner.recording.layout import message_record
 from runner.recording.messages import QTable, encode_q_table
 from runner.recording.pipeline import MessageBatches, Pipeline
 from runner.recording.reader import open_recording

@@ -28,8 +28,8 @@ from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import message_record
 from runner.recording.description import recorded_facts
+from runner.recording.layout import message_record
 from runner.recording.marks import MARKS_FILE, Marks, read_marks
 from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.metadata import kind_of

@@ -31,8 +31,7 @@ from runner.execution.session import evaluation_metrics
 from runner.learning.learner import Learner
 from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 from runner.sweep.local import Workers
 from runner.sweep.objective import readings
 from runner.util import __version__

@@ -28,7 +28,7 @@ from runner.export.reports.player_data import Playback
 from runner.planning.evaluation import action_values, policy_values
 from runner.planning.optimum import optimal_values
 from runner.recording import schema
-from runner.recording.blocks import blank_records
+from runner.recording.layout import blank_records
 from runner.recording.reader import Recording
 from runner.replay.steps import episode_blocks, steps_of
 from runner.replay.tables import TableReplay

@@ -26,7 +26,7 @@ from runner.errors import ConfigError, RunnerError
 from runner.execution.initial_tables import recorded_tables
 from runner.execution.session import Report, run_job
 from runner.recording.reader import Recording, open_recording
-from runner.recording.reuse import PackedChunks
+from runner.recording.reference import PackedChunks
 from runner.runs.branches import TrainingOrigin, origin_in
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.processes import Stop

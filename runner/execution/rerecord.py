@@ -21,14 +21,13 @@ from runner.execution.initial_tables import address, recorded_tables
 from runner.execution.session import Report, Session, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.actions import ACTION_TOPICS, after_step
 from runner.recording.description import recorded_facts
 from runner.recording.digest import combined_digest
 from runner.recording.observer import Observer
 from runner.recording.reader import Recording, open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
-from runner.recording.turns import is_taken
+from runner.recording.steps import ACTION_TOPICS, after_step, is_taken
 from runner.recording.writer import RecordingFile
 from runner.replay.engine import Replay
 from runner.replay.makers import stream_from_child, why_not_rerun

@@ -32,10 +32,10 @@ from runner.recording.code import CODE_RECORD
 from runner.recording.description import recorded_facts
 from runner.recording.index import Index
 from runner.recording.integrity import may_be_cut, survey
-from runner.recording.liveness import owner
 from runner.recording.metadata import REQUIRED_RECORDS
 from runner.recording.reader import Recording, open_recording
 from runner.recording.reference import Reference
+from runner.recording.run_file import owner
 from runner.recording.writer import RecordingFile, writing
 from runner.replay.trust import require_may_train
 from runner.runs.code import CodeCollector

@@ -32,8 +32,7 @@ from runner.recording.metadata import (
 from runner.recording.metrics import METRICS, defined_metrics
 from runner.recording.observer import Observer
 from runner.recording.recorder import Recorder
-from runner.recording.reference import Reference
-from runner.recording.reuse import PackedChunks
+from runner.recording.reference import PackedChunks, Reference
 from runner.recording.writer import RecordingFile, create_recording
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector

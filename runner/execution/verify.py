@@ -40,9 +40,9 @@ from runner.errors import (
     RunnerError,
 )
 from runner.recording import schema
-from runner.recording.composition import Composition, composition_of
 from runner.recording.consistency import Findings, Inconsistent, check_extras, check_phase
 from runner.recording.digest import combined_digest
+from runner.recording.environment import Composition, composition_of
 from runner.recording.integrity import check_integrity, refuse_foreign, survey
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording, open_recording

@@ -17,7 +17,7 @@ from runner.errors import RecordingError
 from runner.export.values import acted, observed
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value, least_number
-from runner.recording.turns import turns_of
+from runner.recording.steps import turns_of
 from runner.util.arrays import Flags, Floats, Records
 from runner.util.values import Ranges
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from runner.analysis.series import training_steps_before
 from runner.recording import schema
-from runner.recording.clock import read_clock
+from runner.recording.machine import read_clock
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording

@@ -13,7 +13,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.drawing.raster import Pixels
 from runner.environments.naming import agent_actions, numbered_actions, spoken
 from runner.recording import schema
-from runner.recording.observation_names import observation_names
+from runner.recording.environment import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
 from runner.replay.recorded import reset_of

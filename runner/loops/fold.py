@@ -46,8 +46,7 @@ from runner.recording.metadata import json_object, layout_of_run, write_result
 from runner.recording.observer import Observer
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
-from runner.recording.reset_options import ResetOptions
-from runner.recording.reset_states import ResetState
+from runner.recording.resets import ResetOptions, ResetState
 from runner.recording.rewriting import content_of
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic

@@ -22,14 +22,13 @@ from runner.loops.fold import OWNER_WAITS, fold_if_over
 from runner.loops.options import Options
 from runner.loops.outcomes import Outcomes
 from runner.recording import schema
-from runner.recording.action_recorder import ActionRecorder
-from runner.recording.actions import ACTION_TOPICS
-from runner.recording.compaction import compacted
 from runner.recording.gym_spaces import recorded_space
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.metadata import run_metadata, write_description, write_maker, write_result
 from runner.recording.observer import Observer
-from runner.recording.recorder import Recorder
+from runner.recording.recorder import ActionRecorder, Recorder
+from runner.recording.rewriting import compacted
+from runner.recording.steps import ACTION_TOPICS
 from runner.recording.syncing import SYNCER
 from runner.recording.writer import create_recording
 from runner.runs.code import CodeCollector

@@ -15,14 +15,14 @@ import numpy as np
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import MAGIC
 from runner.recording.integrity import check_up_to_cut
+from runner.recording.layout import MAGIC
 from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording, open_recording
 from runner.recording.repair import can_be_repaired
 from runner.recording.schema import STEP_NANOSECONDS
+from runner.recording.steps import is_of_environment, is_taken
 from runner.recording.topic_chunks import FOREVER, TopicChunks
-from runner.recording.turns import is_of_environment, is_taken
 from runner.runs.listing import run_in
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
 from runner.runs.shards import shard_folders

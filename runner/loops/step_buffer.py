@@ -35,8 +35,7 @@ from runner.recording.gym_values import (
     step_filler,
 )
 from runner.recording.recorder import BLOCK_BYTES, Recorder
-from runner.recording.reset_options import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions
-from runner.recording.reset_states import ResetState
+from runner.recording.resets import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions, ResetState
 from runner.recording.spaces import Value, least_number
 from runner.util.arrays import Array, Flags, Floats, Ints, Records, zeros
 

@@ -19,9 +19,8 @@ from runner.recording.description import environment_count
 from runner.recording.episode_log import Columns, EpisodeLog, TurnBlock
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number
-from runner.recording.steps import aligned
+from runner.recording.steps import aligned, is_taken
 from runner.recording.topic_chunks import TopicChunks
-from runner.recording.turns import is_taken
 from runner.util.arrays import Array, Flags, Ints, Records, zeros
 from runner.util.differences import first_differing_row
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.clock import Clock
+from runner.recording.machine import Clock
 from runner.recording.reader import Recording
 
 STREAMS: Final = ("", "stdout", "stderr")

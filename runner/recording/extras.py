@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES
 from runner.recording.fields import space_field
 from runner.recording.index import Beginning, Index, beginning_of_extras
+from runner.recording.layout import HEADER_BYTES
 from runner.recording.messages import Message, decode
 from runner.recording.metadata import json_object
 from runner.recording.records import ReadChunk, check_constants

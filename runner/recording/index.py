@@ -31,8 +31,7 @@ from mcap.records import (
 )
 
 from runner.errors import CutOff, RecordingError
-from runner.recording.blocks import MAGIC, MESSAGE_HEAD, RECORD_HEAD
-from runner.recording.layout import Layout
+from runner.recording.layout import MAGIC, MESSAGE_HEAD, RECORD_HEAD, Layout
 from runner.recording.messages import file_descriptor_set
 from runner.recording.records import (
     CHUNK_HEAD,

@@ -16,10 +16,9 @@ from typing import BinaryIO
 
 from runner.errors import CutOff, OtherVersion, RecordingError
 from runner.recording import schema
-from runner.recording.blocks import MAGIC, RECORD_HEAD
 from runner.recording.extras import ExtraNames
 from runner.recording.index import Index, beginning_of, check_beginning, checksum
-from runner.recording.layout import Layout
+from runner.recording.layout import MAGIC, RECORD_HEAD, Layout
 from runner.recording.metadata import layout_of_run
 from runner.recording.records import (
     ChunkEntry,

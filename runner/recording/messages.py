@@ -16,8 +16,8 @@ from google.protobuf.message import DecodeError
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, blank_records, constant_bytes, row_dtype
 from runner.recording.fields import Field, varint
+from runner.recording.layout import HEADER_BYTES, blank_records, constant_bytes, row_dtype
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import NUMBERS
 from runner.util.arrays import Array, Floats, Records

@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Final
 
 from runner.recording import schema
-from runner.recording.clock import SAMPLE_SECONDS, Stopwatch, interval
 from runner.recording.console import ConsoleLog, Tee
-from runner.recording.host import HostSampler
+from runner.recording.machine import SAMPLE_SECONDS, HostSampler, Stopwatch, interval
 from runner.recording.messages import Message, encode
 from runner.recording.schema import Topic
 

@@ -23,8 +23,8 @@ from typing import Final
 
 import numpy as np
 
-from runner.recording.blocks import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, lone_message
 from runner.recording.digest import ContentHash
+from runner.recording.layout import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, lone_message
 from runner.recording.records import Chunk, Packed, encode_chunk
 from runner.recording.schema import ACTIONS, RESET, RESET_OPTIONS, RESET_STATE, STEP, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile, storage_error

@@ -28,7 +28,6 @@ from runner.recording import schema
 from runner.recording.description import RunDescription, environment_count
 from runner.recording.extras import ExtraLayout, Extras, read_layouts
 from runner.recording.labels import read_labels
-from runner.recording.liveness import is_owned
 from runner.recording.maker import MAKER_RECORD, SHARD_MAKER, EnvironmentMaker
 from runner.recording.messages import (
     Message,
@@ -43,14 +42,12 @@ from runner.recording.messages import (
 from runner.recording.metadata import check_file
 from runner.recording.metrics import RECENT_EPISODES, finite_mean
 from runner.recording.record_store import RecordStore
-from runner.recording.reset_options import ResetOptions, decode_reset_options
-from runner.recording.reset_states import ResetState, decode_reset_state
-from runner.recording.run_file import RecentTraining, run_title
+from runner.recording.resets import ResetOptions, ResetState, decode_reset_options, decode_reset_state
+from runner.recording.run_file import RecentTraining, is_owned, run_title
 from runner.recording.schema import Topic, topics_of
 from runner.recording.spaces import decode as decode_value
-from runner.recording.steps import EpisodeSteps, Steps
+from runner.recording.steps import EpisodeSteps, Steps, taken
 from runner.recording.topic_chunks import FOREVER, TopicChunks
-from runner.recording.turns import taken
 from runner.util.arrays import Records
 
 MAX_METRICS: Final = 1 << 17

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.errors import RecordingError
-from runner.recording.blocks import RECORD_HEAD
 from runner.recording.index import read_index
+from runner.recording.layout import RECORD_HEAD
 from runner.recording.records import (
     MAX_METADATA_BYTES,
     AttachmentRecord,

@@ -25,7 +25,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import (
+from runner.recording.layout import (
     HEADER,
     HEADER_BYTES,
     MAGIC,

@@ -20,9 +20,9 @@ import numpy as np
 
 from runner.errors import RecordingError, StorageError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, MAGIC, RECORD_HEAD, record_dtype
 from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
+from runner.recording.layout import HEADER_BYTES, MAGIC, RECORD_HEAD, record_dtype
 from runner.recording.messages import decode
 from runner.recording.metadata import REQUIRED_RECORDS, LostRanges, check_run, json_object, layout_of_run
 from runner.recording.reader import Recording, open_recording

@@ -1,4 +1,4 @@
-"""The contents of `run.json` and of a recording's result, parsed once into typed records.
+"""The contents of `run.json` and of a recording's result, as typed records; the process that owns a run.
 
 Anyone may have written either of them. An invalid value is left out of the record and named in a problem, so
 that no other code has to check types.
@@ -8,14 +8,20 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import re
+import socket
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeGuard
 
 from runner.errors import shortened
 from runner.recording.metrics import METRICS
+from runner.util.files import read_object
 from runner.util.values import MAX_JSON_DEPTH, Json, JsonView, is_number, is_too_deep
 
 STATED_STATUSES: Final = ("running", "finished", "interrupted", "failed")
@@ -328,3 +334,76 @@ _RUN: Final = {
     "proof": _optional(_DIGEST),
     "recording": _TEXT,
 }
+
+_MAX_RUN_FILE_BYTES: Final = 8 << 20
+HEARTBEAT_SECONDS: Final = 15.0
+"""On another host, a run without a heartbeat for this long counts as interrupted."""
+
+
+def owner() -> Json:
+    """Return the identity of this process: host, boot, process id and start."""
+    return {"host": socket.gethostname(), **_of_process(os.getpid())}
+
+
+@lru_cache(1)
+def _of_process(pid: int) -> dict[str, object]:
+    """Return what does not change while this process lives."""
+    return {"boot_id": boot_id(), "pid": pid, "process_started": process_start(pid)}
+
+
+def is_alive(owner: JsonView, heartbeat: Path) -> bool:
+    """Return whether an owner is alive: its process, if it is on this machine; else by its last heartbeat.
+
+    Args:
+        heartbeat: the file whose modification time is set at each heartbeat.
+    """
+    if owner.get("host") == socket.gethostname() and owner.get("boot_id") == boot_id():
+        started = process_start(owner.get("pid", 0))
+        return started is not None and started == owner.get("process_started")
+    with contextlib.suppress(OSError):
+        return time.time() - heartbeat.stat().st_mtime < HEARTBEAT_SECONDS
+    return False
+
+
+def is_owned(folder: Path) -> bool:
+    """Return whether a living process owns the run in a folder, according to its `run.json`."""
+    try:
+        facts = read_object(folder / "run.json", _MAX_RUN_FILE_BYTES)
+    except (OSError, ValueError):
+        return False
+    process = facts.get("owner")
+    return (
+        facts.get("status") == "running"
+        and isinstance(process, dict)
+        and is_alive(process, folder / "run.json")
+    )
+
+
+def boot_id() -> str:
+    """Return an identifier of this boot of the machine."""
+    with contextlib.suppress(OSError):
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    import psutil
+
+    return f"{psutil.boot_time():.0f}"
+
+
+def process_start(pid: int) -> float | None:
+    """Return when a process started, comparable within one boot of the machine; None if there is none.
+
+    On Linux it is counted in ticks since the boot, so that setting the clock changes nothing.
+    """
+    if not isinstance(pid, int) or isinstance(pid, bool):
+        return None  # a file may contain anything
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return None if fields[0] == "Z" else float(fields[19])
+    if Path("/proc/self/stat").exists():
+        return None
+    import psutil
+
+    try:
+        process = psutil.Process(pid)
+        return None if process.status() == psutil.STATUS_ZOMBIE else process.create_time()
+    except (psutil.Error, ValueError, TypeError, OverflowError):
+        return None

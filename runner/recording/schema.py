@@ -1,6 +1,6 @@
 """The recording format, defined once: topics, messages, fields, times and the version.
 
-Every message is protobuf; `blocks` defines how the most frequent ones are laid out in the file.
+Every message is protobuf; `layout` defines how the most frequent ones are laid out in the file.
 """
 
 from __future__ import annotations
@@ -226,11 +226,11 @@ RESET_STATE = MessageType(
         reset=_SFIXED64, environment=_FIXED32, np_random_seed=_BYTES, bit_generator=_BYTES, ale_state=_BYTES
     ),
 )
-"""What a reset without a seed depends on; `reset_states` describes its fields."""
+"""What a reset without a seed depends on; `resets` describes its fields."""
 RESET_OPTIONS = MessageType(
     "ResetOptions", _fields(reset=_SFIXED64, json=_STRING, large_seed=_STRING, resets=_FIXED32)
 )
-"""What a reset was called with, if there is more than a seed; `reset_options` describes its fields."""
+"""What a reset was called with, if there is more than a seed; `resets` describes its fields."""
 INFO = MessageType("Info", _fields(step=_SFIXED64, reset=_BOOL, json=_STRING))
 SCALAR = MessageType(
     "Scalar",
@@ -273,7 +273,7 @@ CHECKPOINT = MessageType(
 )
 """A reference to content in the store next to the recordings, by its BLAKE3."""
 CLOCK = MessageType("Clock", _fields(started=_DOUBLE, seconds=_DOUBLE))
-"""How much time had passed at its position; `clock` describes its fields."""
+"""How much time had passed at its position; `machine` describes its fields."""
 HOST = MessageType(
     "Host",
     _fields(
@@ -294,7 +294,7 @@ HOST = MessageType(
         gpu_memory_total=[_DOUBLE],
     ),
 )
-"""What the process and its host used at a moment; NaN is unknown. `host` describes its fields."""
+"""What the process and its host used at a moment; NaN is unknown. `machine` describes its fields."""
 CONSOLE = MessageType(
     "Console",
     _fields(started=_DOUBLE, seconds=_DOUBLE, stream=_FIXED32, line=_SFIXED64, text=_STRING),
@@ -302,7 +302,7 @@ CONSOLE = MessageType(
 """A line of the process's output; a later line of the same number, stream and session replaces it."""
 
 ACTIONS = MessageType("Actions", _fields(step=_SFIXED64, count=_FIXED32, data=_BYTES, digests=_BYTES))
-"""A block of steps of which only the actions were recorded; `actions` describes its columns."""
+"""A block of steps of which only the actions were recorded; `steps` describes its columns."""
 
 LOG_LEVELS: Final = ("UNKNOWN", "DEBUG", "INFO", "WARNING", "ERROR", "FATAL")
 

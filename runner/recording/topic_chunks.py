@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, RECORD_HEAD, record_dtype, row_dtype, rows_of
+from runner.recording.layout import HEADER_BYTES, RECORD_HEAD, record_dtype, row_dtype, rows_of
 from runner.recording.messages import Logged, Message, decode, decode_rows
 from runner.recording.record_store import RecordStore
 from runner.recording.records import ChunkEntry, checked_messages

@@ -17,9 +17,8 @@ from isal.isal_zlib import crc32
 from mcap.records import Attachment, Header
 
 from runner.errors import StorageError
-from runner.recording.blocks import MAGIC
 from runner.recording.index import Beginning, Index, beginning_of, checksum
-from runner.recording.layout import Layout
+from runner.recording.layout import MAGIC, Layout
 from runner.recording.records import (
     AttachmentRecord,
     Chunk,

@@ -21,14 +21,13 @@ from runner.environments.gym_types import Space
 from runner.environments.layers import final_observations, spaces_of_one
 from runner.errors import CannotRedo, shortened
 from runner.recording import schema
-from runner.recording.actions import EpisodeDigests, after_step
 from runner.recording.gym_spaces import recorded_space, value_of
 from runner.recording.gym_values import LeafValues, SpaceValues, StateValues, element_of, filler
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.spaces import leaves_of as recorded_leaves
-from runner.recording.turns import is_of_environment, is_taken
+from runner.recording.steps import EpisodeDigests, after_step, is_of_environment, is_taken
 from runner.replay.makers import ALL, environments_of, make_environment, make_vector, using, why_not_made
 from runner.replay.recorded import (
     Piece,

@@ -27,8 +27,15 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
-from runner.recording.liveness import is_alive, owner
-from runner.recording.run_file import ArchiveReference, RunFile, Summary, parse_run_file, run_title
+from runner.recording.run_file import (
+    ArchiveReference,
+    RunFile,
+    Summary,
+    is_alive,
+    owner,
+    parse_run_file,
+    run_title,
+)
 from runner.util.files import storage_errors, write_object
 from runner.util.values import Json, JsonView, as_utf8, checked_run_name, is_utf8
 

@@ -51,8 +51,8 @@ def console(
       dualtaxi console cartpole --search nan
       dualtaxi console cartpole --stream stderr --limit 20
     """
-    from runner.recording.clock import read_clock
     from runner.recording.console import read_console
+    from runner.recording.machine import read_clock
 
     lines = read_console(recording, read_clock(recording))
     matching = [

@@ -9,8 +9,7 @@ from runner.analysis.sections import Section
 from runner.views.view import ReadyAnswer, View
 
 if TYPE_CHECKING:
-    from runner.recording.clock import Clock
-    from runner.recording.host import HostMetrics
+    from runner.recording.machine import Clock, HostMetrics
     from runner.recording.reader import Recording
 
 
@@ -23,8 +22,7 @@ def system(recording: Recording) -> ReadyAnswer:
       dualtaxi system @latest
       dualtaxi system cartpole --json
     """
-    from runner.recording.clock import read_clock
-    from runner.recording.host import read_host
+    from runner.recording.machine import read_clock, read_host
 
     clock = read_clock(recording)
     host = read_host(recording, clock)

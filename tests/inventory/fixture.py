@@ -24,7 +24,7 @@ from runner.config.job import Job
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
 from runner.integrations.tensorboard import SummaryWriter
-from runner.recording.host import HostSampler
+from runner.recording.machine import HostSampler
 from runner.recording.metadata import packed_provenance
 from runner.recording.observer import Observer
 from runner.recording.rewriting import rewrite

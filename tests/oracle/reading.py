@@ -28,11 +28,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from runner.recording import schema
-from runner.recording.actions import COLUMNS as KEPT_COLUMNS
 from runner.recording.description import environment_count
 from runner.recording.messages import frame_place
 from runner.recording.reader import Phase, Recording, open_recording
 from runner.recording.run_file import has_environment
+from runner.recording.steps import COLUMNS as KEPT_COLUMNS
 
 Column = NDArray[Any]
 """The values of a column, [rows, ...]; texts as objects."""

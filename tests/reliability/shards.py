@@ -37,14 +37,13 @@ from runner.errors import RunnerError
 from runner.execution.verify import verify
 from runner.loops import loop_run
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES, rows_of
-from runner.recording.layout import Layout
-from runner.recording.liveness import owner
+from runner.recording.layout import HEADER_BYTES, Layout, rows_of
 from runner.recording.messages import decode
 from runner.recording.metadata import layout_of_run
 from runner.recording.records import MetadataRecord, ReadChunk
 from runner.recording.repair import DamagedFile
-from runner.recording.turns import taken
+from runner.recording.run_file import owner
+from runner.recording.steps import taken
 from runner.runs.listing import run_at
 from runner.runs.shards import shards_of
 from runner.util.files import open_regular

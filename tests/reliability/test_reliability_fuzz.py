@@ -17,8 +17,7 @@ from hypothesis import strategies as st
 
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from tests.reliability.hostile import (

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from runner.recording.blocks import HEADER, HEADER_BYTES, blank_records
 from runner.recording.integrity import survey
+from runner.recording.layout import HEADER, HEADER_BYTES, blank_records
 from runner.recording.reader import open_recording
 from runner.recording.records import encode_chunk
 from runner.recording.repair import repair

@@ -18,7 +18,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import evaluations_of
 from runner.errors import shortened
 from runner.recording import schema
-from runner.recording.blocks import HEADER_BYTES
+from runner.recording.layout import HEADER_BYTES
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.replay.recorded import ended_episode

@@ -10,8 +10,7 @@ import numpy as np
 from runner.analysis.sections import Figure
 from runner.export.plots.chart import Chart, Scale, labelled, series_colour, series_marker
 from runner.export.plots.curves import HEIGHT, WIDTH, draw_legend
-from runner.recording.clock import SAMPLE_SECONDS, Clock
-from runner.recording.host import HostMetrics
+from runner.recording.machine import SAMPLE_SECONDS, Clock, HostMetrics
 from runner.util import humanize
 from runner.util.arrays import Floats
 

@@ -32,8 +32,8 @@ from runner.export.reports.player_data import (
 )
 from runner.export.values import is_image, names_in, number_names, observed, step_actions_in_words
 from runner.recording import schema
+from runner.recording.environment import observation_names
 from runner.recording.extras import filled
-from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, leaves_of
 from runner.replay.recorded import reset_of

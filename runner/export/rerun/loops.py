@@ -25,8 +25,8 @@ from runner.export.rerun.steps import Batch
 from runner.export.rerun.tracks import Times, Track, TrackView, Writer, scalars, times_of
 from runner.export.values import FEW, acted, names_in, number_names, observed
 from runner.recording import schema
+from runner.recording.environment import observation_names
 from runner.recording.messages import decode_array, frame_place, media_type
-from runner.recording.observation_names import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
 from runner.replay.steps import frames_every, log_times_of

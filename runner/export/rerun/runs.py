@@ -29,7 +29,7 @@ from runner.export.rerun.tracks import (
     times_of,
 )
 from runner.recording import schema
-from runner.recording.turns import taken
+from runner.recording.steps import taken
 from runner.util.arrays import Records, in_blocks
 
 T = TypeVar("T")

@@ -26,7 +26,7 @@ from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.export.encoder import FORMATS
 from runner.export.reports.rendering import partials
 from runner.recording import schema
-from runner.recording.composition import composition_of
+from runner.recording.environment import composition_of
 from runner.recording.labels import MAX_NOTE
 from runner.recording.messages import log_level
 from runner.recording.metrics import METRICS

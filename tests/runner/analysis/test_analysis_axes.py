@@ -16,7 +16,7 @@ from runner.analysis.series import read_series
 from runner.cli import cli
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.clock import read_clock
+from runner.recording.machine import read_clock
 from runner.recording.reader import open_recording
 
 STEPS_TAKEN = 2_000

@@ -17,8 +17,8 @@ from mcap.writer import Writer
 from runner.cli import cli
 from runner.recording import schema
 from runner.recording.integrity import survey
-from runner.recording.liveness import owner
 from runner.recording.reader import open_recording
+from runner.recording.run_file import owner
 from runner.replay.tables import tables_at
 from runner.runs.listing import list_runs
 from runner.runs.run import Run

@@ -12,7 +12,7 @@ import runner
 from runner.execution.branching import branch_training
 from runner.execution.verify import verify
 from runner.recording import schema
-from runner.recording.blocks import RECORD_HEAD
+from runner.recording.layout import RECORD_HEAD
 from runner.recording.reader import open_recording
 from runner.recording.records import CHUNK_HEAD, ReadChunk, encode_chunk, walk
 from runner.recording.repair import repair

@@ -16,9 +16,9 @@ import runner
 from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.recording import schema
-from runner.recording.blocks import message_record
 from runner.recording.consistency import check_phase
 from runner.recording.digest import ContentHash, combined_digest
+from runner.recording.layout import message_record
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import content_of
 from runner.recording.topic_chunks import TopicChunks

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from runner.cli import cli
-from runner.recording.liveness import owner
+from runner.recording.run_file import owner
 from tests.runner.recording.making import LAKE, make_run
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from runner.export.plots.machine import machine_facts, machine_plots
-from runner.recording.clock import Clock
-from runner.recording.host import FIELDS, GPU_FIELDS, HostMetrics
+from runner.recording.machine import FIELDS, GPU_FIELDS, Clock, HostMetrics
 
 CLOCK = Clock(np.array([0, 100, 400]), np.array([0.0, 10.0, 20.0]), np.zeros(3), {0.0: 0.0})
 

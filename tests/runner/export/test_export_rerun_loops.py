@@ -23,9 +23,9 @@ from runner.export.rerun.selection import Request, select
 from runner.export.rerun.writing import export
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema
-from runner.recording.observation_names import NAMES
+from runner.recording.environment import NAMES
 from runner.recording.reader import open_recording
-from runner.recording.turns import taken
+from runner.recording.steps import taken
 from runner.runs.listing import run_at
 from tests.runner.export.making import made_otherwise
 from tests.runner.export.rerun_views import shown_ranges

@@ -18,7 +18,7 @@ import runner
 from runner.cli import cli
 from runner.export.scalars import measures
 from runner.recording import schema
-from runner.recording.clock import read_clock
+from runner.recording.machine import read_clock
 from runner.recording.reader import open_recording
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 

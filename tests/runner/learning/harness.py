@@ -14,8 +14,7 @@ from runner.environments.mdp import Mdp
 from runner.learning import kernel
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 from runner.replay.step_replay import NO_ROWS, NO_UPDATES
 from tests.runner.learning.twin import Twin
 

@@ -16,8 +16,7 @@ from runner.execution.verify import verify
 from runner.learning.algorithms import ALGORITHMS as DEFINITIONS
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, named_tables_at, tables_at
 from tests.runner.learning import harness

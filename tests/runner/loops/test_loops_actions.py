@@ -25,10 +25,10 @@ from runner.errors import CannotRedo, ConfigError, Diverged, RecordingError, Run
 from runner.execution.rerecord import rerecord
 from runner.execution.verify import verify
 from runner.export.reports.report import render_report
-from runner.recording.actions import packed, unpacked
 from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
+from runner.recording.steps import packed, unpacked
 from runner.replay.steps import whole_steps
 from runner.runs.trust_marks import MARK_FILE
 from runner.service.app import create_app
@@ -376,7 +376,7 @@ def test_a_disk_without_space_for_both_keeps_the_small_chunks(tmp_path, monkeypa
     def fail(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("runner.recording.compaction.RecordingFile", fail)
+    monkeypatch.setattr("runner.recording.rewriting.RecordingFile", fail)
     run = single("CartPole-v1")(tmp_path, steps="actions")
     assert sorted(path.name for path in run.folder.iterdir()) == ["recording.mcap", "run.json", "trust.json"]
     with open_recording(run.recording) as recording:
@@ -425,7 +425,7 @@ def test_a_changed_action_is_found(tmp_path, monkeypatch):
 
 
 def test_an_episode_of_which_actions_were_lost_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("runner.recording.action_recorder.packed", lambda rows, n: packed(rows[5:], n))
+    monkeypatch.setattr("runner.recording.recorder.packed", lambda rows, n: packed(rows[5:], n))
     env = gymnasium.make("FrozenLake-v1", is_slippery=False)
     with runner.record(env, tmp_path, steps="actions") as rec:
         rec.reset(seed=1)

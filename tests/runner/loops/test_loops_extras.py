@@ -22,8 +22,8 @@ from runner.execution.verify import verify
 from runner.export.rerun.selection import Request
 from runner.export.rerun.writing import export
 from runner.recording import schema
-from runner.recording.blocks import message_record
 from runner.recording.extras import ExtraNames
+from runner.recording.layout import message_record
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from runner.recording.records import ReadChunk, encode_chunk

@@ -15,7 +15,7 @@ import runner
 from dualtaxi.parallel import DualTaxiParallelEnv
 from runner.export.reports.report import render_report
 from runner.integrations.tensorboard import SummaryWriter
-from runner.recording.composition import composition_of
+from runner.recording.environment import composition_of
 from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import open_recording
 from runner.service.app import create_app

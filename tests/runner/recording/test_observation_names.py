@@ -11,7 +11,7 @@ import pytest
 from gymnasium import wrappers
 
 import runner
-from runner.recording.observation_names import NAMES, observation_names
+from runner.recording.environment import NAMES, observation_names
 from runner.recording.reader import open_recording
 
 POLE = NAMES["CartPoleEnv"]

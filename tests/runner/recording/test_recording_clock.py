@@ -15,9 +15,9 @@ from runner.errors import RecordingError
 from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.execution.verify import verify
-from runner.recording import clock as clocks
+from runner.recording import machine as clocks
 from runner.recording import schema
-from runner.recording.clock import Clock, read_clock
+from runner.recording.machine import Clock, read_clock
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from runner.runs.run import create_run

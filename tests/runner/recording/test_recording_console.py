@@ -19,9 +19,9 @@ import runner
 from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.export.mcap import export_mcap
-from runner.recording import clock, console, observer, schema
-from runner.recording.clock import Clock, read_clock
+from runner.recording import console, machine, observer, schema
 from runner.recording.console import MAX_CONSOLE_BYTES, Screen, read_console
+from runner.recording.machine import Clock, read_clock
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from runner.runs.listing import list_runs
@@ -35,7 +35,7 @@ from tests.waiting import until
 def often(monkeypatch):
     """Watch fifty times a second."""
     monkeypatch.setattr(observer, "SAMPLE_SECONDS", 0.02)
-    monkeypatch.setattr(clock, "SAMPLE_SECONDS", 0.02)
+    monkeypatch.setattr(machine, "SAMPLE_SECONDS", 0.02)
 
 
 def lines_of(run) -> list[tuple[str, str]]:

@@ -14,10 +14,9 @@ import pytest
 import runner
 from runner.errors import RecordingError
 from runner.execution.verify import verify
-from runner.recording import clock, observer, schema
-from runner.recording.clock import read_clock
+from runner.recording import machine, observer, schema
 from runner.recording.console import read_console
-from runner.recording.host import HostMetrics, HostSampler, read_host
+from runner.recording.machine import HostMetrics, HostSampler, read_clock, read_host
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
 from tests.runner.altering import altered
@@ -30,7 +29,7 @@ from tests.waiting import until
 def often(monkeypatch):
     """Watch fifty times a second."""
     monkeypatch.setattr(observer, "SAMPLE_SECONDS", 0.02)
-    monkeypatch.setattr(clock, "SAMPLE_SECONDS", 0.02)
+    monkeypatch.setattr(machine, "SAMPLE_SECONDS", 0.02)
 
 
 def samples_in(run):

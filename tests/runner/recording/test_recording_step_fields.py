@@ -10,8 +10,7 @@ from runner.archive import layout
 from runner.archive.batches import batch_of, records_of
 from runner.archive.columns import Shape
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 
 NAMES = [field.name for field in schema.STEP.fields]
 

@@ -12,8 +12,7 @@ from runner.environments.loading import load_mdp
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
 from runner.recording import schema
-from runner.recording.blocks import blank_records
-from runner.recording.layout import layout_of
+from runner.recording.layout import blank_records, layout_of
 from runner.recording.reader import open_recording
 from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode

@@ -15,7 +15,7 @@ from loop_replays import page, part, pictures, serving, steps_of, taken
 
 import runner
 from runner.recording import schema
-from runner.recording.observation_names import NAMES
+from runner.recording.environment import NAMES
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.runs.run import Run
