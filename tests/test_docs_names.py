@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import runner
-from runner.service import pages, queries, views
+from runner.service import pages, views
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from runner.views import shipped_views
@@ -31,7 +31,7 @@ def as_written(paths):
 def test_every_name_exists(tmp_path):
     settings = ServiceSettings(recordings=(tmp_path,), tokens=tmp_path / "tokens.json")
     addresses = as_written(create_app(settings).openapi()["paths"])
-    page_addresses = as_written(path for _, path in routes([pages.router, views.pages, queries.pages]))
+    page_addresses = as_written(path for _, path in routes([pages.router, views.pages]))
     names = {" ".join(path) for path in commands()}
     for _, command, page, route, name in ROWS:
         assert command in names

@@ -24,8 +24,8 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute
 
 from runner.errors import RunnerError
-from runner.service import pages, queries, views
-from runner.service.api import comparing, debugging, files, jobs, questions, reading, replay, runs, uploads
+from runner.service import pages, views
+from runner.service.api import files, jobs, reading, replay, runs
 from runner.service.catalogue import Catalogue
 from runner.service.computed import load_sweep_libraries
 from runner.service.dependencies import CatalogueOf, SettingsOf
@@ -173,10 +173,10 @@ def _response(
 def _routes() -> list[BaseRoute]:
     """Return the routes of every application of this process: FastAPI takes half a second to analyse them."""
     whole = APIRouter()
-    parts = (runs, reading, replay, debugging, questions, comparing, files, jobs, uploads)
-    for router in (*(part.router for part in parts), views.api, queries.api):
+    parts = (runs.router, reading.router, replay.router, reading.comparing, files.router, jobs.router)
+    for router in (*parts, files.uploads_router, views.api):
         whole.include_router(router, prefix=API, responses=ERROR_DOCS, dependencies=[Depends(known_query)])
-    for router in (health, login_pages, views.pages, queries.pages, pages.router):
+    for router in (health, login_pages, views.pages, pages.router):
         whole.include_router(router)
     return whole.routes
 
@@ -202,7 +202,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.jobs = stack.enter_context(
             JobQueue(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
-        app.state.writers = anyio.CapacityLimiter(uploads.WRITERS)
+        app.state.writers = anyio.CapacityLimiter(files.WRITERS)
         app.state.downloads = anyio.CapacityLimiter(2)
         app.state.uploads = Uploads(settings.recordings[0], limits, log_upload)
         stack.callback(app.state.uploads.close)

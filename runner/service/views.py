@@ -1,35 +1,47 @@
-"""Views over HTTP: an API route and a page with a form for each."""
+"""Views over HTTP: an API route and a page with a form for each, of a run or of all runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Hashable
 from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Any, Final, Literal
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import HTMLResponse
-from pydantic import AfterValidator, BaseModel, Field, create_model
+from pydantic import AfterValidator, BaseModel, Field, TypeAdapter, create_model
 from pydantic_core import PydanticCustomError
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.contents import damage_of
+from runner.analysis.sections import Grid
 from runner.errors import RecordingError, RunnerError
+from runner.query.text import cell_of
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.comparing import RunName, RunNames, found_runs
+from runner.service.api.reading import RunName, RunNames, found_runs
 from runner.service.api.replay import OCTETS
 from runner.service.computed import Form, link, require_few
-from runner.service.dependencies import CatalogueOf, Computation, ComputationOf, RecordedRun, SettingsOf
+from runner.service.dependencies import (
+    CatalogueOf,
+    Computation,
+    ComputationOf,
+    RecordedRun,
+    SettingsOf,
+    json_response,
+)
 from runner.service.errors import EXPECTED
-from runner.service.pages.frame import RunPage, StatusName, installed_names
+from runner.service.pages.rendering import Page, StatusName, installed_names, run_page
 from runner.service.problems import filled, media_docs, status_of
 from runner.views import shipped_views, view_named
+from runner.views.find import VIEW as FIND
+from runner.views.sql import VIEW as SQL
 from runner.views.view import Input, View, rows_in
 
 api = APIRouter()
-pages = APIRouter(prefix="/runs/{run}", include_in_schema=False)
+pages = APIRouter(include_in_schema=False)
 _NAMES: Final[dict[str, Any]] = {
     "pair": {"a": (RunName, ...), "b": (RunName, ...)},
     "runs": {"run": (RunNames, ...)},
@@ -83,9 +95,9 @@ def _add_routes(view: View) -> None:
             return HTMLResponse(await _answer(compute, run, view, "html", given, number))
 
         part.__annotations__["given"] = Annotated[given_type, Query()]
-        pages.get(f"/{view.name}/part")(part)
+        pages.get(f"/runs/{{run}}/{view.name}/part")(part)
 
-    @pages.get(f"/{view.name}")
+    @pages.get(f"/runs/{{run}}/{view.name}")
     async def page(
         request: Request, run: RecordedRun, compute: ComputationOf, number: PageNumber = 1
     ) -> Response:
@@ -106,7 +118,7 @@ def _add_routes(view: View) -> None:
             live = link(f"/runs/{run.run_id}/{view.name}/part", asked | shown_page | {"status": run.status})
         shown = {"view": view, "given": form, "body": body.decode(), "problem": problem, "live": live}
         status = status_of(problem) if isinstance(problem, RecordingError) else None
-        return RunPage(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
+        return run_page(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
 
 
 def _add_route_of_runs(view: View) -> None:
@@ -198,3 +210,112 @@ for _view in (*shipped_views(), *map(view_named, installed_names())):
             _add_routes(_view)
         else:
             _add_route_of_runs(_view)
+
+
+MAX_PICTURES: Final = 24
+"""The most hits that a page shows pictures of."""
+
+Sql = Annotated[str, Query(max_length=10_000, description="One SELECT, as for `dualtaxi sql`.")]
+Runs = Annotated[str, Query(max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")]
+
+
+class QueryResponse(BaseModel):
+    """The first 1,000 rows of a query."""
+
+    columns: list[str]
+    rows: list[list[object]]
+    more: bool
+    """Whether there are more rows."""
+    left_out: list[str]
+    """Sentences on the runs that were left out."""
+
+
+class EpisodeQuestion(BaseModel):
+    """What is asked about episodes."""
+
+    expression: str = Field("", max_length=1000, description="A condition, as for `dualtaxi find`.")
+    runs: str = Field("", max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")
+    phase: Literal["", "train", "eval"] = Field("", description="Training or evaluation; both by default.")
+    sort: str = Field("", max_length=1000, description="A number to sort by, such as `-ret`.")
+    limit: int = Field(
+        20, ge=0, le=1000, description="Maximum number of episodes; 0 for the most of a server, 1,000."
+    )
+
+
+SearchOf = Annotated[EpisodeQuestion, Query()]
+
+
+@api.get(
+    "/sql",
+    tags=["runs"],
+    response_model=QueryResponse,
+    summary="Ask the runs, and every step of them, in SQL.",
+)
+async def sql(request: Request, query: Sql, runs: Runs = "") -> Response:
+    """Return the first rows that `dualtaxi sql` returns."""
+    return json_response(await _answer_query(request, computed.query, query, runs))
+
+
+@api.get(
+    "/find",
+    tags=["runs"],
+    response_model=dict[str, object],
+    summary="Find the episodes of all runs that match an expression.",
+)
+async def find(request: Request, search: SearchOf) -> Response:
+    """Return what `dualtaxi find --json` prints."""
+    return json_response(await _answer_query(request, computed.find, *search.model_dump().values()))
+
+
+@pages.get("/find")
+async def find_page(request: Request, search: SearchOf) -> Response:
+    """Show the form, and the episodes that match."""
+    asked = search.model_dump()
+    shown: dict[str, object] = {
+        "view": FIND,
+        "given": asked,
+        "problem": "",
+        "found": None,
+        "left_out": (),
+        "max_pictures": MAX_PICTURES,
+    }
+    try:
+        if search.expression.strip():
+            from runner.query.find import Found  # needs the extra
+
+            answer = await _answer_query(request, computed.find, *asked.values())
+            found = TypeAdapter(Found).validate_json(answer)
+            kept = link("", asked).removeprefix("?")
+            links = [link(hit.replay, {"found": kept}) for hit in found.hits]
+            shown |= {"found": found, "left_out": found.left_out, "links": links}
+    except RunnerError as error:
+        shown["problem"] = error
+    return Page("find.html", shown)
+
+
+@pages.get("/sql")
+async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Response:
+    """Show the form, and the answer to a query."""
+    shown: dict[str, object] = {
+        "view": SQL,
+        "given": {"query": query, "runs": runs},
+        "problem": "",
+        "left_out": [],
+        "grid": None,
+    }
+    try:
+        if query.strip():
+            answer = json.loads(await _answer_query(request, computed.query, query, runs))
+            rows = [tuple(map(cell_of, row)) for row in answer["rows"]]
+            shown |= answer | {"grid": Grid(tuple(answer["columns"]), rows)}
+    except RunnerError as error:
+        shown["problem"] = error
+    return Page("sql.html", shown)
+
+
+async def _answer_query(request: Request, function: Callable[..., bytes], *asked: Hashable) -> bytes:
+    """Return the answer to a question about all runs: computed in a process with limits, or seconds old."""
+    state = request.app.state
+    make = partial(state.processes, function, state.settings, *asked)
+    answer: bytes = await state.cache.get_or_await((function, *asked, state.catalogue.state()), make)
+    return answer

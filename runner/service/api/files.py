@@ -1,4 +1,4 @@
-"""A run's recording, and its export for the Rerun viewer."""
+"""Files of runs: recordings and checkpoints, exports made on demand, and uploads."""
 
 from __future__ import annotations
 
@@ -6,31 +6,37 @@ import contextlib
 import os
 import pathlib
 from dataclasses import replace
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Final
 from urllib.parse import quote
 
-from fastapi import APIRouter, Header, Path, Query, Response
+from anyio.to_thread import run_sync
+from fastapi import APIRouter, Header, Path, Query, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef
+from runner.client.uploads import UploadState, UploadStatus
 from runner.errors import ConfigError, RunNotFound
 from runner.export.encoder import FORMATS
 from runner.export.plugin import installed_export
-from runner.export.rerun.selection import Request
+from runner.export.rerun.selection import Request as Selection
 from runner.runs.run import Run
 from runner.service import computed
 from runner.service.dependencies import (
     CacheOf,
     ComputationOf,
     InTurn,
+    OwnerOf,
     ProcessesOf,
     RecordedRun,
     SettingsOf,
+    UploadsOf,
     recording_state,
 )
 from runner.service.tokens import Digest
+from runner.service.uploads import UploadSource
 from runner.util.extras import EXPORTS, plugin_names
 from runner.util.processes import CallFailed
 from runner.util.values import Ranges, ranges_in
@@ -148,10 +154,10 @@ async def replay(
 
     By default it has the steps of 20 training episodes and of the last evaluation.
     """
-    request = Request(
+    selection = Selection(
         _ranges(episodes), tuple(evaluations or ()), every, frames=frames, trials=tuple(trials or ())
     )
-    path = await replay_of([run], cache, processes, request)
+    path = await replay_of([run], cache, processes, selection)
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
 
 
@@ -202,7 +208,7 @@ async def replay_of(
     runs: list[Run],
     cache: CacheOf,
     processes: ProcessesOf,
-    request: Request,
+    selection: Selection,
 ) -> pathlib.Path:
     """Return the export of some runs, made in a child process, once for all concurrent requests.
 
@@ -210,12 +216,12 @@ async def replay_of(
     """
 
     async def make() -> bytes:
-        if request.frames:
+        if selection.frames:
             with contextlib.suppress(CallFailed):
-                return await processes(computed.replay, runs, request, seconds=DRAW_SECONDS)
-        return await processes(computed.replay, runs, replace(request, frames=False))
+                return await processes(computed.replay, runs, selection, seconds=DRAW_SECONDS)
+        return await processes(computed.replay, runs, replace(selection, frames=False))
 
-    key = ("replay", *map(recording_state, runs), request)
+    key = ("replay", *map(recording_state, runs), selection)
     path = await cache.get_or_await(key, make, max_seconds=0)
     return pathlib.Path(os.fsdecode(path))
 
@@ -246,3 +252,79 @@ def _ranges(text: str) -> Ranges:
         raise ConfigError(
             f"query.episodes: found {text!r}, expected START..STOP or N, such as 0..20,49980..",
         ) from error
+
+
+WRITE_BYTES: Final = 1 << 20
+"""Bytes that are collected before they are written."""
+WRITERS: Final = 4
+"""Threads that write to the disk."""
+_BYTES: Final = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+_BODY: Final = {"requestBody": {"required": True, "content": _BYTES}}
+_ID_IS: Final = "64 hexadecimal digits: the BLAKE3 of the file, or random ones while it is growing."
+UploadId = Annotated[Digest, Path(description=_ID_IS)]
+
+uploads_router = APIRouter(prefix="/uploads", tags=["uploads"])
+
+
+class UploadsResponse(BaseModel):
+    """All uploads."""
+
+    uploads: list[UploadStatus]
+
+
+@uploads_router.get("", summary="List uploads in progress and the results of others.")
+def list_uploads(
+    uploads: UploadsOf, owner: OwnerOf, state: Annotated[UploadState | None, Query()] = None
+) -> UploadsResponse:
+    """List uploads, the newest first; ids and problems only of one's own."""
+    listed: list[UploadStatus] = [
+        upload if upload.owner == owner else replace(upload, id="", problem="")
+        for upload in uploads.all()
+        if state in (None, upload.state)
+    ]
+    return UploadsResponse(uploads=listed)
+
+
+@uploads_router.put("/{upload_id}", summary="Begin an upload, or continue it; return its state.")
+def put(uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId, source: UploadSource) -> UploadStatus:
+    """Announce a file: it is verified when its digest is known and all of its bytes are here.
+
+    The response has the offset of the next bytes. After the last, send the same again until it is stored or
+    refused.
+    """
+    return uploads.put(owner, upload_id, source)
+
+
+@uploads_router.patch("/{upload_id}", openapi_extra=_BODY, summary="Send bytes from an offset on.")
+async def append(
+    uploads: UploadsOf,
+    owner: OwnerOf,
+    upload_id: UploadId,
+    request: Request,
+    upload_offset: Annotated[int, Header(ge=0, lt=1 << 62)],
+    content_length: Annotated[int, Header(ge=0, lt=1 << 62, include_in_schema=False)] = 0,
+) -> UploadStatus:
+    """Append bytes; those that were received stay, even if the connection breaks."""
+    append_here = partial(uploads.append, owner, upload_id)
+    write = partial(run_sync, append_here, limiter=request.app.state.writers)
+    upload = await write(upload_offset, b"", content_length)  # refused before anything is read
+    collected = bytearray()
+    try:
+        async for data in request.stream():
+            collected += data
+            if len(collected) >= WRITE_BYTES:
+                piece = bytes(collected)
+                collected = bytearray()
+                upload = await write(upload.offset, piece)
+    finally:
+        if collected:
+            upload = await write(upload.offset, bytes(collected))
+    return upload
+
+
+@uploads_router.delete(
+    "/{upload_id}", status_code=HTTPStatus.NO_CONTENT, summary="Delete an upload; its run stays."
+)
+def delete(uploads: UploadsOf, owner: OwnerOf, upload_id: UploadId) -> None:
+    """Forget an upload, and remove what was received."""
+    uploads.delete(owner, upload_id)

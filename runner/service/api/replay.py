@@ -1,19 +1,22 @@
-"""Episodes as the pages replay them: actions, rewards, and what was observed at each step."""
+"""Episodes as the pages replay them, and where other actions lead."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 from collections.abc import Awaitable, Callable, Hashable
+from dataclasses import fields
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple, get_type_hints
 
-from fastapi import APIRouter, Depends, Query, Request, Response
-from pydantic import BaseModel
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from pydantic import BaseModel, create_model
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.episodes import EpisodeRef
+from runner.analysis.episodes import EXPECTED, EpisodeRef
+from runner.debugging.action_outcomes import WhatIf
+from runner.debugging.what_if import what_if as outcomes_of
 from runner.errors import RunnerError
 from runner.export.encoded import encoded_pictures
 from runner.export.reports.player_data import Playback
@@ -34,7 +37,7 @@ from runner.service.problems import media_docs
 from runner.util import __version__
 
 router = APIRouter(
-    prefix="/runs/{run}/replay",
+    prefix="/runs/{run}",
     tags=["reading"],
 )
 
@@ -62,7 +65,9 @@ class ReplayPart(BaseModel):
 
 
 def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: str) -> None:
-    @router.get(path, name=kind, response_model=ReplayPart, summary=f"A part of a {kind}, to be replayed.")
+    @router.get(
+        f"/replay{path}", name=kind, response_model=ReplayPart, summary=f"A part of a {kind}, to be replayed."
+    )
     async def part(
         run: RecordedRun,
         compute: ComputationOf,
@@ -74,7 +79,7 @@ def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: 
         return await compute.json(computed.episode_part, run.recording, at, start, steps)
 
     @router.get(
-        f"{path}/pictures",
+        f"/replay{path}/pictures",
         name=f"{kind} pictures",
         response_class=Response,
         responses=media_docs(OCTETS),
@@ -147,3 +152,49 @@ def _pictured_episode(run: Run, at: EpisodeRef) -> _PicturedEpisode:
     make = partial(encoded_pictures, run.recording, at.phase, number)
     tag = f"{tag_of(run)}-{at.phase}-{number}-{__version__}"
     return _PicturedEpisode((recording_state(run), at.phase, number), tag, make, length)
+
+
+MAX_ACTIONS = 1000
+StepPath = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
+ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
+
+
+_KINDS = get_type_hints(WhatIf)
+_FIELDS: Any = {field.name: (_KINDS[field.name], ...) for field in fields(WhatIf) if field.name != "mdp"}
+WhatIfAnswer = create_model("WhatIfAnswer", __doc__=WhatIf.__doc__, **_FIELDS)
+
+
+@router.get("/what-if/{at}", response_model=WhatIfAnswer, summary="Where each joint action at a step leads.")
+async def what_if(
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: StepPath,
+    action: Annotated[
+        list[str] | None, Query(max_length=MAX_ACTIONS, description="Numbers or names; default: all.")
+    ] = None,
+) -> Response:
+    """Return what `dualtaxi branch --action all --json` prints; of a run that was trained here."""
+    return await compute.json(
+        computed.answer,
+        run.recording,
+        outcomes_of,
+        "json",
+        (("at", at), ("actions", tuple(action or ()))),
+    )
+
+
+@router.get(
+    "/what-if/{at}/{action}",
+    response_model=ReplayPart,
+    summary="A part of the episode to which an action leads.",
+)
+async def branch(
+    run: RecordedRun,
+    compute: ComputationOf,
+    at: StepPath,
+    action: ActionPath,
+    start: Start = 0,
+    steps: Steps = STEPS,
+) -> Response:
+    """Return steps in the form of a replay: those recorded up to the step, then those played."""
+    return await compute.json(computed.branch_part, run.recording, at, action, start, steps)

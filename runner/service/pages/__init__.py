@@ -5,17 +5,13 @@ from __future__ import annotations
 from fastapi import APIRouter
 
 from runner.service.pages import (
-    branch,
     compare,
-    environments,
-    explanations,
     jobs,
+    rendering,
     replay,
     rerun,
     run,
     runs,
-    static,
-    submit,
     sweeps,
 )
 
@@ -24,15 +20,11 @@ for _module in (
     runs,
     rerun,
     run,
+    rendering,
     replay,
-    branch,
-    environments,
     compare,
-    submit,
     jobs,
     sweeps,
-    explanations,
-    static,
 ):
     router.include_router(_module.router)
 router.include_router(run.acts)

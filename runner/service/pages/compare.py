@@ -26,8 +26,7 @@ from runner.service import computed
 from runner.service.api.reading import AxisOf
 from runner.service.computed import ShownDifference, link, places_in
 from runner.service.dependencies import At, CatalogueOf, ComputationOf, recorded_run
-from runner.service.pages.frame import RunHead, head_of, result_of
-from runner.service.pages.rendering import Page
+from runner.service.pages.rendering import Page, RunHead, head_of, result_of
 from runner.service.pages.replay import panel_of
 from runner.service.problems import requests_page, status_of
 from runner.util import humanize

@@ -1,8 +1,11 @@
-"""Pages and the forms that they send: filled templates."""
+"""Pages: filled templates, the forms that they send, the files they load, the head of a run's pages."""
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gzip
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -12,19 +15,89 @@ from typing import Annotated, Final
 from urllib.parse import parse_qsl
 
 import jinja2
-from fastapi import Depends, Request, Response
+from fastapi import APIRouter, Depends, HTTPException, Query, Request, Response
 from fastapi.responses import RedirectResponse
 from markupsafe import Markup
 from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
-from runner.errors import RunnerError
+from runner.analysis.qtable import recorded_tables
+from runner.errors import RecordingError, RunnerError
 from runner.export.reports.rendering import TEMPLATES as REPORT_TEMPLATES
-from runner.export.reports.rendering import code, environment_of
+from runner.export.reports.rendering import code, environment_of, page_style
+from runner.recording import schema
+from runner.recording.metrics import EvaluationMetric
+from runner.recording.reader import open_recording
+from runner.recording.run_file import EvaluationMetrics, has_environment
+from runner.runs.run import Run
 from runner.service.computed import link
-from runner.service.pages import static
 from runner.service.problems import error_body
-from runner.util import humanize
+from runner.util import extras, humanize
+from runner.views import NAMES, shipped_views, view_named
+
+router = APIRouter(include_in_schema=False)
+
+STATIC: Final = files("runner.service.pages") / "static"
+UPLOT: Final = "vendor/uplot-1.6.32"
+_TYPES: Final = {"css": "text/css", "js": "text/javascript", "svg": "image/svg+xml", "LICENSE": "text/plain"}
+_FOREVER: Final = "public, max-age=31536000, immutable"
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A file of the pages."""
+
+    media_type: str
+    body: bytes
+    compressed: bytes
+
+
+@functools.cache
+def assets() -> Mapping[str, Asset]:
+    """Return the files by name."""
+    bodies = {entry.name: entry.read_bytes() for entry in STATIC.iterdir() if entry.is_file()}
+    bodies |= {
+        name: (STATIC / name).read_bytes() for name in (f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
+    }
+    bodies["replay.js"] = (REPORT_TEMPLATES / "replay.js").read_bytes()
+    layouts = (STATIC / UPLOT / "uPlot.min.css").read_text("utf-8"), bodies.pop("pages.css").decode()
+    bodies["style.css"] = "\n".join([page_style(), *layouts]).encode()
+    return {
+        name: Asset(_TYPES[name.rpartition("/")[2].rpartition(".")[2]], body, gzip.compress(body, mtime=0))
+        for name, body in bodies.items()
+    }
+
+
+@functools.cache
+def static_version() -> str:
+    """Return a digest of all files."""
+    digest = hashlib.sha256()
+    for name, asset in sorted(assets().items()):
+        digest.update(name.encode() + b"\0" + asset.body)
+    return digest.hexdigest()[:12]
+
+
+def static_address(name: str) -> str:
+    """Return the address of a file."""
+    assets()[name]
+    return f"/static/{static_version()}/{name}"
+
+
+@router.api_route("/static/{digest}/{name:path}", methods=["GET", "HEAD"])
+def static_file(digest: str, name: str, request: Request) -> Response:
+    """Return a file of the pages."""
+    asset = assets().get(name)
+    if asset is None:
+        raise HTTPException(HTTPStatus.NOT_FOUND)
+    headers = {
+        "vary": "accept-encoding",
+        "cache-control": _FOREVER if digest == static_version() else "no-cache",
+    }
+    if "gzip" in request.headers.get("accept-encoding", ""):
+        headers["content-encoding"] = "gzip"
+        return Response(asset.compressed, media_type=asset.media_type, headers=headers)
+    return Response(asset.body, media_type=asset.media_type, headers=headers)
+
 
 TEMPLATES: Final = files("runner.service.pages") / "templates"
 SECTIONS: Final = (
@@ -112,7 +185,7 @@ def templates() -> jinja2.Environment:
         "age": _age,
         "problem": _problem,
     }
-    environment.globals |= {"static": static.address, "sections": SECTIONS, "link": link}
+    environment.globals |= {"static": static_address, "sections": SECTIONS, "link": link}
     return environment
 
 
@@ -151,3 +224,100 @@ Form = Annotated[dict[str, str], Depends(form_of)]
 def message_of(error: RunnerError, request: Request) -> str:
     """Return the message of an error, as in the API."""
     return error_body(error, request.app.state.settings).message
+
+
+StatusName = Annotated[str, Query(max_length=20, description="The status that the page shows.")]
+
+TABS: Final = (
+    ("", "Overview", ""),
+    ("replay", "Replay", "episodes"),
+    ("learned", "What was learned", "tables"),
+    *((view.name, view.title, view.needs) for view in shipped_views() if view.has_tab),
+    ("config", "Configuration", ""),
+    ("pictures", "Pictures", "pictures"),
+    ("rerun", "Rerun", "episodes"),
+)
+"""Paths and titles of the pages of a run, and what a run needs for each."""
+
+
+def installed_names() -> list[str]:
+    """Return the names of the views that installed packages add, except names of shipped pages."""
+    shipped = {*NAMES, *(path for path, *_ in TABS)}
+    return [name for name in extras.plugin_names(extras.VIEWS) if name not in shipped]
+
+
+@dataclass(frozen=True)
+class RunHead:
+    """The facts of a run that all of its pages show."""
+
+    id: str
+    name: str
+    seed: int | None
+    status: str
+    created: str
+    tags: tuple[str, ...]
+    note: str
+    tabs: tuple[tuple[str, str], ...]
+    lacking: Mapping[str, str]
+    """The tabs that it does not have, and what they need."""
+    steps: str
+    """Which steps it records: `all`, `actions` or `none`."""
+
+
+def run_page(run: Run, here: str, template: str, values: Values, status: HTTPStatus | None = None) -> Page:
+    """Return a page of a run; `here` is the path of its tab."""
+    return Page(template, lambda: {"run": head_of(run), "here": here, **made(values)}, status)
+
+
+def head_of(run: Run) -> RunHead:
+    """Return the facts of a run that all of its pages show."""
+    has_episodes = has_environment(run.file.config)
+    has_tables = run.can_train_again or _has_recorded_tables(run)
+    status, messages = run.status, run.summary.messages
+    packing = run.file.config.get("recording")
+    is_running_loop = status == "running" and not run.can_train_again
+    has = {
+        "": True,
+        "checkpoints": bool(messages.get(schema.CHECKPOINT_TOPIC.name)) or is_running_loop,
+        "episodes": has_episodes,
+        "pictures": bool(messages.get(schema.IMAGE_TOPIC.name)) or is_running_loop,
+        "tables": has_tables,
+        "training": run.can_train_again,
+    }
+    missing = {
+        "episodes": "recorded steps",
+        "tables": "Q-tables",
+        "training": "training that the runner can repeat" if has_tables else "Q-tables",
+    }
+    installed = [view for view in map(view_named, installed_names()) if view.has_tab]
+    return RunHead(
+        id=run.run_id,
+        name=run.name,
+        seed=run.seed if run.has_seed else None,
+        status=status,
+        created=run.created.isoformat(),
+        tags=run.tags,
+        note=run.note,
+        tabs=(
+            *((path, title) for path, title, need in TABS if has[need]),
+            *((view.name, view.title) for view in installed),
+        ),
+        lacking={path: missing[need] for path, _, need in TABS if need in missing and not has[need]},
+        steps=str(packing.get("steps", "all")) if isinstance(packing, Mapping) else "all",
+    )
+
+
+def _has_recorded_tables(run: Run) -> bool:
+    """Return whether a loop recorded tables that can be drawn as maps; only one with arrays is opened."""
+    if not run.summary.messages.get(schema.ARRAY_TOPIC.name):
+        return False
+    with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
+        return recording.tabular and next(recorded_tables(recording), None) is not None
+    return False
+
+
+def result_of(metric: EvaluationMetric, evaluation: EvaluationMetrics) -> tuple[str, str]:
+    """Return the name of a metric in the last evaluation, and its value with its unit."""
+    value = evaluation.values.get(metric.name)
+    heading = metric.heading.removesuffix(metric.suffix).capitalize()
+    return f"{heading} in the last evaluation", humanize.number(value) + metric.suffix * (value is not None)

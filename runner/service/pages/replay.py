@@ -23,11 +23,11 @@ from runner.drawing import svg
 from runner.errors import RunnerError
 from runner.export.encoded import picture_note
 from runner.recording.reader import Recording, open_recording
+from runner.recording.steps import EpisodeSteps
 from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.debugging import StepPath
-from runner.service.api.replay import STEPS, prepare_pictures
+from runner.service.api.replay import STEPS, StepPath, prepare_pictures
 from runner.service.catalogue import Catalogue
 from runner.service.computed import link
 from runner.service.dependencies import (
@@ -40,8 +40,7 @@ from runner.service.dependencies import (
     RecordedRun,
     WrittenRun,
 )
-from runner.service.pages.frame import RunPage
-from runner.service.pages.rendering import Form, Page
+from runner.service.pages.rendering import Form, Page, run_page
 from runner.service.pictures import PictureStreams
 from runner.service.problems import status_of
 from runner.util.humanize import counted
@@ -219,7 +218,7 @@ def _page(
 
     wrong = refused or part
     status = status_of(wrong) if isinstance(wrong, RunnerError) else None
-    return RunPage(run, "replay", "run_replay.html", show, status)
+    return run_page(run, "replay", "run_replay.html", show, status)
 
 
 def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None:
@@ -234,6 +233,15 @@ def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None
     ) -> Response:
         """Show a step of an episode."""
         return await _replay(run, compute, streams, catalogue, replace(at, t=t))
+
+    @router.get(f"/replay{path}/environments")
+    def environments(
+        run: RecordedRun,
+        at: EpisodeRef = Depends(episode),  # noqa: B008
+        t: T = 0,
+    ) -> Response:
+        """Show all environments of a vector during an episode of one of them."""
+        return run_page(run, "replay", "run_environments.html", _environments(run, replace(at, t=t)))
 
 
 for _path, _episode in EPISODES.items():
@@ -272,7 +280,7 @@ async def what_if(
     shown_t = step.t if t is None else t
     start = max(0, shown_t - BEFORE)
     found = json.loads(await compute(computed.what_if_page, run.recording, step, action, start, STEPS))
-    return RunPage(
+    return run_page(
         run,
         "replay",
         "run_what_if.html",
@@ -349,3 +357,58 @@ def panel_of(
     has_pictures, note = picture_note(recording, phase)
     scene = "" if drawing is None else drawing.frame(None, f"The grid of {label}", style="")
     return ReplayPanel(label, number, source, f"{source}/pictures", scene, has_pictures, note, **more)
+
+
+MAX_PANELS: Final = 8
+"""Environments of a vector that a page shows side by side."""
+
+
+def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
+    """Return the values of the page: an episode, and the other environments' episodes at its first step."""
+    base = f"/runs/{run.run_id}/replay"
+    with open_recording(run.recording) as recording:
+        shown = at.number_in(recording)
+        steps = recording.phase(at.phase).episode(shown)
+        turns = steps.table.round_of(steps.first)
+        # The first trial of the evaluation, within which trials are numbered.
+        first = shown - at.episode
+        panels = []
+        for environment, number in _episodes_at(recording, at.phase, steps, shown)[:MAX_PANELS]:
+            begun = steps.table.round_of(recording.phase(at.phase).episode(number).first)
+            path = replace(at, episode=number - first, t=0).episode_path
+            name = "trial" if at.after is not None else "episode"
+            panel = panel_of(
+                recording,
+                at.phase,
+                f"/api/v1{base}/{path}",
+                f"Environment {environment}: {name} {number - first:,}",
+                offset=(begun.start - turns.start) // len(turns),
+                address=f"{base}/{path}",
+            )
+            panels.append(panel)
+        return {
+            "title": at.heading,
+            "alone": f"{base}/{at.episode_path}",  # the replay of the episode alone
+            "shown": panels,
+            "length": len(steps),
+            "t": min(at.t, len(steps)),
+            "left_out": max(0, recording.environments - len(panels)),
+        }
+
+
+def _episodes_at(
+    recording: Recording, phase: str, steps: EpisodeSteps, episode: int
+) -> list[tuple[int, int]]:
+    """Return each environment and the number of its episode at the first step of another one, if it ended."""
+    episodes, begin = recording.phase(phase).episodes, steps.table.round_of(steps.first).start
+    by_environment = {steps.environment: episode}
+    if not steps.table.have_turns:
+        return list(by_environment.items())
+    names = ("environment", "episode", "last_step")
+    for block in episodes.blocks(episodes.first_from("last_step", begin)):
+        for environment, number, last in zip(*(block[name].tolist() for name in names), strict=True):
+            if last >= begin:
+                by_environment.setdefault(environment, number)
+        if len(by_environment) == recording.environments:
+            break
+    return sorted(by_environment.items())

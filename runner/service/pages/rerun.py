@@ -24,8 +24,7 @@ from runner.service import computed
 from runner.service.computed import link
 from runner.service.dependencies import At, ComputationOf, RecordedRun
 from runner.service.guard import POLICY
-from runner.service.pages.frame import RunPage
-from runner.service.pages.rendering import Page
+from runner.service.pages.rendering import Page, run_page
 from runner.service.pages.replay import step_of
 from runner.util.extras import missing
 from runner.util.files import cache_folder, replacing, storage_errors
@@ -53,7 +52,7 @@ async def viewer(run: RecordedRun, compute: ComputationOf, at: At = "") -> Respo
     back = step.replay_address(run.run_id) if step else ""
     frame = link(f"/runs/{run.run_id}/rerun/frame", {"at": at})
     values = {"content": content, "back": back, "frame": frame}
-    return RunPage(run, "rerun", "run_rerun.html", values)
+    return run_page(run, "rerun", "run_rerun.html", values)
 
 
 @router.get("/runs/{run}/rerun/frame")

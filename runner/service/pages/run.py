@@ -49,8 +49,7 @@ from runner.service.dependencies import (
     WrittenRun,
 )
 from runner.service.jobs.queue import JobQueue
-from runner.service.pages.frame import RunPage, StatusName, result_of
-from runner.service.pages.rendering import Form, Page, form_of, viewer_of
+from runner.service.pages.rendering import Form, Page, StatusName, form_of, result_of, run_page, viewer_of
 from runner.service.settings import ServiceSettings
 from runner.util import humanize
 from runner.util.extras import EXPORTS, plugin_names
@@ -196,14 +195,14 @@ async def distributions(run: RecordedRun, compute: ComputationOf, axis: AxisOf =
 async def pictures(run: RecordedRun, compute: ComputationOf) -> Response:
     """Show the logged pictures."""
     body = (await compute(computed.pictures, run.recording)).decode()
-    return RunPage(run, "pictures", "run_body.html", {"body": body})
+    return run_page(run, "pictures", "run_body.html", {"body": body})
 
 
 @router.get("/learned")
 async def learned(run: RecordedRun, compute: ComputationOf, state: StateParts = None) -> Response:
     """Show the maps of what was learned, in the situation of a state."""
     body = (await compute(computed.maps, run.recording, tuple(state or ()))).decode()
-    return RunPage(run, "learned", "run_body.html", {"body": body})
+    return run_page(run, "learned", "run_body.html", {"body": body})
 
 
 @router.get("/config")
@@ -243,7 +242,7 @@ def config(request: Request, run: FoundRun, settings: SettingsOf) -> Response:
         Section("", links=links),
         Section("Log", grids=[log]) if lines else Section("Log", [silence]),
     ]
-    return RunPage(run, "config", "run_body.html", {"body": partials().answer(sections)})
+    return run_page(run, "config", "run_body.html", {"body": partials().answer(sections)})
 
 
 def _overview(
@@ -265,7 +264,7 @@ def _overview(
             "film_endings": {ending: ending[1:].upper() for ending in FORMATS},
         }
 
-    return RunPage(run, "", "run_overview.html", values)
+    return run_page(run, "", "run_overview.html", values)
 
 
 def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:

@@ -1,11 +1,11 @@
-"""The sweeps, and the results of one."""
+"""The sweeps, the results of one, and explanations of the difference between two runs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -13,11 +13,14 @@ from fastapi import APIRouter, Depends, Request, Response
 from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 
-from runner.analysis.sections import Grid
+from runner.analysis.episodes import EpisodeRef
+from runner.analysis.sections import Grid, Link
+from runner.debugging.explanation import Explanation, drawn_sections
 from runner.debugging.explanation_files import explanations_in
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
 from runner.service import computed
+from runner.service.api.reading import Part, found_explanation
 from runner.service.catalogue import Catalogue
 from runner.service.computed import link
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
@@ -29,7 +32,7 @@ from runner.sweep.state import read_sweep
 router = APIRouter(prefix="/sweeps", include_in_schema=False)
 
 Name = Annotated[str, InPath(max_length=100)]
-Part = Literal["results", "importance", "pictures"]
+SweepPart = Literal["results", "importance", "pictures"]
 PARTS: Final = {
     "results": (computed.sweep_ranking, "Comparing the trials"),
     "importance": (computed.sweep_importance, "Computing the importance of parameters"),
@@ -117,8 +120,27 @@ async def sweep(state: SweepOf, cache: CacheOf, jobs: JobsOf) -> Response:
     return Page("sweep_page.html", show)
 
 
+@router.get("/explanations/{pair}/{metric}")
+def explanation(pair: Part, metric: Part, settings: SettingsOf) -> Response:
+    """Show an explanation."""
+    result = found_explanation(pair, metric, settings)
+    first, *others = drawn_sections(result)
+    shown = [replace(first, title="", links=_links(result)), *others]
+    return Page("explanation.html", {"title": first.title, "answer": shown})
+
+
+def _links(found: Explanation) -> list[Link]:
+    """Return the replays of the first step that the strongest setting changed, without and with it."""
+    first = found.first_step
+    if first is None or first.episode is None:
+        return []
+    step = EpisodeRef(first.episode, first.t or 0)
+    runs = (("without", first.run_a), ("with", first.run_b))
+    return [Link(f"Replay {word} {first.setting}", step.replay_address(run)) for word, run in runs]
+
+
 @router.get("/{name}/{part}")
-async def sweep_part(state: SweepOf, part: Part, cache: CacheOf, processes: SweepProcesses) -> Response:
+async def sweep_part(state: SweepOf, part: SweepPart, cache: CacheOf, processes: SweepProcesses) -> Response:
     """Return a part of the page of a sweep: the ranking, the importance of parameters, or the pictures."""
     make, _ = PARTS[part]
     body = await cache.get_or_await(
