@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.compare.statistics import Estimate, bootstrap_means
+from runner.analysis.statistics import Estimate, bootstrap_means
 from runner.debugging.explanation import ENOUGH, Interaction, Mixture, Setting
 from runner.debugging.factors import MAX_ALL
 from runner.debugging.mixtures import Mixtures

@@ -137,8 +137,7 @@ def plot(
         RunnerError: there is no such axis, or smooth is not from 0 to 100.
     """
     from runner.analysis.axes import axis_of
-    from runner.analysis.groups import groups_of
-    from runner.analysis.panels import panels_of
+    from runner.analysis.groups import groups_of, panels_of
     from runner.analysis.series import series_of
     from runner.archive.places import at_hand
     from runner.export.plots.curves import curves_sheet

@@ -24,8 +24,7 @@ from urllib.parse import urlencode
 from markupsafe import Markup, escape
 
 from runner.analysis.axes import axis_of
-from runner.analysis.compare.score_table import scores_of
-from runner.analysis.compare.tasks import compare_algorithms
+from runner.analysis.compare.tasks import compare_algorithms, scores_of
 from runner.analysis.diff import diff, with_seconds, without_ignored
 from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.sections import made_sections, summary

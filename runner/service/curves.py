@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field
 
 from runner.analysis.axes import AXES, EPISODES, Axis, axes_of, axis_of
-from runner.analysis.groups import Group, duplicates, groups_of
-from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
+from runner.analysis.groups import Curve, Group, NoMetrics, Panel, duplicates, groups_of, panels_of, smoothed
 from runner.analysis.series import RunSeries, read_series, series_of, values_left_out
 from runner.environments.naming import spoken
 from runner.errors import RunnerError

@@ -14,11 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.compare.statistics import NEVER
-from runner.analysis.groups import Group
-from runner.analysis.panels import Panel
+from runner.analysis.groups import Group, Panel
 from runner.analysis.sections import Figure, LegendEntry, Section, SourceFile
 from runner.analysis.series import series_of
+from runner.analysis.statistics import NEVER
 from runner.archive.places import at_hand
 from runner.drawing import palette
 from runner.errors import RunnerError

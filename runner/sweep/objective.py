@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from runner.analysis.axes import first_crossing, mean_height
-from runner.analysis.compare.statistics import NEVER
 from runner.analysis.evaluations import evaluation_record
 from runner.analysis.series import (
     evaluation_readings,
@@ -17,6 +16,7 @@ from runner.analysis.series import (
     full_name,
     training_readings,
 )
+from runner.analysis.statistics import NEVER
 from runner.errors import RunnerError, nearest
 from runner.recording import schema
 from runner.recording.messages import Message

@@ -14,9 +14,9 @@ from typing import BinaryIO, Final, get_args
 
 import numpy as np
 
-from runner.analysis.compare import statistics
-from runner.analysis.compare.statistics import Estimate, bounded
+from runner.analysis import statistics
 from runner.analysis.sections import Answer, Grid, Section
+from runner.analysis.statistics import Estimate, bounded
 from runner.errors import RunnerError
 from runner.sweep.importance import Effect, effects_of, effects_of_grid
 from runner.sweep.model import Sweep

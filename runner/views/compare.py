@@ -110,13 +110,11 @@ def compare(
     from runner.analysis.axes import axis_of
     from runner.analysis.compare import compare
     from runner.analysis.compare.moments import moment_of
-    from runner.analysis.compare.score_table import scores_of
-    from runner.analysis.compare.sections import sections
-    from runner.analysis.compare.statistics import require_scipy
-    from runner.analysis.compare.task_sections import task_sections
-    from runner.analysis.compare.tasks import compare_algorithms
+    from runner.analysis.compare.sections import sections, task_sections
+    from runner.analysis.compare.tasks import compare_algorithms, scores_of
     from runner.analysis.groups import grouped, metrics_of, require_two
     from runner.analysis.series import parse_target, series_of
+    from runner.analysis.statistics import require_scipy
     from runner.export.reports.compare import render_comparison, render_tasks
 
     require_scipy()

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from runner.analysis.compare.moments import Moment
-from runner.analysis.compare.score_table import Bounds
-from runner.analysis.compare.tasks import compare_tasks
+from runner.analysis.compare.tasks import Bounds, compare_tasks
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries
 

@@ -3,7 +3,7 @@
     groups, notes = grouped([read_series(recording) for recording in recordings])
     comparison = compare(groups, [("success_percent", "")], Moment("last"), notes)
 
-`runner.analysis.compare.statistics` explains the numbers.
+`runner.analysis.statistics` explains the numbers.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.compare import statistics
+from runner.analysis import statistics
 from runner.analysis.compare.moments import (
     Measured,
     Moment,
@@ -30,9 +30,9 @@ from runner.analysis.compare.moments import (
     uneven_ends,
     window_notes,
 )
-from runner.analysis.compare.statistics import Estimate
 from runner.analysis.groups import Group
 from runner.analysis.series import full_name, points_of, title_of
+from runner.analysis.statistics import Estimate
 from runner.errors import RunnerError
 from runner.util.arrays import Floats
 

@@ -12,9 +12,9 @@ from typing import Final, Literal
 import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis, first_crossing, mean_height
-from runner.analysis.compare.statistics import FEW_SEEDS, NEVER
 from runner.analysis.groups import Group
 from runner.analysis.series import RunSeries, full_name, points_of
+from runner.analysis.statistics import FEW_SEEDS, NEVER
 from runner.errors import RunnerError
 from runner.recording.metrics import is_higher_better
 from runner.util.humanize import listed

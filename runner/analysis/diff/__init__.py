@@ -27,9 +27,16 @@ from runner.analysis.diff.divergence import (
     training_divergence,
     unbroken,
 )
-from runner.analysis.diff.metrics import MetricDiff, metric_diffs
-from runner.analysis.diff.overlap import Overlap, VisitsDiff, training_overlap, visits_diff
-from runner.analysis.diff.tables import TableDiff, table_diffs
+from runner.analysis.diff.extent import (
+    MetricDiff,
+    Overlap,
+    TableDiff,
+    VisitsDiff,
+    metric_diffs,
+    table_diffs,
+    training_overlap,
+    visits_diff,
+)
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.recording import schema

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from runner.analysis.diff.divergence import Divergence
-from runner.analysis.diff.tables import own_actions_in_words
+from runner.analysis.diff.extent import own_actions_in_words
 from runner.environments.naming import (
     actions_in_words,
     agent_actions,

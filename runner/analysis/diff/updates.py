@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.diff.tables import own_actions_in_words
+from runner.analysis.diff.extent import own_actions_in_words
 from runner.config import from_mapping
 from runner.environments.naming import rewards_in_words, states_in_words
 from runner.learning.learner import NamedTables

@@ -64,8 +64,7 @@ def plot_command(
     """
     from runner.analysis.axes import axis_of
     from runner.analysis.contents import shortcomings
-    from runner.analysis.groups import duplicates, groups_of
-    from runner.analysis.panels import panels_of
+    from runner.analysis.groups import duplicates, groups_of, panels_of
     from runner.analysis.series import read_series, values_left_out
     from runner.export.plots.curves import curves_sheet
     from runner.export.plots.image import check_suffix, save
@@ -108,8 +107,7 @@ def plot_command(
 
 
 def _plot_tasks(series: list[RunSeries], normalise: Path, to: Writing) -> Reply:
-    from runner.analysis.compare.score_table import scores_of
-    from runner.analysis.compare.tasks import compare_algorithms
+    from runner.analysis.compare.tasks import compare_algorithms, scores_of
     from runner.export.plots.image import save
     from runner.export.plots.tasks import tasks_sheet
 
@@ -133,7 +131,7 @@ def _refuse_style(axis: str, style: CurveStyle) -> None:
 
 
 def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
-    from runner.analysis.panels import panels_of
+    from runner.analysis.groups import panels_of
     from runner.export.plots.image import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of

@@ -197,7 +197,7 @@ def _range_text(parameter: Parameter) -> str:
 
 
 def _results(sweep: Sweep, trials: Trials, status: SweepStatus, following: str, exit_code: int) -> Reply:
-    from runner.analysis.compare.statistics import bounded
+    from runner.analysis.statistics import bounded
     from runner.sweep.results import objective_text, values_text
 
     best = status.best

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.compare import GroupResult, MetricResult
-from runner.analysis.compare.statistics import Estimate
 from runner.analysis.compare.tasks import AlgorithmResult
-from runner.analysis.diff.tables import TableDiff
+from runner.analysis.diff.extent import TableDiff
+from runner.analysis.statistics import Estimate
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.export.plots.chart import Canvas, Chart, Scale, labelled, series_colour, series_marker

@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 
 from runner.analysis.axes import EPISODES
-from runner.analysis.groups import Group
-from runner.analysis.panels import Curve, NoMetrics, Panel, panels_of, smoothed
+from runner.analysis.groups import Curve, Group, NoMetrics, Panel, panels_of, smoothed
 from runner.analysis.sections import Figure, LegendEntry, Section
 from runner.analysis.series import values_left_out
 from runner.drawing import palette

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from runner.analysis.compare.statistics import Estimate
+from runner.analysis.statistics import Estimate
 from runner.drawing import palette
 from runner.export.plots.chart import Chart, Markers, Scale, series_colour
 

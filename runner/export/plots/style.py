@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.panels import Panel
+from runner.analysis.groups import Panel
 from runner.errors import RunnerError
 from runner.recording.metrics import SHARES
 from runner.util.arrays import Flags, Floats

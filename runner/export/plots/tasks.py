@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from runner.analysis.compare.task_sections import AGGREGATES, EXPLANATION
+from runner.analysis.compare.sections import AGGREGATES, TASKS_EXPLANATION
 from runner.analysis.compare.tasks import TaskComparison
 from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, series_colour
 from runner.export.plots.comparisons import draw_estimate, letter, profile_chart
@@ -33,7 +33,7 @@ def task_charts(comparison: TaskComparison) -> list[Canvas]:
 def tasks_sheet(comparison: TaskComparison) -> Canvas:
     """Return all charts on one sheet, with a legend above and notes below."""
     charts = task_charts(comparison)
-    notes = textwrap.wrap(EXPLANATION, _LETTERS)
+    notes = textwrap.wrap(TASKS_EXPLANATION, _LETTERS)
     head = 46.0 + 14 * len(comparison.algorithms)
     height = head + max(chart.height for chart in charts) + 10 * len(notes) + 8
     sheet = Canvas(

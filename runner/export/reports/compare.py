@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from runner.analysis.compare import Comparison, MetricResult
-from runner.analysis.compare.sections import sections, summary
-from runner.analysis.compare.task_sections import task_sections
+from runner.analysis.compare.sections import sections, summary, task_sections
 from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
 from runner.analysis.sections import Figure, Grid, LegendEntry, Section

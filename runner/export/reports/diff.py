@@ -9,8 +9,8 @@ import numpy as np
 
 from runner.analysis.diff import RunDiff
 from runner.analysis.diff.divergence import Divergence
+from runner.analysis.diff.extent import common_snapshots
 from runner.analysis.diff.sections import sections, summary
-from runner.analysis.diff.tables import common_snapshots
 from runner.analysis.groups import Group
 from runner.analysis.sections import Figure, LegendEntry, Section
 from runner.analysis.series import read_series

@@ -13,8 +13,7 @@ import runner
 from runner.analysis.compare import compare
 from runner.analysis.compare.moments import Moment
 from runner.analysis.compare.sections import sections, summary
-from runner.analysis.groups import grouped, groups_of, metrics_of
-from runner.analysis.panels import panels_of
+from runner.analysis.groups import grouped, groups_of, metrics_of, panels_of
 from runner.analysis.sections import markdown
 from runner.analysis.series import RunSeries
 from runner.errors import RunnerError

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from runner.analysis.compare import statistics
+from runner.analysis import statistics
 
 
 def test_the_interval_of_the_iqm_has_its_nominal_coverage():

@@ -11,12 +11,11 @@ import pytest
 from click.testing import CliRunner
 
 import runner
+from runner.analysis import statistics
 from runner.analysis.axes import STEPS
-from runner.analysis.compare import statistics
 from runner.analysis.compare.moments import Moment
-from runner.analysis.compare.score_table import Bounds, parse_table, read_table
-from runner.analysis.compare.task_sections import task_sections
-from runner.analysis.compare.tasks import compare_tasks, metric_of_tasks
+from runner.analysis.compare.sections import task_sections
+from runner.analysis.compare.tasks import Bounds, compare_tasks, metric_of_tasks, parse_table, read_table
 from runner.analysis.groups import grouped
 from runner.analysis.sections import markdown
 from runner.analysis.series import RunSeries

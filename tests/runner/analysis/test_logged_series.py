@@ -10,8 +10,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.analysis.axes import STEPS, axis_of
-from runner.analysis.groups import groups_of
-from runner.analysis.panels import panels_of
+from runner.analysis.groups import groups_of, panels_of
 from runner.analysis.series import LOGGED, points_of, read_series, values_left_out
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import runner
-from runner.analysis.compare.statistics import Estimate
+from runner.analysis.statistics import Estimate
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.debugging.explain import EPISODES, RUNS

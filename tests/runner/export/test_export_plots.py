@@ -11,8 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from runner.analysis.evaluations import evaluation_records
-from runner.analysis.groups import groups_of
-from runner.analysis.panels import panels_of
+from runner.analysis.groups import groups_of, panels_of
 from runner.analysis.series import RunSeries, read_series
 from runner.cli import cli
 from runner.errors import RunnerError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from runner.analysis.axes import EPISODES
-from runner.analysis.compare.statistics import Estimate
-from runner.analysis.panels import Curve, Panel, smoothed
+from runner.analysis.groups import Curve, Panel, smoothed
+from runner.analysis.statistics import Estimate
 from runner.export.plots.chart import Scale
 from runner.export.plots.curves import panel_chart
 from runner.export.plots.mixtures import bars_chart

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 from sweeping import Here, described, digests, swept
 
-from runner.analysis.panels import panels_of
+from runner.analysis.groups import panels_of
 from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.config import from_mapping

@@ -1,0 +1,412 @@
+"""How much two runs differ: in training after they diverged, visits to states, Q-tables and metrics.
+
+Q-tables are compared at the steps of which both runs have a snapshot; curves of metrics at the end, in
+area, and where each first reaches a level.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from runner.analysis.axes import first_crossing, mean_height
+from runner.analysis.diff.divergence import FIELDS, differing_steps, unbroken
+from runner.analysis.evaluations import evaluation_records
+from runner.analysis.series import (
+    evaluation_readings,
+    full_name,
+    lines_in,
+    points_of,
+    read_series,
+    single_agent_unnamed,
+    training_readings,
+)
+from runner.environments.mdp import Mdp
+from runner.environments.naming import action_names, actions_in_words, states_in_words
+from runner.errors import RecordingError, RunnerError, nearest
+from runner.recording.messages import QTable
+from runner.recording.metrics import METRIC_OF, METRICS, is_higher_better
+from runner.recording.reader import Recording
+from runner.util.arrays import Floats, Ints, Records
+
+_MAX_STATES: Final = 5
+"""States that are named."""
+_BATCH_EPISODES: Final = 4096
+_BATCH_STEPS: Final = 1 << 15
+_ALIGNED: Final = FIELDS[2:]
+"""The fields compared of steps of the same time in the same episode."""
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How far two runs' training is the same, aligned by episode and time in it."""
+
+    steps_a: int
+    steps_b: int
+    episodes: int
+    """Episodes that both runs have."""
+    equal_episodes: int
+    """Episodes that are the same step by step."""
+    equal_steps: int
+    """Steps that agree with the other run's step of the same episode and time."""
+    compared_steps: int
+    """Steps of the longer of each two episodes."""
+    mean_length_a: float
+    mean_length_b: float
+
+
+@dataclass(frozen=True)
+class StateVisits:
+    """How often two runs acted in a state, given by its name."""
+
+    state: str
+    a: int
+    b: int
+
+
+@dataclass(frozen=True)
+class VisitsDiff:
+    """How the training steps of two runs spread over the states."""
+
+    states_a: int
+    """States that A acted in at all."""
+    states_b: int
+    alike: float
+    """Overlap of the two distributions over states, 0 to 1: the sum of the lower share of each state."""
+    most_apart: list[StateVisits]
+    """The states whose shares of all steps differ most."""
+
+
+def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Ints, Ints]]:
+    """Return how far the training of two runs is the same, and the visits to each state, [S], of either."""
+    left, right = _Steps(a), _Steps(b)
+    episodes = equal_episodes = equal_steps = compared = 0
+    total = np.zeros(2, np.int64)
+    for ours, theirs in _common_lengths(a, b):
+        agree = _agreement(left, right, ours, theirs)
+        episodes += len(ours)
+        equal_steps += int(agree.sum())
+        compared += int(np.maximum(ours, theirs).sum())
+        equal_episodes += int(((ours == theirs) & (agree == ours)).sum())
+        total += ours.sum(), theirs.sum()
+    mean_a, mean_b = (total / max(episodes, 1)).tolist()
+    steps_a, steps_b = (recording.train.steps.count() for recording in (a, b))
+    overlap = Overlap(steps_a, steps_b, episodes, equal_episodes, equal_steps, compared, mean_a, mean_b)
+    return overlap, (left.count_all_visits(), right.count_all_visits())
+
+
+def visits_diff(mdp: Mdp, a: Ints, b: Ints) -> VisitsDiff:
+    """Return how two runs' visits to states, [S] each, differ."""
+    shares = [visits / max(visits.sum(), 1) for visits in (a, b)]
+    apart = np.abs(shares[0] - shares[1])
+    words = states_in_words(mdp)
+    most = [int(state) for state in np.argsort(-apart, kind="stable")[:_MAX_STATES] if apart[state] > 0]
+    return VisitsDiff(
+        states_a=int(np.count_nonzero(a)),
+        states_b=int(np.count_nonzero(b)),
+        alike=float(np.minimum(*shares).sum()),
+        most_apart=[StateVisits(str(words[state]), int(a[state]), int(b[state])) for state in most],
+    )
+
+
+def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the lengths of successive episodes of both runs, in batches of about `_BATCH_STEPS` steps.
+
+    An episode longer than that comes alone.
+    """
+    lengths = [unbroken(recording) for recording in (a, b)]
+    common = min(count for _, count in lengths)
+    for first in range(0, common, _BATCH_EPISODES):
+        last = min(first + _BATCH_EPISODES, common)
+        records = [recording.train.episodes.array(first, last) for recording in (a, b)]
+        whole = min(
+            int(np.searchsorted(episodes["last_step"], steps))
+            for episodes, (steps, _) in zip(records, lengths, strict=True)
+        )
+        ours, theirs = (episodes["length"][:whole].astype(np.int64) for episodes in records)
+        longer = np.maximum(ours, theirs)
+        apart = np.diff(np.cumsum(longer) // _BATCH_STEPS) > 0
+        apart |= (longer[:-1] > _BATCH_STEPS) | (longer[1:] > _BATCH_STEPS)
+        cuts = np.flatnonzero(apart) + 1
+        if whole:
+            yield from zip(np.split(ours, cuts), np.split(theirs, cuts), strict=True)
+        if whole < last - first:
+            return
+
+
+class _Steps:
+    """A run's training steps, taken in order; the visits to each state are counted on the way."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._path = recording.path
+        self._blocks = recording.train.steps.blocks()
+        self._rest: Records = np.empty(0, recording.train.steps.row_dtype)
+        self._visits = np.zeros(recording.mdp.states, np.int64)
+
+    def take(self, count: int) -> Records:
+        """Return the next steps."""
+        parts = [self._rest[:0]]
+        while count > 0:
+            if not len(self._rest) and not self._read_block():
+                raise RecordingError(f"{self._path}: found fewer training steps than its episodes are long.")
+            parts.append(self._rest[:count])
+            self._rest = self._rest[count:]
+            count -= len(parts[-1])
+        if len(parts) == 2:
+            return parts[1]
+        return np.concatenate([_without_fields(part) for part in parts]).view(self._rest.dtype)
+
+    def skip(self, count: int) -> None:
+        """Pass over the next steps."""
+        for first in range(0, count, _BATCH_STEPS):
+            self.take(min(_BATCH_STEPS, count - first))
+
+    def count_all_visits(self) -> Ints:
+        """Read to the end, and return how often each state was acted in, [S]."""
+        while self._read_block():
+            pass
+        return self._visits
+
+    def _read_block(self) -> bool:
+        block = next(self._blocks, None)
+        if block is None:
+            return False
+        states = len(self._visits)
+        if (highest := int(block["state"].max(initial=0))) >= states:
+            raise RecordingError(
+                f"{self._path}: found state {highest} in training step {block['step'][0]} or soon after, "
+                f"expected less than {states}; `dualtaxi verify` names the step."
+            )
+        self._visits += np.bincount(block["state"], minlength=states)
+        self._rest = block
+        return True
+
+
+def _agreement(left: _Steps, right: _Steps, ours: Ints, theirs: Ints) -> Ints:
+    """Return, for each of the next episodes, how many steps agree with the other's of the same time."""
+    common = np.minimum(ours, theirs)
+    if len(ours) == 1:  # it may be longer than a batch
+        agree = 0
+        for first in range(0, int(common[0]), _BATCH_STEPS):
+            n = min(_BATCH_STEPS, int(common[0]) - first)
+            agree += n - int(differing_steps(left.take(n), right.take(n), _ALIGNED).sum())
+        left.skip(int(ours[0] - common[0]))
+        right.skip(int(theirs[0] - common[0]))
+        return np.array([agree])
+    episode = np.repeat(np.arange(len(common)), common)
+    t = np.arange(len(episode)) - np.repeat(np.cumsum(common) - common, common)
+    at = [(np.cumsum(lengths) - lengths)[episode] + t for lengths in (ours, theirs)]
+    agree_at = _agreeing_pairs(left.take(int(ours.sum())), right.take(int(theirs.sum())), at[0], at[1])
+    return np.bincount(episode[agree_at], minlength=len(common))
+
+
+def _agreeing_pairs(left: Records, right: Records, ours: Ints, theirs: Ints) -> Ints:
+    """Return which of the pairs of steps (`ours` in `left`, `theirs` in `right`) agree in all but number."""
+    if len(left) == len(right) == len(ours):
+        return np.flatnonzero(~differing_steps(left, right, _ALIGNED))
+    agree = np.flatnonzero(left["state"][ours] == right["state"][theirs])  # most that differ do so there
+    pairs = [
+        _without_fields(steps)[at[agree]].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
+    ]
+    return agree[~differing_steps(pairs[0], pairs[1], _ALIGNED)]
+
+
+def _without_fields(steps: Records) -> Records:
+    """Return steps as plain bytes: NumPy copies fields one by one, and this ten times as fast."""
+    return steps.view(f"V{steps.itemsize}")
+
+
+_MAX_CELLS: Final = 5
+"""Cells with the largest differences that are listed."""
+
+
+@dataclass(frozen=True)
+class CellDiff:
+    """One cell of a table, by the names of state and action, and its value in both runs."""
+
+    state: str
+    action: str
+    a: float
+    b: float
+
+
+@dataclass(frozen=True)
+class TableDiff:
+    """Two runs' tables of one agent after the same number of training episodes."""
+
+    episode: int
+    agent: str
+    largest: float
+    mean: float
+    """Mean of the absolute difference over all cells."""
+    greedy_share: float
+    """Share of the states in which the greedy action differs."""
+    greedy_share_visited: float
+    """The same, each state weighted by its visits in both runs' training; nan without steps."""
+    cells: list[CellDiff]
+    """Where the difference is largest."""
+
+
+def table_diffs(a: Recording, b: Recording, visits: Ints | None) -> Iterator[TableDiff]:
+    """Yield the differences of the tables, of the same shapes, that both runs have snapshots of.
+
+    `visits` is how often each state was acted in, [S], both runs together.
+    """
+    weights = visits if visits is not None and visits.sum() else None
+    for left, right in common_snapshots(a, b):
+        apart = np.abs(left.values - right.values)
+        other = left.values.argmax(axis=1) != right.values.argmax(axis=1)
+        yield TableDiff(
+            episode=left.episode,
+            agent=left.agent,
+            largest=float(apart.max()),
+            mean=float(apart.mean()),
+            greedy_share=float(other.mean()),
+            greedy_share_visited=math.nan if weights is None else float(other @ weights / weights.sum()),
+            cells=_largest_cells(a.mdp, left, right, apart),
+        )
+
+
+def common_snapshots(a: Recording, b: Recording) -> Iterator[tuple[QTable, QTable]]:
+    """Yield the tables, of one shape, that both runs have after as many episodes."""
+    theirs = b.snapshots()
+    right = next(theirs, None)
+    for left in a.snapshots():
+        while right is not None and _moment(right) < _moment(left):
+            right = next(theirs, None)
+        if right is not None and _moment(right) == _moment(left) and right.values.shape == left.values.shape:
+            states, actions = left.values.shape
+            widths = {a.mdp.joint_actions, *a.mdp.action_counts}
+            if states != a.mdp.states or actions not in widths:
+                raise RecordingError(
+                    f"{a.path}: found a Q-table of shape {left.values.shape}, expected {a.mdp.states} states "
+                    f"and one of {sorted(widths)} actions."
+                )
+            yield left, right
+
+
+def _moment(table: QTable) -> tuple[int, int]:
+    return table.episode, table.table
+
+
+def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: Floats) -> list[CellDiff]:
+    flat = apart.reshape(-1)
+    # Faster than sorting all cells, for each snapshot.
+    least = np.partition(flat, -_MAX_CELLS)[-_MAX_CELLS] if flat.size > _MAX_CELLS else 0.0
+    candidates = np.flatnonzero(flat >= least)
+    order = candidates[np.argsort(-flat[candidates], kind="stable")][:_MAX_CELLS]
+    states = states_in_words(mdp)
+    actions = own_actions_in_words(mdp, a.table, apart.shape[1])
+    cells = []
+    for cell in order.tolist():
+        s, j = divmod(cell, apart.shape[1])
+        if apart[s, j] > 0:
+            cells.append(CellDiff(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
+    return cells
+
+
+def own_actions_in_words(mdp: Mdp, table: int, width: int) -> list[str]:
+    """Return the words of the columns of table number `table`: joint actions, or one agent's own."""
+    if width == mdp.joint_actions:
+        return [str(words) for words in actions_in_words(mdp)]
+    names = action_names(mdp)
+    return names[table] if names else [f"action {j}" for j in range(width)]
+
+
+_COMPARED: Final = (*METRICS, METRIC_OF["training.mean_length"], METRIC_OF["training.percent_filled"])
+_OF_LOOPS: Final = ("training.mean_length", "training.mean_return")
+
+
+@dataclass(frozen=True)
+class MetricDiff:
+    """One metric of two runs, over training episodes."""
+
+    name: str
+    episodes: list[int]
+    """Episodes at which both have a value."""
+    a: list[float]
+    b: list[float]
+    end_a: float
+    """The last value of all, also where the other has none; of a loop's training the mean at its end."""
+    end_b: float
+    area: float
+    """Mean difference b - a: the area between the curves over the episodes both have, by their span."""
+    crossings: dict[str, tuple[int | None, int | None]]
+    """Target level, as text, to the episodes at which a and b first reach it."""
+
+    @property
+    def same(self) -> bool:
+        """Whether both curves are the same."""
+        return self.a == self.b and self.end_a == self.end_b
+
+
+def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> list[MetricDiff]:
+    """Return how each metric of evaluations and of a loop's training differs.
+
+    With the first crossing of each target's level.
+
+    Raises:
+        RunnerError: they have no metric of that name.
+    """
+    (curves_a, ends_a), (curves_b, ends_b) = _curves(a), _curves(b)
+    names = [name for name in curves_a if name in curves_b]
+    for name in targets:
+        if name not in names:
+            known = f"expected one of {', '.join(names)}" if names else "but both runs have no metric"
+            raise RunnerError(f"target: found {name!r}, {known}.{nearest(name, names)}")
+    diffs = []
+    for name in names:
+        left, right = curves_a[name], curves_b[name]
+        episodes = sorted(left.keys() & right.keys())
+        crossings = {}
+        if (level := targets.get(name)) is not None:
+            rising = is_higher_better(name, has_goal="success_percent" in names)
+            crossings[f"{level:g}"] = (
+                first_crossing(left, level, rising),
+                first_crossing(right, level, rising),
+            )
+        diffs.append(
+            MetricDiff(
+                name=name,
+                episodes=episodes,
+                a=[left[episode] for episode in episodes],
+                b=[right[episode] for episode in episodes],
+                end_a=ends_a[name],
+                end_b=ends_b[name],
+                area=mean_height(episodes, [right[episode] - left[episode] for episode in episodes]),
+                crossings=crossings,
+            )
+        )
+    return diffs
+
+
+def _curves(recording: Recording) -> tuple[dict[str, dict[int, float]], dict[str, float]]:
+    """Return metric to episode to value, without values that are unknown, and the value at the end of each.
+
+    A loop's training ends with the mean over its last episodes, as in `ls` and `show`.
+    """
+    curves: dict[str, dict[int, float]] = {}
+    recent: dict[str, float] = {}
+    for record in evaluation_records(recording):
+        readings = evaluation_readings(record)
+        if not recording.can_train_again:
+            readings = single_agent_unnamed(readings)
+        if record.training is not None:
+            readings |= training_readings(record.training)
+        for metric in _COMPARED:
+            for line, value in readings.get(metric.name, {}).items():
+                curves.setdefault(full_name(metric.name, line), {})[record.episode] = value
+    if not recording.can_train_again and recording.train.episodes.count():
+        series = read_series(recording, metrics=_OF_LOOPS)
+        for name, line in lines_in([series]):
+            if name in _OF_LOOPS:
+                full = full_name(name, line)
+                points = points_of(series, name, line, aligned=False)
+                curves[full] = {int(at): value for at, value in points.items()}
+                if (end := series.recent.get(name, {}).get(line)) is not None:
+                    recent[full] = end
+    return curves, {name: curve[max(curve)] for name, curve in curves.items()} | recent
