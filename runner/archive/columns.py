@@ -313,9 +313,7 @@ class Shape:
         self.extras = extras
         self._topics = run.topics
         space = run.spaces["action"]
-        first = 0
-        if not run.has_states:
-            first = space.get("start", 0)
+        first = 0 if run.has_states else space.get("start", 0)
         is_discrete = space.get("type") == "Discrete"
         self._actions = range(first, first + space["n"]) if is_discrete else range(0)
         self.mdp = run.mdp if run.tabular else None

@@ -112,18 +112,9 @@ LEFT_OUT_IF_EMPTY: Final = {
 }
 """The tables that an archive need not have."""
 EXTRA_PREFIX: Final = "extra_"
-_MAY_BE_NULL: Final = frozenset({"data", "seed"})
-
-
-def may_be_null(column: str) -> bool:
-    """Return whether a column is nullable.
-
-    That is the data of a snapshot that a replay computes, the seed of a reset without one, and the extras of
-    a step without them.
-    """
-    return column in _MAY_BE_NULL or column.startswith(EXTRA_PREFIX)
-
-
+"""The prefix of the columns of extras, which are null at a step without them."""
+NULLABLE: Final = frozenset({"data", "seed"})
+"""The other nullable columns: the data of a snapshot that a replay computes, and the seed of a reset."""
 ENCODINGS: Final = {
     **dict.fromkeys(("position", "step", "episode", "first_step", "last_step"), "DELTA_BINARY_PACKED"),
     **dict.fromkeys(("t", "state", "next_state", "action"), "BYTE_STREAM_SPLIT"),
@@ -145,11 +136,6 @@ def encodings_of(columns: pa.Schema) -> dict[str, str]:
     special = {name: ENCODINGS[name] for name in numbers if name in ENCODINGS}
     plain = {column.name for column in columns if pa.types.is_fixed_size_binary(column.type)}
     return special | dict.fromkeys(split, "BYTE_STREAM_SPLIT") | dict.fromkeys(plain, "PLAIN")
-
-
-def row_bytes(columns: pa.Schema) -> int:
-    """Return the approximate size of a row in memory; a text counts as a pointer."""
-    return sum(kind.byte_width if pa.types.is_fixed_size_binary(kind) else 8 for kind in columns.types)
 
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
@@ -218,22 +204,18 @@ def read_manifest(data: bytes, where: str) -> Manifest:
                 "another version of dualtaxi to restore it; its tables can be read all the same."
             )
         manifest = stored_as(Manifest, values, f"{where}: is not the manifest of an archive")
-        _check(manifest)
+        if strange := [name for name in manifest.files if not is_inside(name)]:
+            raise ValueError(f"the file {strange[0]!r} would leave the archive")
+        for name in ("run_id", "name", "created", "status"):
+            if not isinstance(manifest.run[name], str):
+                raise ValueError(f"the {name} of its run is {manifest.run[name]!r}")
+        if unknown := manifest.topics.keys() - {topic.name for topic in schema.ALL_TOPICS}:
+            raise ValueError(f"it has topics {sorted(unknown)}")
     except (KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
         raise RecordingError(f"{where}: is not the manifest of an archive ({error}).") from error
     if manifest.to_json() != data:
         raise RecordingError(f"{where}: does not match its seal: it was changed, and the archive is damaged.")
     return manifest
-
-
-def _check(manifest: Manifest) -> None:
-    if strange := [name for name in manifest.files if not is_inside(name)]:
-        raise ValueError(f"the file {strange[0]!r} would leave the archive")
-    for name in ("run_id", "name", "created", "status"):
-        if not isinstance(manifest.run[name], str):
-            raise ValueError(f"the {name} of its run is {manifest.run[name]!r}")
-    if unknown := set(manifest.topics) - {topic.name for topic in schema.ALL_TOPICS}:
-        raise ValueError(f"it has topics {sorted(unknown)}")
 
 
 def is_inside(name: str) -> bool:
@@ -243,16 +225,11 @@ def is_inside(name: str) -> bool:
     return plain and str(path) == name and not path.is_absolute() and ".." not in path.parts and name != "."
 
 
-def entry_of(path: Path) -> Entry:
-    """Return size and hash of a file.
+def entries_of(folder: Path) -> dict[str, Entry]:
+    """Return size and hash of every file of an archive but its manifest, by name.
 
     Raises:
-        OSError: it cannot be read.
+        OSError: one cannot be read.
     """
-    return Entry(*hash_of(path))
-
-
-def entries_of(folder: Path) -> dict[str, Entry]:
-    """Return size and hash of every file of an archive but its manifest, by name."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / MANIFEST)
-    return {path.relative_to(folder).as_posix(): entry_of(path) for path in files}
+    return {path.relative_to(folder).as_posix(): Entry(*hash_of(path)) for path in files}

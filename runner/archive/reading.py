@@ -17,15 +17,15 @@ import pyarrow.parquet as pq
 
 from runner.archive import layout
 from runner.archive.columns import Shape
-from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, entry_of, is_inside, read_manifest
+from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, is_inside, read_manifest
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.description import RunDescription
-from runner.recording.extras import ExtraLayout, read_layouts
+from runner.recording.extras import read_layouts
 from runner.recording.metadata import check_run, json_object
 from runner.recording.records import MAX_UNPACKED_RATIO
 from runner.recording.schema import MAX_LAYOUTS, STEP_NANOSECONDS, Topic
-from runner.util.files import open_regular
+from runner.util.files import hash_of, open_regular
 from runner.util.stored import stored_as
 
 MAX_DESCRIPTION_BYTES: Final = 64 << 20
@@ -68,7 +68,7 @@ class Archive(RunDescription):
         for name, expected in self.manifest.files.items():
             path = self.folder / name
             try:
-                found = entry_of(path) if path.stat().st_size == expected.size else None
+                found = Entry(*hash_of(path)) if path.stat().st_size == expected.size else None
                 size = path.stat().st_size
             except OSError as error:
                 raise RecordingError(
@@ -121,18 +121,15 @@ class Archive(RunDescription):
     @cached_property
     def shape(self) -> Shape:
         """The shape of the run, which determines its tables."""
-        return Shape(self, self._extra_layouts())
-
-    def _extra_layouts(self) -> list[ExtraLayout]:
-        count = self.count(schema.EXTRA_COLUMNS_TOPIC)
-        if not count or (table := Shape(self).tables.get(layout.EXTRA_COLUMNS)) is None:
-            return []
+        shape, count = Shape(self), self.count(schema.EXTRA_COLUMNS_TOPIC)
+        if not count or (table := shape.tables.get(layout.EXTRA_COLUMNS)) is None:
+            return shape
         columns = [
             (row["position"] * STEP_NANOSECONDS, row)
             for batch in self.batches(table.name, table.columns, count, MAX_LAYOUTS)
             for row in batch.to_pylist()
         ]
-        return read_layouts(columns, str(self.folder / table.name))
+        return Shape(self, read_layouts(columns, str(self.folder / table.name)))
 
     def attachment(self, name: str) -> bytes:
         """Return the data of an attachment.
@@ -173,7 +170,8 @@ class Archive(RunDescription):
                 check_table(file, str(path), path.stat().st_size, columns, rows)
                 for batch in file.iter_batches(n):
                     for column, values in zip(batch.schema.names, batch.columns, strict=True):
-                        if values.null_count and not layout.may_be_null(column):
+                        is_nullable = column in layout.NULLABLE or column.startswith(layout.EXTRA_PREFIX)
+                        if values.null_count and not is_nullable:
                             raise RecordingError(
                                 f"{path}: found {values.null_count} rows without {column}, expected none."
                             )
@@ -197,5 +195,6 @@ def check_table(file: pq.ParquetFile, where: str, size: int, columns: pa.Schema,
     groups = [about.row_group(k) for k in range(about.num_row_groups)]
     if any(group.num_rows > MAX_ROWS_A_GROUP for group in groups):
         raise RecordingError(f"{where}: has a group of more than {MAX_ROWS_A_GROUP:,} rows.")
-    if rows * max(_ROW_BYTES, layout.row_bytes(columns)) > size * MAX_UNPACKED_RATIO + _UNPACKED_ANYWAY:
+    widths = [kind.byte_width if pa.types.is_fixed_size_binary(kind) else 8 for kind in columns.types]
+    if rows * max(_ROW_BYTES, sum(widths)) > size * MAX_UNPACKED_RATIO + _UNPACKED_ANYWAY:
         raise RecordingError(f"{where}: {size:,} bytes declare {rows:,} rows; made to exhaust the disk.")

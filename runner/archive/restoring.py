@@ -94,7 +94,13 @@ class _Restorer:
                 for name, media_type in self._archive.attachments:
                     self._file.add_attachment(name, media_type, self._archive.attachment(name))
             for table in self._shape.tables.values():
-                self._restore_table(table)
+                if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):
+                    continue
+                if table.gives_tables:
+                    self._restore_learning(table)
+                else:
+                    for topic, records in self._records(table):
+                        self._send(topic, records)
                 self._batches.flush()
         finally:
             self._pipeline.close()
@@ -104,15 +110,6 @@ class _Restorer:
             names = self._archive.metadata_names
             result = self._archive.metadata("result") if "result" in names else None
             self._file.finish("" if result is None else "result", result)
-
-    def _restore_table(self, table: Table) -> None:
-        if table.name in layout.LEFT_OUT_IF_EMPTY and not self._archive.count(*table.topics):
-            return
-        if table.gives_tables:
-            self._restore_learning(table)
-        else:
-            for topic, records in self._records(table):
-                self._send(topic, records)
 
     def _restore_learning(self, table: Table) -> None:
         """Restore the steps of a job, and the snapshots that they make."""

@@ -184,11 +184,3 @@ class MultiAgent:
         is_over = terminated.get("__all__") or truncated.get("__all__")
         self.agents = [] if is_over else list(observations)
         return result
-
-    def render(self) -> object:
-        """Return a picture of the game."""
-        return self.env.render()
-
-    def close(self) -> None:
-        """Close the game."""
-        self.env.close()

@@ -16,7 +16,7 @@ import importlib
 import json
 import traceback
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -93,10 +93,10 @@ def _read(env_id: str, kwargs: JsonView, env: Any, rewards: str) -> Mdp:
     limit = env.spec.max_episode_steps if env.spec is not None else None
     transitions = _transitions(env_id, base)
     joint = transitions["next_state"].shape[1]
-    described = grid_world(env_id, base, transitions)
-    source: Any = described or base
-    if described is not None:
-        transitions["events"] = described.events
+    source = base
+    if adapt := _ADAPTERS.get(f"{type(base).__module__}.{type(base).__qualname__}"):
+        source = adapt(env_id, base, transitions)
+        transitions["events"] = source.events
     if rewards == "team":
         transitions["rewards"] = transitions["rewards"].sum(axis=-1, keepdims=True)
     return Mdp(
@@ -169,6 +169,10 @@ def _raised(error: Exception) -> str:
     return f"{type(error).__name__}: {error}{at}"
 
 
+_OutcomesOfPairs = Mapping[int, Mapping[int, list[tuple[float, int, ArrayLike, bool]]]]
+"""Gymnasium's `P[state][action] = [(probability, next state, reward, terminated), ...]`."""
+
+
 def _transitions(env_id: str, base: object) -> Transitions:
     """Return the transition arrays, from the environment's own or from its `P`."""
     if hasattr(base, "transitions"):
@@ -185,13 +189,7 @@ def _transitions(env_id: str, base: object) -> Transitions:
             f"environment {env_id!r} offers no transition table (`P` and `initial_state_distrib`), which "
             "tabular learning here needs. DualTaxi-v1, Taxi-v4, FrozenLake-v1 and CliffWalking-v1 have one."
         )
-    return _transitions_from_p(base.P)
-
-
-def _transitions_from_p(
-    p: Mapping[int, Mapping[int, list[tuple[float, int, ArrayLike, bool]]]],
-) -> Transitions:
-    """Return arrays from Gymnasium's `P[state][action] = [(probability, next state, reward, terminated)]`."""
+    p: _OutcomesOfPairs = base.P
     states = len(p)
     actions = len(p[0])
     most = max(len(outcomes) for row in p.values() for outcomes in row.values())
@@ -217,9 +215,7 @@ def _transitions_from_p(
 
 # Okabe and Ito (2008): distinguishable with any common colour blindness.
 _VERMILLION, _GREEN, _YELLOW, _BLUE = "#D55E00", "#009E73", "#F0E442", "#0072B2"
-_GREY, _SKY_BLUE = "#777777", "#56B4E9"
-
-Events = Mapping[str, Flags]
+_GREY = "#777777"
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,11 +227,11 @@ class GridWorld:
     """[S, things]."""
     scene_carriers: NDArray[np.int8]
     """[S, things]."""
-    happens: Events
+    happens: Mapping[str, Flags]
     """Event to the outcomes [S, J, K] in which it happens."""
     success_events: tuple[str, ...]
-    penalty_below: float = -np.inf
-    agents: tuple[str, ...] = field(default=("agent",))
+    agents: tuple[str, ...]
+    penalty_below: float
 
     @property
     def event_names(self) -> tuple[str, ...]:
@@ -247,16 +243,6 @@ class GridWorld:
         """[S, J, K]: bit i is `event_names[i]`."""
         bits = (outcomes.astype(np.uint32) << bit for bit, outcomes in enumerate(self.happens.values()))
         return np.asarray(np.bitwise_or.reduce(list(bits)), np.uint32)
-
-
-def grid_world(env_id: str, base: object, arrays: Transitions) -> GridWorld | None:
-    """Return the additions to one of Gymnasium's grid worlds; None for any other environment.
-
-    Args:
-        arrays: its transition arrays, as `runner.environments.mdp` has them.
-    """
-    adapt = _ADAPTERS.get(f"{type(base).__module__}.{type(base).__qualname__}")
-    return None if adapt is None else adapt(env_id, base, arrays)
 
 
 def _taxi(env_id: str, base: Any, arrays: Transitions) -> GridWorld:
@@ -317,36 +303,16 @@ def _taxi(env_id: str, base: Any, arrays: Transitions) -> GridWorld:
 
 def _frozen_lake(_: str, base: Any, arrays: Transitions) -> GridWorld:
     tiles = base.desc.ravel()
-    return GridWorld(
-        scene=_scene(
-            base.desc.shape,
-            landmarks=_tiles(base.desc, _LAKE),
-            things=[_PLAYER],
-            actions=("left", "down", "right", "up"),
-        ),
-        **_one_player(len(tiles)),
-        happens={"goal": _arrives(arrays, tiles == b"G"), "hole": _arrives(arrays, tiles == b"H")},
-        success_events=("goal",),
-        agents=("player",),
-    )
+    happens = {"goal": _arrives(arrays, tiles == b"G"), "hole": _arrives(arrays, tiles == b"H")}
+    return _one_player(base.desc, _LAKE, ("left", "down", "right", "up"), happens)
 
 
 def _cliff(_: str, base: Any, arrays: Transitions) -> GridWorld:
     tiles = np.where(base._cliff, b"C", b"F")
     tiles.ravel()[base.start_state_index], tiles.ravel()[-1] = b"S", b"G"
-    return GridWorld(
-        scene=_scene(
-            base.shape,
-            landmarks=_tiles(tiles, _CLIFF),
-            things=[_PLAYER],
-            actions=("up", "right", "down", "left"),
-        ),
-        **_one_player(tiles.size),
-        happens={"goal": _arrives(arrays, tiles.ravel() == b"G"), "fall": arrays["rewards"][..., 0] <= _FALL},
-        success_events=("goal",),
-        penalty_below=-1.0,
-        agents=("player",),
-    )
+    falls = arrays["rewards"][..., 0] <= _FALL
+    happens = {"goal": _arrives(arrays, tiles.ravel() == b"G"), "fall": falls}
+    return _one_player(tiles, _CLIFF, ("up", "right", "down", "left"), happens, penalty_below=-1.0)
 
 
 _ADAPTERS: Final[Mapping[str, Callable[[str, object, Transitions], GridWorld]]] = {
@@ -360,7 +326,6 @@ _MOVES: Final = {
     "down": [1, 0], "up": [-1, 0], "right": [0, 1], "left": [0, -1],
 }  # fmt: skip
 _TAXI_COLOURS: Final = (_VERMILLION, _GREEN, _YELLOW, _BLUE)
-_PLAYER: Final = {"name": "player", "label": "player", "kind": "mover", "agent": "player"}
 _FALL: Final = -100.0
 _START: Final = {"name": "S", "label": "start", "kind": "start", "colour": _GREY}
 _GOAL: Final = {"name": "G", "label": "goal", "kind": "goal", "colour": _GREEN}
@@ -377,7 +342,7 @@ _CLIFF: Final = {
 
 
 def _scene(
-    shape: tuple[int, int],
+    shape: tuple[int, ...],
     things: list[dict[str, str]],
     actions: tuple[str, ...],
     landmarks: list[dict[str, object]],
@@ -394,21 +359,29 @@ def _scene(
     }
 
 
-def _tiles(tiles: NDArray[np.bytes_], kinds: Mapping[bytes, dict[str, str]]) -> list[dict[str, object]]:
-    """Return a landmark for each tile that has a meaning."""
-    return [
+def _one_player(
+    tiles: NDArray[np.bytes_],
+    kinds: Mapping[bytes, dict[str, str]],
+    actions: tuple[str, ...],
+    happens: Mapping[str, Flags],
+    penalty_below: float = -np.inf,
+) -> GridWorld:
+    """Return a world whose state is the player's cell, with a landmark for each tile of these kinds."""
+    landmarks: list[dict[str, object]] = [
         kinds[bytes(tile)] | {"cell": [int(row), int(column)]}
         for (row, column), tile in np.ndenumerate(tiles)
         if bytes(tile) in kinds
     ]
-
-
-def _one_player(cells: int) -> dict[str, Any]:
-    """Return the scene's arrays where the state is the player's cell."""
-    return {
-        "scene_cells": np.arange(cells, dtype=np.int16)[:, np.newaxis],
-        "scene_carriers": np.full((cells, 1), -1, np.int8),
-    }
+    player = {"name": "player", "label": "player", "kind": "mover", "agent": "player"}
+    return GridWorld(
+        scene=_scene(tiles.shape, [player], actions, landmarks),
+        scene_cells=np.arange(tiles.size, dtype=np.int16)[:, np.newaxis],
+        scene_carriers=np.full((tiles.size, 1), -1, np.int8),
+        happens=happens,
+        success_events=("goal",),
+        agents=("player",),
+        penalty_below=penalty_below,
+    )
 
 
 def _action(arrays: Transitions, action: int) -> Flags:

@@ -239,13 +239,11 @@ class Mdp:
         joint = np.arange(self.joint_actions)
         return np.stack(np.unravel_index(joint, self.action_counts), axis=1).astype(np.int64)
 
-    @cached_property
+    @property
     def carriers(self) -> NDArray[np.int8]:
-        """[S, things]: the thing that carries each thing of the scene, -1 for none."""
-        if self.scene_carriers is not None:
-            return self.scene_carriers
-        assert self.scene_cells is not None
-        return np.full(self.scene_cells.shape, -1, np.int8)
+        """The carriers of an environment that has a scene."""
+        assert self.scene_carriers is not None
+        return self.scene_carriers
 
     @property
     def success_mask(self) -> int:
@@ -337,27 +335,23 @@ def events_of(mdp: Mdp, steps: Records) -> NDArray[np.uint32]:
     one that ends as it did, and that pays what it did.
     """
     masks = np.zeros(len(steps), np.uint32)
-    if mdp.event_names:
-        batch = max(1, _BATCH_OUTCOMES // mdp.next_state.shape[2])
-        for start in range(0, len(steps), batch):
-            some = slice(start, start + batch)
-            masks[some] = _events(mdp, steps[some])
+    if not mdp.event_names:
+        return masks
+    learners = steps["rewards"].shape[1]
+    shared = learners if mdp.rewards.shape[-1] == 1 else 1  # every learner was paid the shared reward
+    batch = max(1, _BATCH_OUTCOMES // mdp.next_state.shape[2])
+    for start in range(0, len(steps), batch):
+        some = steps[start : start + batch]
+        at = some["state"].astype(np.int64), some["action"].astype(np.int64)
+        likely = mdp.outcomes_to(*at, some["next_state"])
+        outcome = np.zeros(len(some), np.int64)
+        if likely.shape[1] > 1:
+            ends = mdp.terminated[at] == some["terminated"][:, np.newaxis]
+            paid = some["rewards"].sum(axis=-1)[:, np.newaxis]
+            pays = np.isclose(mdp.rewards[at].sum(axis=-1) * shared, paid)
+            outcome = np.argmax(likely * 4 + (likely & ends) * 2 + (likely & pays), axis=1)
+        masks[start : start + batch] = np.where(likely.any(axis=1), mdp.events[*at, outcome], np.uint32(0))
     return masks
-
-
-def _events(mdp: Mdp, steps: Records) -> NDArray[np.uint32]:
-    state, action = steps["state"].astype(np.int64), steps["action"].astype(np.int64)
-    likely = mdp.outcomes_to(state, action, steps["next_state"])
-    outcome = np.zeros(len(steps), np.int64)
-    if likely.shape[1] > 1:
-        ends = mdp.terminated[state, action] == steps["terminated"][:, np.newaxis]
-        rewards = mdp.rewards[state, action].sum(axis=-1)
-        learners = steps["rewards"].shape[1]
-        if mdp.rewards.shape[-1] == 1 and learners > 1:  # every learner was paid the shared reward
-            rewards = rewards * learners
-        pays = np.isclose(rewards, steps["rewards"].sum(axis=-1)[:, np.newaxis])
-        outcome = np.argmax(likely * 4 + (likely & ends) * 2 + (likely & pays), axis=1)
-    return np.where(likely.any(axis=1), mdp.events[state, action, outcome], np.uint32(0))
 
 
 def from_parts(description: EnvironmentDescription, arrays: Mapping[str, NDArray[Any]]) -> Mdp:
@@ -436,7 +430,8 @@ def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     three = mdp.next_state.ndim == 3 and mdp.next_state.size > 0
     yield "next_state must have three axes", three, mdp.next_state
     states = f"next_state must name states, 0 to {shape[0] - 1}"
-    yield states, _within(mdp.next_state, 0, shape[0]), lambda: _range(mdp.next_state)
+    within = 0 <= int(mdp.next_state.min()) <= int(mdp.next_state.max()) < shape[0]
+    yield states, within, lambda: _range(mdp.next_state)
     others = {name: getattr(mdp, name).shape for name in ("probability", "terminated", "events")}
     alike = all(other == shape for other in others.values())
     yield f"shapes must agree with next_state's, {shape}", alike, others
@@ -456,10 +451,8 @@ def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     yield start, distribution, lambda: _sums(mdp.start) if mdp.start.shape == shape[:1] else mdp.start
     joint = math.prod(mdp.action_counts)
     yield f"the agents' actions must make the {shape[1]} joint actions", joint == shape[1], joint
-    rows = [_rows(mdp.scene_cells), _rows(mdp.scene_carriers)]
-    same = mdp.scene_cells is None or mdp.scene_carriers is None or rows[0] == shape[0]
-    fits = same and rows[0] == rows[1]
-    yield f"each of the scene's arrays must have a row for each of the {shape[0]} states", fits, rows
+    arrays = [name for name in mdp.arrays() if name.startswith("scene_")]
+    yield "a scene has cells and carriers, or neither", len(arrays) != 1, arrays
 
 
 def _in_words(found: object) -> str:
@@ -474,13 +467,11 @@ def _in_words(found: object) -> str:
 
 
 def _range(values: Array) -> str:
-    return f"{values.min()} to {values.max()}" if values.size else "none"
+    return f"{values.min()} to {values.max()}"
 
 
 def _sums(probability: Floats) -> str:
     """Return a text of the lowest value and the sums along the last axis."""
-    if not probability.size:
-        return "none"
     return f"values from {probability.min():g} on, sums {_range(probability.sum(axis=-1))}"
 
 
@@ -488,17 +479,7 @@ def _distinct(names: tuple[object, ...]) -> bool:
     return all(map(is_text, names)) and len(set(names)) == len(names)
 
 
-def _within(values: Array, low: int, high: int) -> bool:
-    return bool(values.size) and int(values.min()) >= low and int(values.max()) < high
-
-
-def _rows(array: Array | None) -> int | None:
-    return None if array is None or not array.ndim else len(array)
-
-
 def _sums_to_one(probability: Floats) -> bool:
     """Return whether the last axis adds up to 1, as well as decimal fractions can."""
-    if not probability.size or not (probability >= 0).all():
-        return False
     total = np.asarray(probability.sum(axis=-1))
-    return bool(total.min() >= 1 - 1e-5 and total.max() <= 1 + 1e-5)
+    return bool(probability.min() >= 0 and total.min() >= 1 - 1e-5 and total.max() <= 1 + 1e-5)

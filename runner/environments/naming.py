@@ -28,18 +28,18 @@ def states_in_words(mdp: Mdp) -> NDArray[np.object_]:
     """Return the name of every state, [S] of str: index it by a state, or by an array of states."""
     scene, cells = mdp.scene, mdp.scene_cells
     if scene is None or cells is None:
-        return _texts([f"state {state}" for state in range(mdp.states)])
+        return np.array([f"state {state}" for state in range(mdp.states)], object)
     placed = zip(scene["things"], cells.T, mdp.carriers.T, strict=True)
     things = [_thing_in_words(scene, thing, where, carriers) for thing, where, carriers in placed]
-    return _texts([", ".join(words) for words in zip(*things, strict=True)])
+    return np.array([", ".join(words) for words in zip(*things, strict=True)], object)
 
 
 def actions_in_words(mdp: Mdp) -> NDArray[np.object_]:
     """Return the name of every joint action, [J] of str: `south + pickup`."""
     named = action_names(mdp)
     if named is None:
-        return _texts([f"action {action}" for action in range(mdp.joint_actions)])
-    return _texts([" + ".join(words) for words in itertools.product(*named)])
+        return np.array([f"action {action}" for action in range(mdp.joint_actions)], object)
+    return np.array([" + ".join(words) for words in itertools.product(*named)], object)
 
 
 def action_names(mdp: Mdp) -> list[list[str]] | None:
@@ -53,7 +53,7 @@ def action_names(mdp: Mdp) -> list[list[str]] | None:
 
 def agent_actions_in_words(mdp: Mdp) -> list[str]:
     """Return every joint action as text, with its agents: `taxi 1 south, taxi 2 pickup`."""
-    words = [str(word) for word in actions_in_words(mdp)]
+    words: list[str] = actions_in_words(mdp).tolist()
     if len(mdp.agents) < 2 or action_names(mdp) is None:
         return words
     names = [spoken(agent) for agent in mdp.agents]
@@ -84,7 +84,7 @@ def agent_of(mdp: Mdp, name: str) -> int:
 
 def state_of(mdp: Mdp, text: str) -> int:
     """Return a state from its name, such as `taxi 1 (0,0), passenger at B`, or its number."""
-    return numbered(text, [str(name) for name in states_in_words(mdp)], "a state", 1)
+    return numbered(text, states_in_words(mdp).tolist(), "a state", 1)
 
 
 def own_action(mdp: Mdp, agent: int, text: str) -> int:
@@ -95,7 +95,7 @@ def own_action(mdp: Mdp, agent: int, text: str) -> int:
 
 def joint_action(mdp: Mdp, text: str) -> int:
     """Return a joint action from its name, such as `pickup + east`, or its number."""
-    return numbered(text, [str(name) for name in actions_in_words(mdp)], "a joint action")
+    return numbered(text, actions_in_words(mdp).tolist(), "a joint action")
 
 
 def numbered(text: str, names: list[str], what: str, listed: int = MAX_LISTED) -> int:
@@ -169,9 +169,3 @@ def _thing_in_words(
     where: Sequence[int] = (np.where(carriers >= 0, carriers + len(places), cells)).tolist()
     words = places + carried
     return [words[index] for index in where]
-
-
-def _texts(words: list[str]) -> NDArray[np.object_]:
-    array = np.empty(len(words), dtype=object)
-    array[:] = words
-    return array

@@ -9,7 +9,7 @@ import pytest
 
 from runner.archive import layout
 from runner.archive.batches import Batches
-from runner.archive.layout import entry_of, read_manifest
+from runner.archive.layout import entries_of, read_manifest
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -24,7 +24,7 @@ def test_the_manifest_states_the_runs_digest_and_each_files_hash(run, archive):
     assert manifest.run_id == run.run_id
     found = {path.relative_to(archive).as_posix() for path in archive.rglob("*") if path.is_file()}
     assert found == {*manifest.files, layout.MANIFEST}
-    assert {name: entry_of(archive / name) for name in manifest.files} == dict(manifest.files)
+    assert entries_of(archive) == dict(manifest.files)
 
 
 def test_the_steps_are_there_in_the_order_taken_under_the_names_of_the_recording(run, archive):
