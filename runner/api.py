@@ -153,7 +153,7 @@ def jobs_in(config: ExperimentConfig, recordings: Path) -> Iterator[Job]:
         RunnerError: the run with the initial table does not exist.
     """
     if isinstance(config.initial_q, RunTable):
-        from runner.execution.initial_tables import resolve_initial_q
+        from runner.execution.session import resolve_initial_q
 
         try:
             config = resolve_initial_q(config, recordings)

@@ -29,7 +29,7 @@ from runner.debugging.first_step import first_step
 from runner.debugging.game import Game, SamplingPlan, interactions_of, mixture_bounds, settings_of
 from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures, Readings, measure
 from runner.errors import RunnerError, RunNotFound, nearest
-from runner.execution.initial_tables import resolve_initial_q
+from runner.execution.session import resolve_initial_q
 from runner.replay.trust import require_may_train
 from runner.runs.locking import acquired
 from runner.runs.resolve import find_run

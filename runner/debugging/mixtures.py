@@ -26,8 +26,7 @@ from runner.debugging.factors import Mixing
 from runner.environments.loading import load_once
 from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
-from runner.execution.initial_tables import configured_tables
-from runner.execution.session import evaluation_metrics
+from runner.execution.session import configured_tables, evaluation_metrics
 from runner.learning.learner import Learner
 from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema

@@ -23,8 +23,7 @@ from runner.config.sections import BranchSection, ChangesSection
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions, agent_of, joint_action, numbered_actions, own_action
 from runner.errors import ConfigError, RunnerError
-from runner.execution.initial_tables import recorded_tables
-from runner.execution.session import Report, run_job
+from runner.execution.session import Report, recorded_tables, run_job
 from runner.recording.reader import Recording, open_recording
 from runner.recording.reference import PackedChunks
 from runner.runs.branches import TrainingOrigin, origin_in

@@ -17,8 +17,7 @@ from runner.config.job import Job
 from runner.config.loading import recorded_packing
 from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, Diverged, RunnerError
-from runner.execution.initial_tables import address, recorded_tables
-from runner.execution.session import Report, Session, recorder_for, run_job
+from runner.execution.session import Report, Session, address, recorded_tables, recorder_for, run_job
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.description import recorded_facts
@@ -145,17 +144,6 @@ def evaluate(
         CannotRedo: the environment may not be made.
         RunnerError: there is no such table, or the new run cannot be recorded.
     """
-    config = evaluation_of(run, recordings, step, trials, start, seed)
-    require_may_train(run.recording, config.to_mapping(), trust)
-    fresh = runs.create_run(recordings, config, seed, parent=run)
-    with unless_empty(fresh):
-        return run_job(Job(config, seed), fresh, report, stop)
-
-
-def evaluation_of(
-    run: Run, recordings: Path, step: int | None, trials: int | None, start: Start, seed: int
-) -> ExperimentConfig:
-    """Return the experiment that evaluates a run's table; arguments and errors as for `evaluate`."""
     with open_recording(run.recording) as recording:
         chosen = last_step(recording) if step is None else step
         tables_at(recording, chosen)  # raises here, before there is a new run
@@ -164,7 +152,7 @@ def evaluation_of(
             raise RunnerError(f"start: found state {start}, expected one of 0 to {states - 1}.")
         starts = int(np.count_nonzero(recording.mdp.start))
         original = from_mapping(recording.config)
-    return _with(
+    config = _with(
         original,
         name=f"{run.name[:90]}.evaluated",
         seeds=[seed],
@@ -179,6 +167,10 @@ def evaluation_of(
         branches=[],
         recording=original.to_mapping()["recording"] | {"steps": "all"},
     )
+    require_may_train(run.recording, config.to_mapping(), trust)
+    fresh = runs.create_run(recordings, config, seed, parent=run)
+    with unless_empty(fresh):
+        return run_job(Job(config, seed), fresh, report, stop)
 
 
 def _with(config: ExperimentConfig, **changes: object) -> ExperimentConfig:
@@ -197,12 +189,8 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop, trust: bool
 
     def retrain(file: RecordingFile) -> None:
         recorder = recorder_for(job, learner, file, beat=run.beat, clock=False)
-        try:
-            done, digests = Session(job, learner, recorder, report, stop).run(), recorder.drain()
-        except BaseException:
-            recorder.abandon()
-            raise
-        if not done:
+        is_done, digests = Session(job, learner, recorder, report, stop).finish()
+        if not is_done:
             raise KeyboardInterrupt(f"the recording of run {run.run_id} is as it was")
         if (digest := combined_digest(digests)) != expected:
             raise Diverged("the recording", "content digest", digest, expected)

@@ -23,8 +23,17 @@ from runner.config.sections import RunTable
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import ConfigError, Diverged, RecordingError, RunnerError, truncated_message
-from runner.execution.initial_tables import configured_tables, recorded_tables, resolve_job
-from runner.execution.session import Report, Session, describe, evaluation_brief, execute, recorder_for
+from runner.execution.session import (
+    Report,
+    Session,
+    configured_tables,
+    describe,
+    evaluation_brief,
+    execute,
+    recorded_tables,
+    recorder_for,
+    resolve_job,
+)
 from runner.execution.verify import differing_environment
 from runner.learning.learner import Learner, NamedTables
 from runner.recording import schema
@@ -98,22 +107,17 @@ def resume(
         )
     with locked(run) as current:
         if is_finished(current):
-            return _with_finished_status(current)
+            if current.status == "finished":
+                return current
+            with open_recording(current.recording) as recording:  # its process was killed before it said so
+                summary = recorded_facts(recording)["summary"] | {"bytes": recording.file.size}
+            return current.update(status="finished", summary=summary)
         return _resume(current, accept_changes, report, stop, trust)
 
 
 def require_same_makers(run: Run) -> None:
     """Refuse to resume a run with other code or libraries than it was started with."""
     _refuse_changes(run, _changes(run))
-
-
-def _with_finished_status(run: Run) -> Run:
-    """Return a run with a finished recording, also marked so if its process was killed before that."""
-    if run.status == "finished":
-        return run
-    with open_recording(run.recording) as recording:
-        facts = recorded_facts(recording)
-        return run.update(status="finished", summary=facts["summary"] | {"bytes": recording.file.size})
 
 
 def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop, trust: bool) -> Run:

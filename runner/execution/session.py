@@ -1,4 +1,9 @@
-"""Run a job: the only place where learning meets recording."""
+"""Run a job: the only place where learning meets recording.
+
+A job may begin with the Q-tables of another run. A name may stand for another run tomorrow, and an
+interrupted run may be resumed. So `initial_q` is resolved when the job is created: from then on the
+configuration has the run's id and the step.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +13,18 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from runner.archive.places import opened
+from runner.config import ExperimentConfig, from_mapping
 from runner.config.job import Job
+from runner.config.sections import RunTable
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, truncated_message
-from runner.execution.initial_tables import configured_tables, resolve_job
 from runner.learning.learner import Learner, NamedTables
 from runner.planning.optimality import ExactEvaluator
 from runner.recording import schema
@@ -31,13 +39,17 @@ from runner.recording.metadata import (
 )
 from runner.recording.metrics import METRICS, defined_metrics
 from runner.recording.observer import Observer
+from runner.recording.reader import Recording
 from runner.recording.recorder import Recorder
 from runner.recording.reference import PackedChunks, Reference
 from runner.recording.writer import RecordingFile, create_recording
+from runner.replay.steps import last_step
+from runner.replay.tables import named_tables_at, tables_before_training
 from runner.runs import run as runs
 from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
+from runner.runs.resolve import find_run
 from runner.runs.run import Run
 from runner.util.arrays import Records
 from runner.util.processes import Stop
@@ -105,12 +117,12 @@ def run_job(
 def execute(session: Session, file: RecordingFile, run: Run, started: float, code: CodeCollector) -> Run:
     """Run a session to its end, close its recording and return the run."""
     try:
-        status = "finished" if session.run() else "interrupted"
-        summary = session.summary(session.recorder.drain())
+        is_done, digests = session.finish()
+        status = "finished" if is_done else "interrupted"
+        summary = session.summary(digests)
         code.write(file, wait=True)
         write_result(file, status, summary)
     except BaseException as error:
-        session.recorder.abandon()
         status = "interrupted" if isinstance(error, KeyboardInterrupt | Diverged) else "failed"
         with contextlib.suppress(StorageError):  # a full disk may still have space for the index
             code.write(file, wait=True)
@@ -161,10 +173,17 @@ class Session:
         self._evaluated = 0
         self._last_report = 0.0
 
-    @property
-    def learners(self) -> tuple[str, ...]:
-        """The names of the learners: the agents, or `agency` for one joint table."""
-        return self._learner.agents
+    def finish(self) -> tuple[bool, dict[str, str]]:
+        """Run the whole job and end its recording, also after an error.
+
+        Returns:
+            Whether it was not stopped before its end, and the digest of each topic.
+        """
+        try:
+            return self.run(), self.recorder.drain()
+        except BaseException:
+            self.recorder.abandon()
+            raise
 
     def run(self) -> bool:
         """Run the whole job; return False if it was stopped before the end."""
@@ -372,3 +391,71 @@ def describe(
 @lru_cache(maxsize=4)
 def _environment(mdp: Mdp) -> Attachments:
     return environment_attachments(mdp.description(), mdp.arrays())
+
+
+def resolve_initial_q(config: ExperimentConfig, recordings: Path, exclude: str = "") -> ExperimentConfig:
+    """Return a configuration whose `initial_q`, if it is a run's table, has the run's id and the step.
+
+    Args:
+        exclude: the id of the run that begins with the table, which is never meant.
+    """
+    start = config.initial_q
+    if not isinstance(start, RunTable):
+        return config
+    source = find_run(start.run, recordings, exclude)
+    step = start.step
+    if step is None:
+        with opened(source) as recording:
+            step = last_step(recording)
+    return from_mapping(
+        config.to_mapping() | {"initial_q": {"run": address(source, recordings), "step": step}}
+    )
+
+
+def resolve_job(job: Job, run: Run) -> tuple[Job, Run]:
+    """Return a job and its run with `initial_q` resolved, also in `run.json`."""
+    config = resolve_initial_q(job.config, run.folder.parent, exclude=run.run_id)
+    if config == job.config:
+        return job, run
+    return Job(config, job.seed), run.update(config=config.to_mapping())
+
+
+def address(run: Run, recordings: Path) -> str:
+    """Return how to find a run from a recordings folder: by its id, or by its path if it is elsewhere."""
+    inside = run.folder.parent.resolve() == recordings.resolve()
+    return run.run_id if inside and not run.stands_alone else str(run.recording.resolve())
+
+
+def configured_tables(
+    config: ExperimentConfig, mdp: Mdp, recordings: Path, exclude: str = ""
+) -> list[NamedTables] | None:
+    """Return what the learners of the run in `initial_q` have; None if the configuration has none.
+
+    Args:
+        exclude: the id of a run that is never meant.
+
+    Raises:
+        RunnerError: there is no such run or step, or its tables have another shape.
+    """
+    start = config.initial_q
+    if not isinstance(start, RunTable):
+        return None
+    source = find_run(start.run, recordings, exclude=exclude)
+    with opened(source) as recording:
+        tables = named_tables_at(recording, last_step(recording) if start.step is None else start.step)
+    joint = config.tables == "joint"
+    shapes = [(mdp.states, n) for n in ([mdp.joint_actions] if joint else mdp.action_counts)]
+    found = [table["q"].shape for table in tables]
+    if found != shapes:
+        raise RunnerError(f"initial_q: run {source.run_id} has tables of shape {found}, expected {shapes}.")
+    return tables
+
+
+def recorded_tables(recording: Recording) -> list[NamedTables] | None:
+    """Return the tables that a run took from another run, from its own first snapshots.
+
+    None if it took none, or was interrupted before them: then its configuration has their origin.
+    """
+    if not isinstance(from_mapping(recording.config).initial_q, RunTable):
+        return None
+    return tables_before_training(recording)

@@ -284,8 +284,11 @@ def _check_content(recording: Recording, installed: bool, report: Report, trust:
 
 
 def _retrain(recording: Recording, job: Job, installed: bool, report: Report, trust: bool) -> Verification:
-    from runner.execution.initial_tables import recorded_tables  # they load Numba
-    from runner.execution.session import Session, recorder_for
+    from runner.execution.session import (
+        Session,
+        recorded_tables,  # they load Numba
+        recorder_for,
+    )
     from runner.learning.learner import Learner
 
     env = job.config.env
@@ -324,8 +327,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
     else:
         verification = replace(verification, not_compared=_NAMES_NOT_COMPARED)
     try:
-        ended = session.run()
-        topics = recorder.drain()
+        ended, digests = session.finish()
         if complete or ended:
             reference.check_exhausted()
         if installed:
@@ -334,8 +336,6 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
                 _compare_values(key, recording.environment.get(key), description[key])
     except Diverged as error:
         return _with_difference(verification, error, "differs")
-    finally:
-        recorder.abandon()
     result = recording.result
     # an interrupted run that stated its result is compared with it if all steps of the result are recorded
     whole = complete or bool(result.content_digest and result.steps_recorded)
@@ -349,7 +349,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         steps=steps["train"] + steps["eval"],
         episodes=recording.train.episodes.count(),
     )
-    return _compare_result(verification, recording, session.summary(topics)) if whole else verification
+    return _compare_result(verification, recording, session.summary(digests)) if whole else verification
 
 
 def differing_environment(recording: Recording, mdp: Mdp) -> Differences:
@@ -402,11 +402,12 @@ def _check_loop(recording: Recording) -> Verification:
             taken = last // schema.STEP_NANOSECONDS
             raise Inconsistent(f"found {steps:,} steps, expected {taken:,} by the time of the last")
     except Inconsistent as error:
-        finding = f"{recording.path}: {error}"
-        return replace(verification, verdict="damaged", notes=tuple(notes), finding=finding)
+        verification = replace(verification, verdict="damaged", finding=f"{recording.path}: {error}")
     except Diverged as error:
-        return _with_difference(replace(verification, notes=tuple(notes)), error)
+        verification = _with_difference(verification, error)
     verification = replace(verification, notes=tuple(notes))
+    if not verification.sound:
+        return verification
     off_table = sum(findings.rewards_off_table for findings in phases.values())
     found = _compare_totals(recording, verification, off_table, finished)
     if found.sound and (unlikely := _unlikely(recording, phases)):

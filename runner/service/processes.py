@@ -45,7 +45,7 @@ PRELOADED: Final = (
     "runner.debugging.why",
     "runner.environments.loading",
     "runner.execution.estimate",
-    "runner.execution.initial_tables",
+    "runner.execution.session",
     "runner.query.find",
     "runner.replay.environment",
     "runner.runs.importing",

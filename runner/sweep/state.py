@@ -17,8 +17,8 @@ from runner.config.document import read_yaml
 from runner.config.job import identity_of
 from runner.config.loading import read_text
 from runner.errors import ConfigError, RunnerError, nearest
-from runner.execution.initial_tables import resolve_initial_q
 from runner.execution.resume import require_same_makers
+from runner.execution.session import resolve_initial_q
 from runner.runs.listing import list_runs
 from runner.runs.locking import acquired
 from runner.runs.run import Run

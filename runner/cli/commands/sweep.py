@@ -93,7 +93,7 @@ def run(
       dualtaxi sweep run hyperparameters --resume
     """
     from runner.api import interruptible
-    from runner.execution.initial_tables import resolve_initial_q
+    from runner.execution.session import resolve_initial_q
     from runner.sweep.loading import load_sweep
     from runner.sweep.plan import plan_of
     from runner.sweep.search import require_optuna

@@ -30,7 +30,7 @@ from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.execution.branching import OF_THE_WHOLE, branch_job, branch_name
 from runner.execution.estimate import estimate, step_limit
-from runner.execution.initial_tables import resolve_initial_q
+from runner.execution.session import resolve_initial_q
 from runner.export.values import acted, actions_at
 from runner.loops.actions import parsed_action
 from runner.recording.gym_spaces import restore_space
