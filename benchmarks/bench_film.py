@@ -11,8 +11,7 @@ import gymnasium
 
 import runner
 from benchmarks.figures import Figure, figure, seconds
-from runner.export.encoder import FORMATS
-from runner.export.film import Shot, captioned, write_film
+from runner.export.film import FORMATS, Shot, captioned, write_film
 from runner.export.pictures import Pictures
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run

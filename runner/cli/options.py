@@ -34,7 +34,7 @@ from runner.util.values import Ranges
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
     from runner.environments.mdp import Mdp
-    from runner.export.plots.style import CurveStyle
+    from runner.export.plots.curves import CurveStyle
     from runner.export.rerun.selection import Request
 
 # --- arguments --------------------------------------------------------------------------------------------
@@ -142,7 +142,7 @@ def curve_options(
     log_y: bool = option("--log-y", is_flag=True, help="Logarithmic vertical axes."),
 ) -> CurveStyle:
     """Return how curves are drawn."""
-    from runner.export.plots.style import CurveStyle
+    from runner.export.plots.curves import CurveStyle
 
     return CurveStyle(lines, smooth, log_x, log_y)
 

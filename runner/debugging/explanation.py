@@ -10,7 +10,7 @@ import numpy as np
 
 from runner.analysis.sections import Figure, Grid, Section, html
 from runner.analysis.statistics import Estimate, bootstrap_ratio
-from runner.export.plots.mixtures import BarColumn, bars_chart, mixtures_chart
+from runner.export.plots.comparisons import BarColumn, bars_chart, mixtures_chart
 from runner.util.humanize import counted, duration
 from runner.util.values import Json
 

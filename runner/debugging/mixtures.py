@@ -28,7 +28,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import RunnerError
 from runner.execution.session import configured_tables, evaluation_metrics
 from runner.learning.learner import Learner
-from runner.planning.optimality import ExactEvaluator
+from runner.planning.evaluation import ExactEvaluator
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
 from runner.sweep.local import Workers

@@ -8,7 +8,7 @@ from typing import Final
 
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Answer, Figure, Grid, Section
-from runner.drawing.svg_moves import Move
+from runner.drawing.svg_maps import Move
 from runner.environments.naming import spoken
 from runner.errors import MissingExtra
 from runner.export.reports.rendering import framed, page_style, partials

@@ -20,7 +20,7 @@ from runner.archive.places import opened
 from runner.debugging.q_value import EpisodesPart, RewardPart, StepPart, ValuePart, Why
 from runner.debugging.weights import Cell, weights_of
 from runner.drawing import svg
-from runner.drawing.svg_moves import Move, moves_map
+from runner.drawing.svg_maps import Move, moves_map
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import (
     actions_in_words,

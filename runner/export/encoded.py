@@ -6,13 +6,14 @@
 
 Where the environment must be made again, that is done in a child process, which ends with the iterator.
 Reports contain some of them, made small.
+Without making an environment, an episode is a small drawing: the way through its scene, or its return.
 """
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,10 +22,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from runner.drawing import palette, svg
 from runner.drawing.raster import image_bytes
 from runner.errors import CannotRedo, RunnerError
-from runner.export.painting import decoded
-from runner.export.pictures import PictureSource, paint, source_of
+from runner.export.pictures import PictureSource, decoded, paint, source_of
+from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.replay.steps import recorded_frames
 from runner.util.extras import require
@@ -37,6 +39,11 @@ MAX_PICTURES: Final = 300
 _MAX_SIDE: Final = 320
 """Pixels of the longer side of a picture."""
 _WEBP_QUALITY: Final = 75
+
+DRAWING_WIDTH, DRAWING_HEIGHT = 160, 120
+MAX_DRAWN_STEPS: Final = 100_000
+"""Steps after which a picture says no more."""
+_POINTS: Final = 200
 
 
 def picture_note(recording: Recording, phase: str) -> tuple[bool, str]:
@@ -138,3 +145,55 @@ def _small(data: bytes) -> str:
     options: dict[str, object] = {"quality": _WEBP_QUALITY, "method": 2}
     image.save(buffer, "WEBP", **options)
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def thumbnail(recording: Recording, phase: str, episode: int, title: str) -> str:
+    """Return an episode as SVG: its last state with the ways of the movers, or its return over its steps.
+
+    No environment is made: without recorded steps the picture says so.
+
+    Raises:
+        RecordingError: there is no such episode, or the recording is damaged.
+    """
+    tables = recording.phase(phase)
+    is_empty = recording.leaves_out_steps or tables.steps.are_actions
+    if is_empty:
+        where = f'x="{DRAWING_WIDTH / 2}" y="{DRAWING_HEIGHT / 2}" text-anchor="middle"'
+        return svg.picture(
+            DRAWING_WIDTH,
+            DRAWING_HEIGHT,
+            title,
+            f'<text {where} font-size="13" fill="#808080">no steps</text>',
+        )
+    drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
+    states = []
+    rewards = [np.zeros(1)]
+    count = 0
+    for rows in tables.episode(episode).rows(0):
+        rewards.append(rows["rewards"].sum(axis=1))
+        if drawing is not None:
+            recording.mdp.check_steps(rows, str(recording.path), schema.PHASE_NAMES[phase])
+            states += [rows["state"], rows["next_state"][-1:]]
+        count += len(rows)
+        if count >= MAX_DRAWN_STEPS:
+            break
+    if drawing is not None and states:
+        places = drawing.places(recording.mdp, np.concatenate(states).astype(np.int64))
+        return drawing.frame(places[-1], title, places)
+    returns = np.concatenate(rewards).cumsum()
+    return _curve(returns[:: -(-len(returns) // _POINTS)].tolist(), title)
+
+
+def _curve(values: Sequence[float], title: str) -> str:
+    """Return a curve without axes."""
+    finite = [value for value in values if np.isfinite(value)]
+    low, high = min(finite, default=0.0), max(finite, default=0.0)
+    across = DRAWING_WIDTH / max(1, len(values) - 1)
+    up = (DRAWING_HEIGHT - 20) / ((high - low) or 1.0)
+    points = " ".join(
+        f"{k * across:.1f},{DRAWING_HEIGHT - 10 - (value - low) * up:.1f}"
+        for k, value in enumerate(values)
+        if np.isfinite(value)
+    )
+    line = f'<polyline fill="none" stroke="{palette.agent(0)}" stroke-width="2" points="{points}"/>'
+    return svg.picture(DRAWING_WIDTH, DRAWING_HEIGHT, title, line)

@@ -101,7 +101,7 @@ def report(
     """
     from runner.analysis.axes import axis_of
     from runner.archive.places import at_hand
-    from runner.export.plots.style import CurveStyle
+    from runner.export.plots.curves import CurveStyle
     from runner.export.reports.rendering import framed
     from runner.export.reports.report import render_report
 
@@ -140,9 +140,8 @@ def plot(
     from runner.analysis.groups import groups_of, panels_of
     from runner.analysis.series import series_of
     from runner.archive.places import at_hand
-    from runner.export.plots.curves import curves_sheet
-    from runner.export.plots.image import write_image
-    from runner.export.plots.style import CurveStyle
+    from runner.export.plots.chart import write_image
+    from runner.export.plots.curves import CurveStyle, curves_sheet
 
     style = CurveStyle(lines, smooth, log_x, log_y)
     over = axis_of(axis)
@@ -174,8 +173,8 @@ def rerun_view(
         RecordingError: a recording cannot be read, or does not have these episodes.
     """
     notebook = require("rerun_notebook", extra="notebook", purpose="the Rerun viewer in a notebook")
-    from runner.export.rerun.cache import cached_export
     from runner.export.rerun.selection import Request
+    from runner.export.rerun.viewer import cached_export
 
     path, _ = cached_export(runs, Request(episodes=tuple(episodes), evaluations=tuple(evaluations)))
     viewer = notebook.Viewer(width=width, height=height)

@@ -8,6 +8,9 @@
 
 Unknown values (a mean over no episode, success where the environment does not define it) are left out, so
 every number is one that was recorded, unchanged.
+
+TensorBoard's event file has the same numbers, and is the same whenever it is written: an event's wall time is
+that of the recorded clock; without one, when the run began, plus logical time.
 """
 
 from __future__ import annotations
@@ -15,6 +18,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -26,6 +31,7 @@ from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 from runner.recording.schema import PHASES, SCALAR_TOPIC, STEP_NANOSECONDS
+from runner.util.extras import require
 
 _TRAINING: Final = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
 _EVALUATION: Final = {
@@ -38,6 +44,8 @@ _EXACT: Final = {
     **{f"optimal_{name}": f"optimal_{name}" for name in ("value", "success_percent", "mean_length")},
 }
 """Name to field of a message, for each kind of metrics."""
+
+EVENT_FILES: Final = ("events.out.tfevents.*",)
 
 
 @dataclass(frozen=True)
@@ -141,3 +149,34 @@ def _named(row: Message, fields: Mapping[str, str], owners: Sequence[str]) -> di
 
 def _finite(values: Iterable[tuple[str, float]]) -> dict[str, float]:
     return {name: value for name, value in values if math.isfinite(value)}
+
+
+def require_tensorboard() -> None:
+    """Check that the writer is installed."""
+    require("tensorboardX", extra="tensorboard", purpose="export tensorboard")
+
+
+def write_events(recording: Recording, folder: Path) -> int:
+    """Write the event file of a run into a folder; return how many numbers it has.
+
+    Each number is at its training step, under its name of `runner.export.scalars`; length and return of an
+    episode are at its last step.
+    """
+    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.proto.summary_pb2 import Summary
+    from tensorboardX.record_writer import RecordWriter
+
+    began = recording.created.timestamp()
+    at = times(recording)
+    count = 0
+    writer = RecordWriter(str(folder / f"events.out.tfevents.{int(began)}.{recording.run_id}"))
+    try:
+        writer.write(Event(wall_time=began, file_version="brain.Event:2").SerializeToString())
+        for moment in chain(measures(recording), episodes(recording, "train")):
+            numbers = [Summary.Value(tag=name, simple_value=x) for name, x in moment.by_phase.items()]
+            event = Event(wall_time=at(moment.position), step=moment.step, summary=Summary(value=numbers))
+            writer.write(event.SerializeToString())
+            count += len(numbers)
+    finally:
+        writer.close()
+    return count

@@ -40,11 +40,10 @@ from runner.debugging.what_if import branch_playback, what_if
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
 from runner.errors import ConfigError, RunnerError, shortened
-from runner.export.encoded import picture_note
-from runner.export.encoder import FORMATS
-from runner.export.film import Shot, usual_speed, write_film
+from runner.export.encoded import picture_note, thumbnail
+from runner.export.film import FORMATS, Shot, usual_speed, write_film
 from runner.export.pictures import Pictures
-from runner.export.plots.heatmaps import EXPLANATION, constants_in, heatmap_plots
+from runner.export.plots.training import EXPLANATION, constants_in, heatmap_plots
 from runner.export.plugin import installed_export
 from runner.export.reports.compare import drawn_task_sections
 from runner.export.reports.diff import difference_sections
@@ -53,11 +52,8 @@ from runner.export.reports.playback import playback_of
 from runner.export.reports.player_data import Playback
 from runner.export.reports.rendering import partials
 from runner.export.reports.report import render_report
-from runner.export.rerun.cache import cached_export
-from runner.export.rerun.location import locate
-from runner.export.rerun.selection import Request
-from runner.export.rerun.viewer import require_rerun
-from runner.export.thumbnail import thumbnail
+from runner.export.rerun.selection import Request, locate
+from runner.export.rerun.viewer import cached_export, require_rerun
 from runner.recording import schema
 from runner.recording.messages import media_type
 from runner.recording.reader import Recording, open_recording

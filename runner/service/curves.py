@@ -18,10 +18,9 @@ from runner.analysis.groups import Curve, Group, NoMetrics, Panel, duplicates, g
 from runner.analysis.series import RunSeries, read_series, series_of, values_left_out
 from runner.environments.naming import spoken
 from runner.errors import RunnerError
+from runner.export.plots.chart import svg_file
 from runner.export.plots.comparisons import letter
-from runner.export.plots.curves import curves_sheet, footnote
-from runner.export.plots.image import svg_file
-from runner.export.plots.style import CurveStyle, not_drawn, style_of, visible
+from runner.export.plots.curves import CurveStyle, curves_sheet, footnote, not_drawn, style_of, visible
 from runner.recording.reader import open_recording
 from runner.service.computed import as_json
 from runner.util import humanize

@@ -37,7 +37,7 @@ def system(recording: Recording) -> ReadyAnswer:
 
 def _text(clock: Clock | None, host: HostMetrics | None) -> Iterator[Section]:
     """Yield facts, and charts over time."""
-    from runner.export.plots.machine import machine_facts, machine_plots
+    from runner.export.plots.training import machine_facts, machine_plots
 
     if clock is None:
         yield Section("Time and machine", ["Its recording has no clock."])

@@ -90,7 +90,7 @@ def command(
     if whole and not grid:
         raise click.UsageError("--whole is for a grid: the film of one episode is always whole.")
     from runner.export import film
-    from runner.export.encoder import format_of
+    from runner.export.film import format_of
     from runner.export.pictures import Pictures, source_of
 
     with open_for_export(run) as recording:

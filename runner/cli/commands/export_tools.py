@@ -72,12 +72,12 @@ def tensorboard(
       dualtaxi export tensorboard @latest
       dualtaxi export tensorboard k3v9m2xq -o logs/patient --force
     """
-    from runner.export.tensorboard import PATTERNS, require_packages, write_events
+    from runner.export.scalars import EVENT_FILES, require_tensorboard, write_events
 
-    require_packages()
+    require_tensorboard()
     with open_for_export(run) as recording:
         path = to.path(run)
-        with new_folder(path, to.force, PATTERNS) as folder, stage_line("writing events"):
+        with new_folder(path, to.force, EVENT_FILES) as folder, stage_line("writing events"):
             count = write_events(recording, folder)
     text = (
         f"{path}  {count:,} numbers; view them by: "

@@ -30,7 +30,7 @@ from runner.views.compare import AXIS, NORMALISE
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
     from runner.analysis.series import RunSeries
-    from runner.export.plots.style import CurveStyle
+    from runner.export.plots.curves import CurveStyle
 
 
 @click.command("plot", cls=Command)
@@ -66,9 +66,8 @@ def plot_command(
     from runner.analysis.contents import shortcomings
     from runner.analysis.groups import duplicates, groups_of, panels_of
     from runner.analysis.series import read_series, values_left_out
-    from runner.export.plots.curves import curves_sheet
-    from runner.export.plots.image import check_suffix, save
-    from runner.export.plots.style import CurveStyle
+    from runner.export.plots.chart import check_suffix, save
+    from runner.export.plots.curves import CurveStyle, curves_sheet
     from runner.recording.reader import open_recording
 
     output, folder = to.path(), recordings_folder(recordings)
@@ -108,8 +107,8 @@ def plot_command(
 
 def _plot_tasks(series: list[RunSeries], normalise: Path, to: Writing) -> Reply:
     from runner.analysis.compare.tasks import compare_algorithms, scores_of
-    from runner.export.plots.image import save
-    from runner.export.plots.tasks import tasks_sheet
+    from runner.export.plots.chart import save
+    from runner.export.plots.comparisons import tasks_sheet
 
     output, table = to.path(), scores_of(normalise)
     with stage_line("computing intervals") as stage:
@@ -132,7 +131,7 @@ def _refuse_style(axis: str, style: CurveStyle) -> None:
 
 def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
     from runner.analysis.groups import panels_of
-    from runner.export.plots.image import save
+    from runner.export.plots.chart import save
     from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
     from runner.sweep.results import results_of
 

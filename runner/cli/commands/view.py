@@ -20,8 +20,7 @@ from runner.export.places import require_new
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
-    from runner.export.rerun.location import Location
-    from runner.export.rerun.selection import Request
+    from runner.export.rerun.selection import Location, Request
 
 
 @click.command("view", cls=Command, forms=())
@@ -84,8 +83,8 @@ def view_command(
         require_new(screenshot, force)
     runs = [find_recorded(name, recordings) for name in run_names]
     with stage_line("loading Rerun") as stage:
-        from runner.export.rerun.cache import cached_export
-        from runner.export.rerun.location import locate, locate_divergence
+        from runner.export.rerun.selection import locate, locate_divergence
+        from runner.export.rerun.viewer import cached_export
 
         divergence = None
         if len(runs) == 2 and step is None:

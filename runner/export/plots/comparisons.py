@@ -1,23 +1,35 @@
-"""Charts of a comparison and of a difference: intervals and profiles of groups, and distances of Q-tables.
+"""Charts of comparisons: intervals and profiles of groups, distances of Q-tables, scores over environments.
 
+An explanation compares mixtures of settings: bars of estimates, and the values of each mixture.
 Groups have the colours and markers that they have in the learning curves.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Final
+import textwrap
+from collections.abc import Collection, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from runner.analysis.compare import GroupResult, MetricResult
-from runner.analysis.compare.tasks import AlgorithmResult
+from runner.analysis.compare.sections import AGGREGATES, TASKS_EXPLANATION
+from runner.analysis.compare.tasks import AlgorithmResult, TaskComparison
 from runner.analysis.diff.extent import TableDiff
 from runner.analysis.statistics import Estimate
 from runner.drawing import palette
 from runner.environments.naming import spoken
-from runner.export.plots.chart import Canvas, Chart, Scale, labelled, series_colour, series_marker
+from runner.export.plots.chart import (
+    SMALL,
+    Canvas,
+    Chart,
+    Markers,
+    Scale,
+    labelled,
+    series_colour,
+    series_marker,
+)
 from runner.export.plots.curves import HEIGHT, WIDTH, draw_legend
 
 _SPREAD: Final = 0.22
@@ -27,6 +39,16 @@ _MEASURES: Final = (
     ("mean", "mean difference", 1),
     ("greedy_share", "other greedy action, %", 100),
 )
+
+_SCORE: Final = "normalised score"
+_LETTERS: Final = 150
+"""Letters of a note on a line of the sheet."""
+
+_NAMES: Final = 205.0
+"""Where charts begin, right of the names of settings."""
+_WIDTH: Final = 590.0
+_ROW: Final = 20.0
+_MAX_NAME: Final = 38
 
 
 def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
@@ -140,3 +162,148 @@ def draw_estimate(chart: Chart, estimate: Estimate, row: int, number: int, radiu
     value = np.array([estimate.value])
     at = np.array([float(row)])
     chart.markers(value, at, series_colour(number), series_marker(number), radius, edge=palette.INK)
+
+
+def task_charts(comparison: TaskComparison) -> list[Canvas]:
+    """Return the charts: each aggregate, the performance profile, and the curve where runs have one."""
+    labels = [result.label for result in comparison.algorithms]
+    title = f"Performance profile over {len(comparison.tasks)} environments"
+    profile = profile_chart(
+        "Performance profile", title, _SCORE, comparison.thresholds, comparison.algorithms, labels
+    )
+    curves = [_curves(comparison)] if len(comparison.positions) > 1 else []
+    return [_aggregates(comparison), profile, *curves]
+
+
+def tasks_sheet(comparison: TaskComparison) -> Canvas:
+    """Return all charts on one sheet, with a legend above and notes below."""
+    charts = task_charts(comparison)
+    notes = textwrap.wrap(TASKS_EXPLANATION, _LETTERS)
+    head = 46.0 + 14 * len(comparison.algorithms)
+    height = head + max(chart.height for chart in charts) + 10 * len(notes) + 8
+    sheet = Canvas(
+        WIDTH * len(charts), height, f"Normalised scores over {len(comparison.tasks)} environments"
+    )
+    sheet.text(10, 20, sheet.title, size=13, bold=True)
+    sheet.text(10, 34, f"{comparison.title}, {comparison.moment}; by {comparison.normalised_by}", size=SMALL)
+    for i, result in enumerate(comparison.algorithms):
+        y = 50.0 + 14 * i
+        sheet.shape([(12, y - 3), (36, y - 3)], stroke=series_colour(i), width=1.5)
+        sheet.text(42, y, f"{letter(i)}: {result.label}, {sum(result.seeds.values())} runs")
+    for i, chart in enumerate(charts):
+        sheet.place(chart, WIDTH * i, head)
+    sheet.notes(notes)
+    return sheet
+
+
+def _aggregates(comparison: TaskComparison) -> Canvas:
+    """Return a row for each aggregate, with the value and interval of each algorithm."""
+    count = len(comparison.algorithms)
+    row = max(34.0, 9.0 * count + 16)
+    canvas = Canvas(WIDTH, max(HEIGHT, 32 + row * len(AGGREGATES)), "Aggregates of normalised scores")
+    canvas.text(78.0, 25, "Aggregates, with 95 % intervals", size=9.5, bold=True)
+    for k, (name, estimate_of) in enumerate(AGGREGATES):
+        top = 32 + row * k
+        ends = [
+            end
+            for result in comparison.algorithms
+            for end in (estimate_of(result).low, estimate_of(result).value, estimate_of(result).high)
+            if math.isfinite(end)
+        ]
+        chart = Chart(
+            Scale.around(np.array(ends), 78.0, WIDTH - 10),
+            Scale(count - 0.4, -0.6, top + row - 16, top),
+            0,
+            0,
+            "",
+        )
+        chart.x_ticks()
+        for i, result in enumerate(comparison.algorithms):
+            draw_estimate(chart, estimate_of(result), i, i, 2.6)
+        chart.text(70.0, top + (row - 16) / 2 + 3, name, "end")
+        canvas.place(chart, 0, 0)
+    return canvas
+
+
+def _curves(comparison: TaskComparison) -> Chart:
+    """Return the IQM of the scores over the positions that all runs cover."""
+    places = np.array(comparison.positions)
+    ends = [result.curve for result in comparison.algorithms]
+    ends += [part for r in comparison.algorithms for part in (r.curve_low, r.curve_high)]
+    values = np.array(ends)
+    y = Scale.around(values[np.isfinite(values)], 146.0, 32.0)
+    chart = Chart(Scale(places[0], places[-1], 50.0, WIDTH - 10), y, WIDTH, HEIGHT, "Sample efficiency")
+    chart.x_ticks(labelled(chart.x.ticks, short=places[-1] >= 10_000))
+    chart.y_ticks()
+    chart.frame("Sample efficiency", 25.0, comparison.axis, [f"{_SCORE}, IQM"])
+    for i, result in enumerate(comparison.algorithms):
+        low, high = np.array(result.curve_low), np.array(result.curve_high)
+        if not np.isnan(low).any():
+            chart.band(places, low, high, series_colour(i), opacity=0.2)
+        chart.marked_line(places, np.array(result.curve), i)
+    return chart
+
+
+class BarColumn(NamedTuple):
+    """A mixture: the settings that are changed in it, and its values, one a seed."""
+
+    changed: Collection[str]
+    values: Sequence[float]
+    is_marked: bool
+    """Whether it has the second colour."""
+
+
+def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
+    """Return a bar from 0 for each named estimate, with its interval; pale if that includes 0."""
+    ends = [end for _, each in rows for end in (each.value, each.low, each.high) if math.isfinite(end)]
+    bottom = 24.0 + _ROW * len(rows)
+    x = Scale.around(np.array([0.0, *ends]), _NAMES, _WIDTH - 10)
+    chart = Chart(x, Scale(len(rows) - 0.5, -0.5, bottom, 24.0), _WIDTH, bottom + 18, title)
+    chart.text(5, 14, title, size=9.5, bold=True)
+    chart.x_ticks()
+    for row, (name, each) in enumerate(rows):
+        middle = chart.y.at(row)
+        zero = x.at(0)
+        end = x.at(each.value)
+        corners = [(zero, middle - 6), (end, middle - 6), (end, middle + 6), (zero, middle + 6)]
+        chart.shape(corners, fill=series_colour(0), opacity=0.75 if each.excludes_zero else 0.3)
+        if math.isfinite(each.low):
+            chart.shape([(x.at(each.low), middle), (x.at(each.high), middle)], stroke=palette.INK, width=1.2)
+            for place in (x.at(each.low), x.at(each.high)):
+                chart.shape([(place, middle - 3), (place, middle + 3)], stroke=palette.INK, width=1.2)
+        chart.text(_NAMES - 8, middle + 3, _short(name), "end")
+    chart.shape([(x.at(0), 24), (x.at(0), bottom)], stroke=palette.INK)
+    return chart
+
+
+def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn]) -> Chart:
+    """Return each mixture as a column: its values and their mean, and below a dot for what is changed."""
+    values = np.array([value for column in columns for value in column.values])
+    bottom = 170.0
+    last = 184.0 + 16 * len(names)
+    x = Scale(-0.6, len(columns) - 0.4, _NAMES, _WIDTH - 10)
+    chart = Chart(x, Scale.around(values, bottom, 24.0), _WIDTH, last + 4, title)
+    chart.y_ticks()
+    chart.text(5, 14, title, size=9.5, bold=True)
+    chart.shape([(x.start, 24), (x.start, bottom), (x.end, bottom)], stroke=palette.INK)
+    for column, one in enumerate(columns):
+        own = np.array(one.values)
+        colour = series_colour(1 if one.is_marked else 0)
+        spread = np.linspace(-0.18, 0.18, len(own)) if len(own) > 1 else np.zeros(1)
+        chart.markers(column + spread, own, colour, 0, 1.3, opacity=0.5)
+        chart.line(np.array([column - 0.32, column + 0.32]), np.full(2, own.mean()), colour, width=2.2)
+        for row, name in enumerate(names):
+            place = np.array([[x.at(column), bottom + 16 + 16 * row]])
+            chart.marks.append(Markers(place, 0, 3.5, colour if name in one.changed else "", colour, 1.0))
+    for row, name in enumerate(names):
+        chart.text(_NAMES - 8, bottom + 19 + 16 * row, _short(name), "end")
+    return chart
+
+
+def _short(name: str) -> str:
+    """Return a name that fits left of a chart; of a pair of settings the longer one is shortened."""
+    parts = name.split(" x ")
+    if (excess := len(name) - _MAX_NAME) > 0:
+        at = max(range(len(parts)), key=lambda i: len(parts[i]))
+        parts[at] = f"{parts[at][: max(len(parts[at]) - excess - 1, 3)]}…"
+    return " x ".join(parts)

@@ -10,9 +10,8 @@ from runner.analysis.compare.sections import sections, summary, task_sections
 from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.groups import Group
 from runner.analysis.sections import Figure, Grid, LegendEntry, Section
-from runner.export.plots.comparisons import intervals_svg, letter, profile_chart
+from runner.export.plots.comparisons import intervals_svg, letter, profile_chart, task_charts
 from runner.export.plots.curves import curves_section
-from runner.export.plots.tasks import task_charts
 from runner.export.reports.rendering import render
 from runner.util.humanize import UNKNOWN, counted
 

@@ -28,8 +28,7 @@ from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
 from runner.export.encoded import Thumbnails, picture_note, thumbnails
-from runner.export.plots.curves import curves_section
-from runner.export.plots.style import PLAIN, CurveStyle
+from runner.export.plots.curves import PLAIN, CurveStyle, curves_section
 from runner.export.reports.maps import learned_section, start_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import embedded, render, templates

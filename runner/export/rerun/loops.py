@@ -17,12 +17,11 @@ from runner.drawing.raster import image_bytes
 from runner.errors import CannotRedo, RecordingError
 from runner.export import pictures
 from runner.export.encoded import encoded_picture
-from runner.export.painting import decoded, redrawn
-from runner.export.rerun.layout import OVERVIEW
+from runner.export.pictures import decoded, redrawn
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.selection import MAX_MEMBERS, time_of
 from runner.export.rerun.steps import Batch
-from runner.export.rerun.tracks import Times, Track, TrackView, Writer, scalars, times_of
+from runner.export.rerun.tracks import OVERVIEW, Times, Track, TrackView, Writer, scalars, times_of
 from runner.export.values import FEW, acted, names_in, number_names, observed
 from runner.recording import schema
 from runner.recording.environment import observation_names

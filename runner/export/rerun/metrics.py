@@ -15,8 +15,9 @@ import rerun.blueprint as rrb
 from runner.drawing import palette
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
-from runner.export.rerun.layout import OVERVIEW, PLOTS
 from runner.export.rerun.tracks import (
+    OVERVIEW,
+    PLOTS,
     Colour,
     Floats,
     Times,

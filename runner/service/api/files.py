@@ -19,7 +19,7 @@ from pydantic import BaseModel
 from runner.analysis.episodes import TYPICAL, EpisodeRef
 from runner.client.uploads import UploadState, UploadStatus
 from runner.errors import ConfigError, RunNotFound
-from runner.export.encoder import FORMATS
+from runner.export.film import FORMATS
 from runner.export.plugin import installed_export
 from runner.export.rerun.selection import Request as Selection
 from runner.runs.run import Run

@@ -23,7 +23,7 @@ from runner.analysis.sections import Grid, Link, Section
 from runner.analysis.summary import describe_run, results_in_words
 from runner.client.jobs import RunProgress
 from runner.errors import ConfigError, RecordingError, RunnerError
-from runner.export.encoder import FORMATS
+from runner.export.film import FORMATS
 from runner.export.reports.rendering import partials
 from runner.recording import schema
 from runner.recording.environment import composition_of

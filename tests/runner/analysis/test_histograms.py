@@ -10,7 +10,7 @@ import runner
 from runner.analysis.axes import EPISODES, STEPS, UPDATES
 from runner.analysis.histograms import histograms
 from runner.errors import RecordingError
-from runner.export.plots.heatmaps import constants_in, heatmap_plots
+from runner.export.plots.training import constants_in, heatmap_plots
 from runner.recording.reader import open_recording
 
 

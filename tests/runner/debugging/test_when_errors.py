@@ -12,7 +12,7 @@ import runner
 from runner.cli import cli
 from runner.debugging.when import when
 from runner.errors import RecordingError, RunnerError
-from runner.export.thumbnail import thumbnail
+from runner.export.encoded import thumbnail
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at

@@ -21,7 +21,7 @@ import runner
 from runner.analysis.episodes import EpisodeRef, ranked_episodes
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.export.encoder import FORMATS, Encoder
+from runner.export.film import FORMATS, Encoder
 from runner.export.pictures import Pictures
 from runner.recording.reader import open_recording
 from tests.runner.export.making import made_otherwise

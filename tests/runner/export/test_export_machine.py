@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from runner.export.plots.machine import machine_facts, machine_plots
+from runner.export.plots.training import machine_facts, machine_plots
 from runner.recording.machine import FIELDS, GPU_FIELDS, Clock, HostMetrics
 
 CLOCK = Clock(np.array([0, 100, 400]), np.array([0.0, 10.0, 20.0]), np.zeros(3), {0.0: 0.0})

@@ -15,7 +15,7 @@ from runner.analysis.groups import groups_of, panels_of
 from runner.analysis.series import RunSeries, read_series
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.export.plots import image
+from runner.export.plots import chart
 from runner.export.plots.chart import Text
 from runner.export.plots.curves import curves_sheet, panel_chart
 from runner.recording.reader import open_recording
@@ -157,7 +157,7 @@ def test_a_full_disk_is_no_fault_of_the_input(pictured, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(image, "save", full)
+    monkeypatch.setattr(chart, "save", full)
     result = plot(pictured("corridor", log=None).recording, "-o", tmp_path / "plot.svg")
     assert result.exit_code == 1
     assert "cannot be written (No space left on device)" in result.stderr

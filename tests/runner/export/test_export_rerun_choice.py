@@ -15,8 +15,7 @@ from runner.analysis.diff import diff
 from runner.analysis.episodes import EpisodeRef
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
-from runner.export.rerun.location import locate, locate_divergence
-from runner.export.rerun.selection import Request, episodes_of, select
+from runner.export.rerun.selection import Request, episodes_of, locate, locate_divergence, select
 from runner.export.rerun.viewer import ViewerError, check_port, require_rerun
 from runner.recording import schema
 from runner.recording.reader import open_recording

@@ -12,10 +12,9 @@ from rerun.chunk import RrdReader
 
 import runner
 from runner.environments.mdp import events_of
-from runner.export.rerun.labels import GridLabels
-from runner.export.rerun.layout import PLOTS
-from runner.export.rerun.scene import scene_of
+from runner.export.rerun.scene import GridLabels, scene_of
 from runner.export.rerun.selection import Request
+from runner.export.rerun.tracks import PLOTS
 from runner.export.rerun.viewer import viewer_program
 from runner.export.rerun.writing import export
 from runner.recording import schema

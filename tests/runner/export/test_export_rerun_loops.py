@@ -18,8 +18,7 @@ from runner.errors import RecordingError
 from runner.export.encoded import encoded_picture
 from runner.export.pictures import Pictures, PictureSource
 from runner.export.rerun import selection
-from runner.export.rerun.location import locate
-from runner.export.rerun.selection import Request, select
+from runner.export.rerun.selection import Request, locate, select
 from runner.export.rerun.writing import export
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording import schema

@@ -20,9 +20,8 @@ from runner.cli import cli
 from runner.cli.commands import view
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import viewer, writing
-from runner.export.rerun.cache import cached_export
-from runner.export.rerun.location import locate
-from runner.export.rerun.selection import Request
+from runner.export.rerun.selection import Request, locate
+from runner.export.rerun.viewer import cached_export
 
 PLOTS = {"Success %", "Mean length", "Mean return", "Mean penalties"}
 PLOTS |= {"Q-table filled (%)", "Epsilon, step size", "Rewards (% of the last steps)"}

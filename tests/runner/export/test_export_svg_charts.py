@@ -12,9 +12,8 @@ from runner.analysis.axes import EPISODES
 from runner.analysis.groups import Curve, Panel, smoothed
 from runner.analysis.statistics import Estimate
 from runner.export.plots.chart import Scale
-from runner.export.plots.curves import panel_chart
-from runner.export.plots.mixtures import bars_chart
-from runner.export.plots.style import CurveStyle, not_drawn
+from runner.export.plots.comparisons import bars_chart
+from runner.export.plots.curves import CurveStyle, not_drawn, panel_chart
 from runner.recording.metrics import SHARES
 
 

@@ -15,7 +15,7 @@ import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.archive.runs import restore_run
 from runner.errors import MissingExtra, RunnerError
-from runner.export.encoder import frames_of
+from runner.export.film import frames_of
 from runner.runs.resolve import find_run
 from runner.runs.run import label
 from runner.service import computed
