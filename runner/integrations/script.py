@@ -26,8 +26,7 @@ from runner.errors import ConfigError, nearest
 from runner.integrations.hooks import OTHERS, WatchedEnvironment, open_runs, update_hooks
 from runner.integrations.values import ValueRows, begin_values
 from runner.loops.env import record
-from runner.loops.flushing import open_loops
-from runner.loops.loop import Loop
+from runner.loops.loop import Loop, open_loops
 from runner.loops.media import Media
 from runner.loops.options import CallbackOptions
 from runner.loops.recorded import Recorded, ending_of

@@ -110,8 +110,9 @@ def contents(folder: Path, algorithms: dict[str, dict[str, Any]] = ALGORITHMS) -
     """Make a recording of each kind in a folder; return what they hold, by name."""
     found = {path.stem: reading.read(path) for path in sorted(DATA.glob("*.mcap"))}
     with pytest.MonkeyPatch.context() as patch:
-        for module in ("runner.recording.recorder", "runner.loops.loop"):
-            patch.setattr(f"{module}.FLUSH_SECONDS", 1e9)  # so that chunks do not depend on the machine
+        # So that chunks do not depend on the machine.
+        patch.setattr("runner.recording.recorder.FLUSH_SECONDS", 1e9)
+        patch.setattr("runner.loops.loop.Loop.flush", lambda _: True)
         for name, path in recordings(folder, algorithms):
             assert name not in found, name
             found[name] = reading.read(path)

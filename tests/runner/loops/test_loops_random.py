@@ -60,8 +60,7 @@ def recorded_extras(recording, phase):
 
 @pytest.fixture(autouse=True)
 def flushed_all_the_time(monkeypatch):
-    for module in ("flushing", "loop"):
-        monkeypatch.setattr(f"runner.loops.{module}.FLUSH_SECONDS", 0.002)
+    monkeypatch.setattr("runner.loops.loop.FLUSH_SECONDS", 0.002)
 
 
 @settings(max_examples=20, deadline=None)
