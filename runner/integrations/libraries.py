@@ -1,21 +1,27 @@
-"""What adapters have in common: the versions of libraries that were tested, arguments, settings."""
+"""What adapters have in common: tested versions, arguments, settings, environments made in workers."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
-from typing import Final, Unpack
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final, Self, Unpack
 
 import numpy as np
 
 from runner.errors import ConfigError
+from runner.loops.env import record
 from runner.loops.makers import checked_make
-from runner.loops.options import Arguments, CallbackOptions, options_of, settings_in
+from runner.loops.options import Arguments, CallbackOptions, RecordOptions, options_of, settings_in
+from runner.loops.recorded import Recorded
 from runner.loops.values import warn_user
+from runner.runs.run import Run
 from runner.util.extras import require
 from runner.util.values import Json, is_whole
 
+OF_THE_RUN: Final = ("name", "seed", "config", "run_id")
+"""The arguments of `runner.record` that a process which joins a run does not give."""
 _MAX_TEXT: Final = 1_000
 _MAX_DEPTH: Final = 10
 
@@ -94,3 +100,61 @@ def as_setting(value: object, depth: int = 0) -> object:
         return getattr(value, "__qualname__", type(value).__name__)
     text = str(value)
     return type(value).__name__ if " at 0x" in text else text[:_MAX_TEXT]
+
+
+class Workers:
+    """Records the environments that a library makes by a function, in this process or in others, as one run.
+
+    `train` makes an environment that joins the run: give it to the library in the place of the function.
+    `recorded` is what `runner.record` returns, for `log` and `checkpoint`; it takes no steps. Close the
+    workers, then this; it is a context manager.
+
+    Args:
+        make: makes an environment; it has to be sent to the workers, as without recording.
+        recordings: as for `runner.record`.
+        options: the others of `runner.record`.
+
+    Raises:
+        ConfigError: an argument cannot be used.
+        EnvironmentNotUsable: a space cannot be recorded.
+        StorageError: the recordings folder cannot be written.
+    """
+
+    record: Callable[..., Any] = staticmethod(record)
+    """Records an environment of the library, with the arguments of `runner.record`."""
+
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        recordings: str | os.PathLike[str] | None = None,
+        **options: Unpack[RecordOptions],
+    ) -> None:
+        self._env = self.record(make(), recordings, **options)  # it may close itself when it is collected
+        self.recorded = self.inside(self._env)
+        shared = {name: value for name, value in options.items() if name not in OF_THE_RUN}
+        self.train = partial(_made, self.record, make, join=self.run, **shared)
+
+    @staticmethod
+    def inside(env: Any) -> Recorded:
+        """Return the recorded environment inside of one of the library."""
+        return env  # type: ignore[no-any-return]
+
+    @property
+    def run(self) -> Run:
+        """The run; it has a `summary` once it is closed."""
+        return self.recorded.run
+
+    def close(self) -> None:
+        """Put together what the workers recorded, and close the run as finished."""
+        self.recorded.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self.recorded.__exit__(*raised)
+
+
+def _made(record: Callable[..., Any], make: Callable[[], Any], **options: object) -> Any:
+    """Return a recorded environment; called in the process of a worker."""
+    return record(make(), **options)

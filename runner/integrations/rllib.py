@@ -20,7 +20,7 @@ import numpy as np
 
 from runner.environments.games import MultiAgent
 from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
-from runner.integrations.libraries import Callback, as_setting, require_tested
+from runner.integrations.libraries import OF_THE_RUN, Callback, as_setting, require_tested
 from runner.integrations.shapes import as_run_name
 from runner.loops.description import Described
 from runner.loops.loop import Loop
@@ -49,8 +49,6 @@ _RESULTS: Final = ("training_iteration", "env_runners", "learners", "evaluation"
 """What is logged of an iteration's result, in this order: plots and pages show the first names."""
 _CLOCK: Final = re.compile(r"(^|/)(timers|sample|[^/]*(_timer|throughput|_sec_|_between_)[^/]*)(/|$)")
 """What is not logged, because it differs between two runs that are otherwise the same."""
-_OF_THE_RUN: Final = ("name", "seed", "config")
-"""The arguments that env runners, which join the run, do not get."""
 _STEPS: Final = "num_env_steps_sampled_lifetime"
 
 
@@ -149,7 +147,7 @@ class Recording(Callback, RLlibCallback):  # type: ignore[misc]
     def _join(self, run: _Run, group: Any, is_evaluation: bool, **runners: object) -> str:
         """Have env runners record their environments; return why one of them cannot."""
         phase = "eval" if is_evaluation else "train"
-        shared = {name: value for name, value in self._options.items() if name not in _OF_THE_RUN}
+        shared = {name: value for name, value in self._options.items() if name not in OF_THE_RUN}
         join = partial(_why_not_joined, {"join": run.run, "phase": phase, **shared})
         return next(filter(None, group.foreach_env_runner(join, **runners)), "")
 

@@ -6,8 +6,7 @@ envs = SubprocVectorEnv([recording.train] * 4)
 
 from __future__ import annotations
 
-from runner.integrations.libraries import require_tested
-from runner.integrations.workers import Workers
+from runner.integrations.libraries import Workers, require_tested
 
 require_tested("tianshou", "tianshou", ("2.0", "2.0"))
 

@@ -15,11 +15,10 @@ from typing import Any, Final, Unpack
 from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError
-from runner.integrations.libraries import require_tested
+from runner.integrations.libraries import Workers, require_tested
 from runner.integrations.script import end_with_scripts
 from runner.integrations.shapes import logs
 from runner.integrations.tensorboard import SummaryWriter
-from runner.integrations.workers import Workers
 from runner.loops.batches import RecordedBatches, record_batches
 from runner.loops.env import record as record_env
 from runner.loops.media import film_of, histogram_of

@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,14 +35,13 @@ from runner.integrations.shapes import (
     without_effect,
 )
 from runner.integrations.tensorboard import end_forwarding, forward
-from runner.integrations.wandb.settings import Config, Summary
 from runner.loops.media import Histogram as Histogram
 from runner.loops.media import Image, Media, array_of
 from runner.loops.options import settings_in
 from runner.runs.listing import list_runs
 from runner.runs.redaction import redacted_settings
 from runner.util.jsonable import as_json
-from runner.util.values import flatten
+from runner.util.values import Json, flatten
 
 _IGNORED: Final = frozenset(
     [
@@ -62,6 +61,75 @@ _IGNORED: Final = frozenset(
 
 
 # --- a run --------------------------------------------------------------------------------------------------
+
+
+class Config(MutableMapping[str, Any]):
+    """The settings of a run: `config["lr"]`, `config.lr`, `config.update({...})`."""
+
+    _script: ScriptRun
+    _configure: Callable[..., None]
+
+    def __init__(self, script: ScriptRun, configure: Callable[..., None]) -> None:
+        vars(self).update(_script=script, _configure=configure)
+
+    def update(self, *settings: Any, **more: object) -> None:
+        """Take the settings of a mapping, dataclass or namespace."""
+        more.pop("allow_val_change", None)
+        for part in settings:
+            self._configure(part)
+        self._configure(more)
+
+    def setdefaults(self, settings: Any) -> None:
+        """Take the settings that are not there yet."""
+        self._configure(settings, is_default=True)
+
+    def as_dict(self) -> Json:
+        """Return the settings."""
+        return dict(self._script.settings)
+
+    def __getitem__(self, key: str) -> Any:
+        return self._script.settings[key]
+
+    def __setitem__(self, key: str, value: object) -> None:
+        self._configure({key: value})
+
+    def __delitem__(self, key: str) -> None:
+        raise RunnerError(f"config: {key!r} cannot be removed")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._script.settings)
+
+    def __len__(self) -> int:
+        return len(self._script.settings)
+
+    def __getattr__(self, key: str) -> Any:
+        try:
+            return self._script.settings[key]
+        except KeyError:
+            raise AttributeError(f"config has no {key!r}, but {', '.join(self) or 'nothing'}") from None
+
+    __setattr__ = __setitem__
+
+
+class Summary(Json):
+    """The last value logged under each name, and what the script puts there, which is logged at the end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.own: Json = {}
+
+    def __setitem__(self, key: str, value: object) -> None:
+        super().__setitem__(key, value)
+        self.own[key] = value
+
+    def update(self, values: Any = (), **more: object) -> None:  # type: ignore[override]
+        """Put several values there."""
+        for key, value in {**dict(values), **more}.items():
+            self[key] = value
+
+    def seen(self, key: str, value: object) -> None:
+        """Note a value that was logged."""
+        super().__setitem__(key, value)
 
 
 class Tracked(Tracker):
@@ -263,7 +331,9 @@ def init(
             return run
         run.finish()
     labels = {"project": project, "group": group, "job_type": job_type, "id": id}
-    own_tags = tuple(f"{key}={_tag(str(value))}" for key, value in labels.items() if value)
+    own_tags = tuple(
+        re.sub(r"[^\w.=+/@-]", "-", f"{key}={value}") for key, value in labels.items() if value
+    )
     tags = [tags] if isinstance(tags, str) else list(map(str, tags or ()))
     note = str(notes or "")
     if id and resume and resume != "never":
@@ -319,10 +389,6 @@ def _predecessor(tag: str, recordings: str | os.PathLike[str] | None) -> str:
         "follows it, and names it in its note."
     )
     return f"Follows run {last.run_id}.\n"
-
-
-def _tag(text: str) -> str:
-    return re.sub(r"[^\w.=+/@-]", "-", text)
 
 
 def __getattr__(name: str) -> Any:

@@ -9,7 +9,7 @@ import gymnasium
 from scripts import the_run
 
 from runner.execution.verify import verify
-from runner.integrations.workers import Workers
+from runner.integrations.libraries import Workers
 
 make = functools.partial(gymnasium.make, "CartPole-v1")
 
