@@ -8,31 +8,42 @@ cannot be recorded, they become a run of their own, without steps.
 
 A script that was written for another tracker never ends because of this one: what cannot be recorded gives a
 warning, unless the script asks for an error with `on_error="raise"`.
+
+While a run waits for an environment, every class of environments of Gymnasium has a `reset` that first looks
+for such a run. The outermost environment that the script resets is then stepped through its recorded twin.
+The classes get their own `reset` back as soon as no run has to see which environments are reset.
 """
 
 from __future__ import annotations
 
 import atexit
+import contextlib
+import functools
 import json
 import os
 import sys
 import time
+import weakref
 from collections.abc import Callable
+from types import FrameType, MethodType
 from typing import Any, Final, Protocol
 
+import gymnasium
+from gymnasium.spaces import Discrete
 from gymnasium.vector import VectorEnv
 
 from runner.errors import ConfigError, nearest
-from runner.integrations.hooks import OTHERS, WatchedEnvironment, open_runs, update_hooks
-from runner.integrations.values import ValueRows, begin_values
+from runner.loops.description import Described
 from runner.loops.env import record
 from runner.loops.loop import Loop, open_loops
 from runner.loops.media import Media
-from runner.loops.options import CallbackOptions
+from runner.loops.options import PACKING, CallbackOptions, options_of
 from runner.loops.recorded import Recorded, ending_of
 from runner.loops.values import warn_user
 from runner.loops.vector import record_vector
 from runner.recording.labels import MAX_NOTE, is_tag
+from runner.recording.maker import EnvironmentMaker
+from runner.recording.run_file import NO_ENVIRONMENT
 from runner.runs.run import Run, label, new_run_id, recordings_folder
 from runner.util.jsonable import as_json
 from runner.util.values import Json, is_whole
@@ -48,6 +59,21 @@ _MAX_WAITING_BYTES: Final = 1 << 28
 _MAX_STEP: Final = 2**62
 _WAITING_SECONDS: Final = 10.0
 """How long values wait at most; looked at when another value is logged."""
+_NO_ENVIRONMENT: Final = Described(Discrete(1), Discrete(1), env_id=NO_ENVIRONMENT)
+_NOT_MADE: Final = EnvironmentMaker("gymnasium", reason="values were logged, and no environment was recorded")
+_VALUE_ARGUMENTS: Final = {*PACKING, "name", "on_error", "seed", "config", "run_id"}
+"""The arguments of `record` that need no environment."""
+_MAX_POSITION: Final = 2**37
+"""The last step that has a time of its own; later ones are ordered as they came."""
+OTHERS: Final = "other environments"
+"""The subject of the warning that a run does not record further environments."""
+_BASES: Final[tuple[Any, ...]] = (gymnasium.Env, VectorEnv)
+_VECTORS_OF_OTHERS: Final = {
+    "stable_baselines3": "runner.integrations.sb3.Recording",
+    "torchrl": "runner.integrations.torchrl.record",
+    "ray": "runner.integrations.rllib.Recording",
+}
+"""Libraries that step environments in vectors of their own, and what records these."""
 
 
 class Watched(Protocol):
@@ -265,7 +291,7 @@ class ScriptRun:
 
     def _join_loop(self) -> bool:
         """Log into the newest loop that the script records itself, if there is one."""
-        ours = {id(other._loop) for other in open_runs if isinstance(other, ScriptRun) and other._is_own}
+        ours = {id(other._loop) for other in open_runs if other._is_own}
         loops = [loop for loop in open_loops() if id(loop) not in ours]
         if not loops:
             return False
@@ -312,12 +338,17 @@ class ScriptRun:
 
     def _begin_values(self) -> None:
         """Begin a recording without an environment."""
+        rows = ValueRows()
         try:
-            loop, self._values = begin_values(**self.arguments | {"name": self.name or script_name()})
+            arguments = {key: value for key, value in self.arguments.items() if key in _VALUE_ARGUMENTS}
+            options = options_of(self._recordings, arguments | {"name": self.name or script_name()})
+            loop = Loop(_NO_ENVIRONMENT, options, _NOT_MADE, make_rows=lambda *_: rows)  # type: ignore[arg-type]
+            loop.activate(loop.rows("train"))
         except Exception as error:
             self.discard()
             self.leave_out(error, "run", "all that is logged")
             return
+        self._values = rows
         self._begin_own(loop)
 
     def begin_with(self, env: Any) -> None:
@@ -428,3 +459,185 @@ def script_name() -> str:
     """Return the name of the script that was run, for runs without another name."""
     stem = os.path.splitext(os.path.basename(sys.argv[0] or ""))[0]  # noqa: PTH119, PTH122
     return stem if stem.isidentifier() else "values"
+
+
+# --- a run without an environment -----------------------------------------------------------------------
+
+
+class ValueRows:
+    """Where values stand in a run without an environment: the script's own step."""
+
+    off_table = 0
+
+    def __init__(self) -> None:
+        self.progress = (0, 0)
+        self.pending = 0
+        """The largest step so far, which orders the messages in time."""
+
+    def move(self, step: int) -> None:
+        """Let the next values have this step."""
+        self.progress = (step, 0)
+        self.pending = max(self.pending, min(step, _MAX_POSITION))
+
+    def commit(self) -> None:
+        """Do nothing: there are no steps."""
+
+    def reshape(self, described: Described) -> None:
+        """Do nothing: there are no actions."""
+
+
+# --- the environments that a script resets --------------------------------------------------------------
+
+
+class WatchedEnvironment:
+    """An environment of a script whose resets and steps go through its recorded twin.
+
+    The script keeps its object. The object's `step` and `reset` call the twin, which calls the original ones.
+    """
+
+    def __init__(self, env: object, recorded: Recorded) -> None:
+        self._env = env
+        self.recorded: Any = recorded
+        self.is_inside = False
+        """Whether the twin is calling the environment."""
+        _watched[id(env)] = self
+        for name, method in _METHODS.items():
+            object.__setattr__(env, name, MethodType(method, env))
+
+    def release(self) -> None:
+        """Record nothing more."""
+        _watched.pop(id(self._env), None)
+        for name in _METHODS:
+            with contextlib.suppress(AttributeError):
+                object.__delattr__(self._env, name)
+
+
+open_runs: list[ScriptRun] = []
+"""The runs of scripts that are not closed, the oldest first."""
+_watched: dict[int, WatchedEnvironment] = {}
+"""By the id of the environment, so that a copy of it is not watched."""
+_hooked: weakref.WeakKeyDictionary[Any, tuple[Callable[..., object], bool]] = weakref.WeakKeyDictionary()
+"""The classes that are hooked: the function that replaces `reset`, and whether the class had its own."""
+
+
+def _own(name: str) -> Callable[..., object]:
+    """Return the `step` or `reset` of a recorded environment; a copy is not recorded."""
+
+    def call(env: Any, *arguments: object, **named: object) -> object:
+        watched = _watched.get(id(env))
+        if watched is None or watched.is_inside:
+            return getattr(type(env), name)(env, *arguments, **named)
+        watched.is_inside = True
+        try:
+            return getattr(watched.recorded, name)(*arguments, **named)
+        finally:
+            watched.is_inside = False
+
+    call.__name__ = name  # pickle finds the method of an unpickled environment by it
+    return call
+
+
+_METHODS: Final = {"step": _own("step"), "reset": _own("reset")}
+
+
+def _find_run(env: object) -> None:
+    """Give an environment that is about to be reset to the run that waits for one, if any."""
+    waiting = [run for run in open_runs if run.waits_for_environment]
+    library = _library_that_resets() if waiting and not isinstance(env, Recorded) else None
+    if library is not None:
+        for run in waiting:
+            run.warn_once(
+                f"environments that {library} steps are not recorded by this run, but by "
+                f"{_VECTORS_OF_OTHERS[library]}, into whose recording its values go then."
+            )
+    elif waiting:
+        waiting[0].begin_with(env)
+    elif not isinstance(env, Recorded):
+        for run in open_runs:
+            if run.has_environment:
+                run.warn_once(
+                    f"run {run.run_id} records the environment that was reset first, and no other: "
+                    f"{env} is not recorded. runner.record(env) records it in a run of its own.",
+                    about=OTHERS,
+                )
+        update_hooks()
+
+
+def _library_that_resets() -> str | None:
+    """Return the library that resets the environment, if it steps vectors of its own."""
+    frame: FrameType | None = sys._getframe(2)
+    while frame is not None:
+        top = str(frame.f_globals.get("__name__")).partition(".")[0]
+        if top in _VECTORS_OF_OTHERS:
+            return top
+        frame = frame.f_back
+    return None
+
+
+def update_hooks() -> None:
+    """Let every class of environments look for a run when one is reset, as long as a run needs it."""
+    is_needed = any(run.looks_at_resets for run in open_runs)
+    if is_needed and not _hooked:
+        for base in _BASES:
+            _hook_with_subclasses(base)
+    elif _hooked and not is_needed:
+        _take_hooks_off()
+
+
+def _hook_with_subclasses(base: Any) -> None:
+    """Hook a class of environments, its subclasses, and those that are defined from now on."""
+    classes = [base]
+    while classes:
+        cls = classes.pop()
+        _hook(cls)
+        classes += cls.__subclasses__()
+
+    def hook_subclass(cls: Any, /, **named: object) -> None:
+        super(base, cls).__init_subclass__(**named)
+        _hook(cls)
+
+    base.__init_subclass__ = classmethod(hook_subclass)
+
+
+def _hook(cls: Any) -> None:
+    """Replace the `reset` of a class, wherever it inherits it: EnvPool's is not of a class of Gymnasium's."""
+    owner = next((base for base in cls.__mro__ if "reset" in vars(base)), None)
+    if owner is None or owner in _hooked:
+        return
+    original = vars(owner)["reset"]
+
+    @functools.wraps(original)
+    def reset(self: Any, *arguments: object, **named: object) -> object:
+        if id(self) not in _watched and not any(watched.is_inside for watched in _watched.values()):
+            _find_run(self)
+            if id(self) in _watched:
+                return self.reset(*arguments, **named)
+        return original(self, *arguments, **named)
+
+    _hooked[cls] = reset, owner is cls
+    cls.reset = reset
+
+
+def _take_hooks_off() -> None:
+    """Give all classes their own `reset` back, unless somebody else replaced it meanwhile."""
+    for base in _BASES:
+        del base.__init_subclass__
+    for cls, (reset, has_own) in _hooked.items():
+        if vars(cls).get("reset") is reset:
+            del cls.reset
+            if has_own:
+                cls.reset = reset.__wrapped__
+    _hooked.clear()
+
+
+def _after_fork() -> None:
+    """In a forked process: the runs belong to the other process."""
+    for run in open_runs:
+        run.disown()
+    open_runs.clear()
+    _watched.clear()
+    update_hooks()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)

@@ -21,8 +21,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Final
 
-from runner.integrations.hooks import open_runs
-from runner.integrations.script import ScriptRun
+from runner.integrations.script import ScriptRun, open_runs
 from runner.integrations.shapes import Tracker, as_number, as_run_name, forgiving, logs
 from runner.loops.media import Media, array_of, film_of, histogram_of, picture_of
 from runner.runs.redaction import redacted_settings
@@ -93,7 +92,7 @@ class SummaryWriter(Tracker):
             self.log_dir = os.fspath(log_dir)
             Path(self.log_dir).mkdir(parents=True, exist_ok=True)
         self.logdir = self.log_dir
-        tracked = [run for run in open_runs if isinstance(run, ScriptRun) and run.takes_writers]
+        tracked = [run for run in open_runs if run.takes_writers]
         self._is_own = not tracked
         if tracked:
             self.script = tracked[-1]

@@ -331,9 +331,7 @@ def init(
             return run
         run.finish()
     labels = {"project": project, "group": group, "job_type": job_type, "id": id}
-    own_tags = tuple(
-        re.sub(r"[^\w.=+/@-]", "-", f"{key}={value}") for key, value in labels.items() if value
-    )
+    own_tags = tuple(re.sub(r"[^\w.=+/@-]", "-", f"{key}={value}") for key, value in labels.items() if value)
     tags = [tags] if isinstance(tags, str) else list(map(str, tags or ()))
     note = str(notes or "")
     if id and resume and resume != "never":
