@@ -35,8 +35,7 @@ if TYPE_CHECKING:
     from runner.execution.verify import verify
     from runner.export.notebook import plot, report
     from runner.loops.batches import record_batches
-    from runner.loops.env import record
-    from runner.loops.parallel import record_aec, record_parallel
+    from runner.loops.env import record, record_aec, record_parallel
     from runner.loops.vector import record_vector
     from runner.query.find import find
     from runner.query.sql import sql
@@ -99,9 +98,9 @@ _HOME = {
     "open_recording": "runner.recording.reader",
     "plot": "runner.export.notebook",
     "record": "runner.loops.env",
-    "record_aec": "runner.loops.parallel",
+    "record_aec": "runner.loops.env",
     "record_batches": "runner.loops.batches",
-    "record_parallel": "runner.loops.parallel",
+    "record_parallel": "runner.loops.env",
     "record_vector": "runner.loops.vector",
     "register_space": "runner.recording.gym_spaces",
     "report": "runner.export.notebook",

@@ -25,7 +25,7 @@ from runner.environments.games import is_game
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import TrainingBranch, branch_training
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action
-from runner.loops.parallel import record_alone
+from runner.loops.env import record_alone
 from runner.loops.policies import Policy, from_policy, policy_named
 from runner.recording.reader import Recording, open_recording
 from runner.recording.spaces import Value

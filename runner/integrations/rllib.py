@@ -23,10 +23,10 @@ from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
 from runner.integrations.libraries import OF_THE_RUN, Callback, as_setting, require_tested
 from runner.integrations.shapes import as_run_name
 from runner.loops.description import Described
+from runner.loops.env import described_game, record_parallel
 from runner.loops.loop import Loop
 from runner.loops.makers import game_maker_of, vector_maker_of
 from runner.loops.options import CallbackOptions, options_of
-from runner.loops.parallel import described_game, record_parallel
 from runner.loops.recorded import Recorded
 from runner.loops.values import warn_user
 from runner.loops.vector import (

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -140,13 +140,13 @@ class Recording(Callback, BaseCallback):  # type: ignore[misc]
                 f"found that {type(self.model).__name__}.learn does not call BaseAlgorithm._setup_learn, as "
                 "others do. Record its environments instead, by runner.record(envs)."
             )
-        self._write_into(self.recorded)
+        self._write_into(self.recorded.log)
 
-    def _write_into(self, recorded: Logs) -> None:
-        """Let the model's logger write into a recording."""
+    def _write_into(self, log: Callable[[str, object], None]) -> None:
+        """Let the model's logger write into a recording by this function."""
         formats = self.logger.output_formats
         formats[:] = [output for output in formats if not isinstance(output, _LogWriter)]
-        self._writer = _LogWriter(recorded)
+        self._writer = _LogWriter(log)
         formats.append(self._writer)
 
     def _on_training_start(self) -> None:
@@ -200,13 +200,6 @@ class Recording(Callback, BaseCallback):  # type: ignore[misc]
         self.recorded.checkpoint("policy", self.model.policy.state_dict())
 
 
-class Logs(Protocol):
-    """Takes numbers and texts."""
-
-    def log(self, name: str, value: object) -> None:
-        """Log a number or a text under a name."""
-
-
 class _LogWriter(KVWriter):  # type: ignore[misc]
     """Records what the library's logger writes: numbers and texts.
 
@@ -214,8 +207,8 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
     are the first update after each time that it writes, and the last one, each at its own step.
     """
 
-    def __init__(self, recorded: Logs) -> None:
-        self._recorded = recorded
+    def __init__(self, log: Callable[[str, object], None]) -> None:
+        self._log = log
         self._of_updates: set[str] = set()
         """The names of the numbers of updates."""
         self._is_update_due = False
@@ -239,7 +232,7 @@ class _LogWriter(KVWriter):  # type: ignore[misc]
         for name, value in key_values.items():
             is_array_of_one = hasattr(value, "item") and np.size(value) == 1
             if (is_array_of_one or isinstance(value, int | float | str)) and name not in _CLOCKS:
-                self._recorded.log(name, value)
+                self._log(name, value)
 
     def close(self) -> None:
         """Do nothing: the run is closed by the callback."""

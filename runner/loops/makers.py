@@ -27,17 +27,21 @@ from runner.environments.gym_types import AnyVectorEnv
 from runner.environments.layers import class_name, layers_of, name_of, spaces_of_one, top_package
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
-from runner.loops.arguments import CannotBeMade, arguments_of, is_plain, plain_kwargs, plain_number
-from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
-from runner.loops.wrappers import (
+from runner.loops.arguments import (
     OBSERVERS,
+    CannotBeMade,
+    arguments_of,
     declared_wrapper_fields,
     entry_point_of,
     game_wrapper_fields,
+    is_plain,
     only_observes,
+    plain_kwargs,
+    plain_number,
     wrapper_fields,
     wrappers_as_fields,
 )
+from runner.loops.vec_env import LIBRARY, VecEnvVector, mode_of
 from runner.recording.maker import FUNCTION_NAME, MAX_SPEC, EnvironmentMaker, Registered, VectorMaker
 from runner.replay.scripts import MAIN
 from runner.util.values import MAX_TEXT, Json

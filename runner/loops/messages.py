@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 import threading
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -13,20 +15,20 @@ import numpy as np
 
 from runner.drawing.raster import image_bytes
 from runner.errors import ConfigError, shortened
-from runner.loops.checkpointing import content_of
 from runner.loops.media import Picture, media_of
 from runner.loops.options import ALL_INFO, Options, pillow
 from runner.loops.outcomes import Outcomes
 from runner.loops.step_buffer import StepBuffer
-from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number
+from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number, numbers_of
 from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic, topics_of
-from runner.runs.checkpoints import MAX_CHECKPOINTS
+from runner.runs.checkpoints import MAX_CHECKPOINTS, MAX_NAME_LENGTH, is_checkpoint_name
 from runner.runs.store import Store
+from runner.util.extras import require
 from runner.util.jsonable import as_json, exact_json, is_exact, is_packed, packed
-from runner.util.values import is_utf8
+from runner.util.values import flatten, is_utf8
 
 MAX_INFO_BYTES: Final = 4 << 20
 """The most bytes of JSON for the info of one step."""
@@ -284,3 +286,61 @@ class Messages:
         """Have another thread encode a picture of this moment. The caller holds the lock."""
         position = self._loop.position
         self._recorder.submit(topic, lambda: encode_image(encoded(), kind, position, name), position)
+
+
+_MAX_KEYS: Final = 1 << 20
+
+
+def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
+    """Return the content of a checkpoint, and its format.
+
+    Args:
+        value: bytes, the path of a file, or a mapping of arrays or tensors.
+
+    Raises:
+        ConfigError: name or value cannot be recorded.
+    """
+    if not is_checkpoint_name(name):
+        raise ConfigError(
+            f"checkpoint: found the name {str(name)[:80]!r}, expected printable text of 1 to "
+            f"{MAX_NAME_LENGTH} letters without @"
+        )
+    if pickle:
+        import pickle as pickling
+
+        try:
+            return pickling.dumps(value), "pickle"
+        except Exception as error:  # whatever the object raises
+            raise ConfigError(f"checkpoint: {name!r} cannot be pickled ({error})") from error
+    if isinstance(value, bytes | bytearray | memoryview):
+        return memoryview(value).cast("B"), "bytes"
+    if isinstance(value, str | os.PathLike):
+        path = Path(os.fspath(value))
+        if not path.is_file():
+            raise ConfigError(
+                f"checkpoint: found the path {str(path)!r} for {name!r}, expected that of a file"
+            )
+        return path, "safetensors" if path.suffix == ".safetensors" else "file"
+    if isinstance(value, Mapping):
+        return _safetensors(name, flatten(value, separator="/")), "safetensors"
+    raise ConfigError(
+        f"checkpoint: found {type(value).__name__} for {name!r}, expected bytes, a path, or a mapping of "
+        "arrays or tensors, such as model.state_dict(); pickle=True records any other object"
+    )
+
+
+def _safetensors(name: str, values: Mapping[str, Any]) -> bytes:
+    if not 0 < len(values) <= _MAX_KEYS:
+        raise ConfigError(f"checkpoint: found {len(values):,} arrays for {name!r}, expected at least one")
+    torch = sys.modules.get("torch")
+    is_torch = torch is not None and all(isinstance(value, torch.Tensor) for value in values.values())
+    module = "safetensors.torch" if is_torch else "safetensors.numpy"
+    save = require(module, extra="safetensors", purpose="a checkpoint of arrays or tensors").save
+    if is_torch:  # a copy of each: tensors that share memory are refused
+        return bytes(save({key: value.detach().cpu().contiguous().clone() for key, value in values.items()}))
+    expected = "an array of numbers; pickle=True records any object"
+    arrays = {
+        key: np.array(numbers_of(value, "checkpoint", f"at {key!r} of {name!r}", expected), order="C")
+        for key, value in values.items()
+    }
+    return bytes(save(arrays))

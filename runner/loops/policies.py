@@ -23,7 +23,7 @@ import numpy as np
 from runner.environments.games import game_spaces, is_game
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari import episodes_in
-from runner.loops.parallel import record_alone
+from runner.loops.env import record_alone
 from runner.loops.values import as_array
 from runner.recording.gym_spaces import restore_space
 from runner.recording.gym_values import element_of

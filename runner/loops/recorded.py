@@ -297,30 +297,6 @@ def _close_abandoned(loop: Loop) -> None:
     loop.close(*(("interrupted", "") if error is None or is_interactive else ending_of(error)))
 
 
-class RecordedAlone(Recorded):
-    """What a recorded environment has that steps alone, not in a vector: an environment or a game."""
-
-    def _enter(self, phase: str) -> None:
-        super()._enter(phase)
-        self._watch.begin_phase()
-
-    def is_over(self, terminated: object, truncated: object) -> bool:
-        """Return whether a step ended the episode, from what it returned."""
-        return bool(terminated or truncated)
-
-    def _record_frame(self, is_over: bool) -> None:
-        """Record a picture of the last step, if it is due."""
-        self._until_frame -= 1
-        if is_over or self._until_frame <= 0:
-            self._record_frames(ends=is_over)
-
-    def _recorded_reset(self, seed: int | None, options: ResetOptions | None) -> ResetResult:
-        with self._loop.lock:  # another thread may be committing steps
-            self._watch.steps = self._rows.progress[0]
-        seeds = () if seed is None else (seed,)
-        return self._reset(seeds, (0,), options, {"seed": seed, "options": options})
-
-
 def require_pictures(env: object) -> None:
     """Refuse an environment that renders no pictures, in a run with frames.
 
@@ -333,3 +309,18 @@ def require_pictures(env: object) -> None:
             f"frames_every: found an environment with render_mode={mode!r}, expected "
             "'rgb_array': make it with render_mode=\"rgb_array\"."
         )
+
+
+def return_name(names: Sequence[str]) -> str:
+    """Return the name under which the returns of episode statistics are logged; empty if there is no need.
+
+    Statistics of episodes inside of a wrapper that changes rewards, such as `NormalizeReward`, have returns
+    that the recorded rewards do not show.
+
+    Args:
+        names: the wrappers, `module:class`, from the outermost in.
+    """
+    classes = [name.rpartition(":")[2] for name in names]
+    inside = next((at for at, name in enumerate(classes) if name == "RecordEpisodeStatistics"), 0)
+    changing = [name for name in classes[:inside] if "Reward" in name]
+    return f"return before {changing[-1]}" if changing else ""

@@ -20,9 +20,8 @@ from runner.loops.generators import GeneratorWatch, States, vector_watch
 from runner.loops.loop import Loop
 from runner.loops.makers import checked_make, vector_maker_of
 from runner.loops.options import RecordOptions, options_of
-from runner.loops.recorded import Recorded, require_pictures
+from runner.loops.recorded import Recorded, require_pictures, return_name
 from runner.loops.values import as_given, check_phase
-from runner.loops.wrappers import return_name
 from runner.util.arrays import Flags
 
 if TYPE_CHECKING:

@@ -220,7 +220,7 @@ def test_a_digest_that_is_a_path_leads_nowhere(tmp_path):
 
 
 def test_a_name_that_no_recorder_writes_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("runner.loops.checkpointing.is_checkpoint_name", lambda _: True)
+    monkeypatch.setattr("runner.loops.messages.is_checkpoint_name", lambda _: True)
     with runner.record(make("CartPole-v1"), tmp_path) as rec:
         rec.checkpoint("\x1b[2J", b"content")
     with pytest.raises(RecordingError, match="invalid checkpoint"):

@@ -87,7 +87,7 @@ class WandbCallback(Recording):
         for output in self.logger.output_formats:
             if isinstance(output, TensorBoardOutputFormat):
                 do_not_forward(output.writer)
-        self._write_into(self)
+        self._write_into(self.log)
 
     def _on_training_end(self) -> None:
         super()._on_training_end()
