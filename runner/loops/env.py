@@ -240,11 +240,6 @@ class RecordedParallel(RecordedAlone):
             raise AttributeError(name)
         return getattr(self.env, name)
 
-    @property
-    def unwrapped(self) -> Any:
-        """The environment inside of all wrappers."""
-        return self.env.unwrapped
-
     def step(
         self, actions: Mapping[str, object], extras: Mapping[str, Mapping[str, object]] | None = None
     ) -> GameStepResult:

@@ -61,9 +61,6 @@ class _Column:
     """The classes of single numbers that it holds exactly."""
     values: Array
     """[rows, *shape]."""
-    fit: Callable[[int, object], Any]
-    """Returns a value of another class or dtype, as it is put into a row given by its number; raises
-    `_OtherValues` if it has another shape or dtype."""
 
 
 class PendingExtras:
@@ -126,7 +123,7 @@ class PendingExtras:
                         and value.dtype is column.dtype
                         and value.shape == column.shape
                     ) or value.__class__ in column.scalars
-                    column.values[row] = value if is_fitting else column.fit(row, value)
+                    column.values[row] = value if is_fitting else self._fitted(name, row, value)
             except (AttributeError, KeyError):  # no mapping, a new name, or values of another length
                 take(self._grow(row, values))
                 return
@@ -168,7 +165,7 @@ class PendingExtras:
         fitting = {}
         for name, value in values.items():
             try:
-                fitting[name] = self._columns[name].fit(row, value)
+                fitting[name] = self._fitted(name, row, value)
             except ConfigError as error:
                 self._leave_out(error)
         for name, value in fitting.items():
@@ -249,7 +246,7 @@ class PendingExtras:
         left = len(self._steps)
         for name, description in described.items():
             before = self._columns.get(name)
-            column = self._column(name, description)
+            column = self._column(description)
             self._columns[name] = column
             if before is None:
                 continue
@@ -257,7 +254,7 @@ class PendingExtras:
                 column.values[:left] = before.values[:left]
             else:
                 for k in range(left):
-                    column.values[k] = column.fit(k, before.values[k])
+                    column.values[k] = self._fitted(name, k, before.values[k])
         return fitting
 
     def _descriptions(
@@ -281,57 +278,54 @@ class PendingExtras:
             described[name], size = needed, larger
         return described, size
 
-    def _column(self, name: str, description: Description) -> _Column:
+    def _column(self, description: Description) -> _Column:
         """Return a column for values of a description."""
         dtype = leaf_dtype(description)
-        batch = self._batch
         if dtype is None:
-            column = np.empty((self._room + 1, *batch), object)
-            column.fill(NOTHING)
-            return _Column(None, (), frozenset(), column, self._varying_fit(name, description))
+            return _Column(None, (), frozenset(), np.full((self._room + 1, *self._batch), NOTHING, object))
         base = np.dtype(dtype.base.str)
-        shape = (*batch, *dtype.shape)
+        shape = (*self._batch, *dtype.shape)
         exact = {kind for kind in SCALARS if np.can_cast(kind, base)}
         exact |= {kind for kind, held in _PYTHON.items() if np.dtype(held) == base}
+        return _Column(
+            base, shape, frozenset(() if shape else exact), np.zeros((self._room + 1, *shape), base)
+        )
 
-        def fit(_: int, value: object) -> Array:
-            values = _values(name, value, batch)
-            if isinstance(values, list) or values.shape != shape or not np.can_cast(values.dtype, base):
+    def _fitted(self, name: str, row: int, value: object) -> Any:
+        """Return a value as it is put into a row of its column; count the bytes of values of varying size.
+
+        Raises:
+            _OtherValues: it has another dtype or shape than the column.
+            ConfigError: it cannot be recorded.
+        """
+        column, description, batch = self._columns[name], self._described[name], self._batch
+        values = _values(name, value, batch)
+        if column.dtype is not None:
+            if isinstance(values, list) or values.shape != column.shape:
+                raise _OtherValues(name)
+            if not np.can_cast(values.dtype, column.dtype):
                 raise _OtherValues(name)
             return values
-
-        cells = np.zeros((self._room + 1, *shape), base)
-        return _Column(base, shape, frozenset(() if shape else exact), cells, fit)
-
-    def _varying_fit(self, name: str, description: Description) -> Callable[[int, object], Any]:
-        """Return the function that returns values of varying size as bytes, and counts these."""
-        batch = self._batch
+        items = _listed(values, batch)
         item_type = item_dtype(description)
-        base = None if item_type is None else item_type.base
-
-        def is_alike(item: Any) -> bool:
-            if item_type is None:
-                return isinstance(item, str)
-            return not isinstance(item, str) and (item.dtype, item.shape[1:]) == (base, item_type.shape)
-
-        def fit(row: int, value: object) -> Any:
-            items = _listed(_values(name, value, batch), batch)
-            if not all(map(is_alike, items)):
+        for item in items:
+            is_alike = isinstance(item, str) == (item_type is None)
+            if item_type is not None and is_alike:
+                is_alike = (item.dtype, item.shape[1:]) == (item_type.base, item_type.shape)
+            if not is_alike:
                 _needed(name, description, value, batch)
-            data = [encoded(description, item) for item in items]
-            if row != self._held_row:
-                self._held_row = row
-                self._row_bytes = {}
-            self._row_bytes[name] = max(map(len, data))
-            if (size := self._fixed_bytes + sum(self._row_bytes.values())) > MAX_EXTRA_BYTES:
-                del self._row_bytes[name]
-                raise _too_large(name, size)
-            self._held += sum(map(len, data))
-            if self._held > _MAX_BYTES:
-                self._max_rows = min(self._max_rows, row)
-            return _objects(data) if batch else data[0]
-
-        return fit
+        data = [encoded(description, item) for item in items]
+        if row != self._held_row:
+            self._held_row = row
+            self._row_bytes = {}
+        self._row_bytes[name] = max(map(len, data))
+        if (size := self._fixed_bytes + sum(self._row_bytes.values())) > MAX_EXTRA_BYTES:
+            del self._row_bytes[name]
+            raise _too_large(name, size)
+        self._held += sum(map(len, data))
+        if self._held > _MAX_BYTES:
+            self._max_rows = min(self._max_rows, row)
+        return _objects(data) if batch else data[0]
 
     def commit(self) -> None:
         """Hand all rows to the recorder but the last one, which may be extended."""

@@ -8,6 +8,7 @@ as if one loop had done all of it, and does not depend on which process was fast
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import shutil
 import tempfile
@@ -23,13 +24,21 @@ from blake3 import blake3
 
 from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
-from runner.errors import RecordingError, RunnerError, StorageError, truncated_message
-from runner.loops.copied_extras import CopiedExtras
+from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Copied
+from runner.loops.extras import begin_layout, blank_extras, put_extras
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, UNIT, Source, open_sources
 from runner.loops.step_buffer import StepBuffer
 from runner.recording import schema
+from runner.recording.extras import (
+    MAX_EXTRA_BYTES,
+    MAX_NAME_LENGTH,
+    MAX_NAMES,
+    ExtraLayout,
+    encoded,
+    united,
+)
 from runner.recording.layout import Layout
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
@@ -50,20 +59,18 @@ from runner.recording.resets import ResetOptions, ResetState
 from runner.recording.rewriting import content_of
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
-from runner.recording.spaces import Description, parts_of
+from runner.recording.spaces import Description, leaf_dtype, parts_of
 from runner.recording.writer import create_recording
 from runner.runs.listing import run_at
 from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, shards_locked, shards_of
 from runner.runs.trust_marks import merge_marks
-from runner.util.arrays import Array, Floats, Ints, Records
+from runner.util.arrays import Array, Ints, Records
 from runner.util.files import storage_errors
 from runner.util.values import Json
 
 _OWN_METADATA: Final = frozenset({"run", "result", "repair"})
 """The metadata that is not copied from the process that began the run."""
-_OWN_TOPICS: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
-"""Topics of one process alone, or recorded again, as are episodes, which follow from the steps."""
 _NEW_FIELDS: Final = frozenset(
     {"step", "episode", "t", "environment", "taken", "reset", "log_time", "publish_time"}
 )
@@ -216,21 +223,21 @@ class _Fold:
                 result["rewards_off_table"] = off_table
             unfolded = dict(self._left_out)
             for source in self._sources:
-                if parts := left_out(source, self._read[source.number]):
+                if parts := source.left_out(self._read[source.number]):
                     unfolded[source.name] = f"{parts} are in the run."
             if unfolded:
                 result["unfolded"] = unfolded
-            if errors := self._errors() + [_kept(name, reason) for name, reason in unfolded.items()]:
-                result["error"] = truncated_message("; ".join(errors))
+            failed = (shard for shard in shards_of(self._run) if shard.status == "failed")
+            errors = [
+                self._run.file.summary.error,
+                *(f"{shard.run_id} failed: {shard.summary.error or 'of unknown cause'}" for shard in failed),
+                *(_kept(name, reason) for name, reason in unfolded.items()),
+            ]
+            if any(errors):
+                result["error"] = truncated_message("; ".join(filter(None, errors)))
             write_result(file, _ending_of_run(self._run, unfolded), result)
             before = self._run.file.summary.seconds or 0.0
             return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
-
-    def _errors(self) -> list[str]:
-        first = self._run.file.summary.error
-        failed = [shard for shard in shards_of(self._run) if shard.status == "failed"]
-        others = [f"{shard.run_id} failed: {shard.summary.error or 'of unknown cause'}" for shard in failed]
-        return ([first] if first else []) + others
 
     def _facts(self) -> dict[str, str]:
         shards = [
@@ -239,21 +246,17 @@ class _Fold:
         ]
         names = {"run_id": self._run.run_id, "name": str(self._run.facts["name"])}
         seeded = {"seeded": "false"} if not self._run.has_seed else {}
+        spaces = dict(self._first.spaces)
+        for source in self._sources[1:]:  # with the widest numbers of all recorded actions
+            spaces["action"] = _widest(spaces["action"], source.recording.spaces["action"])
         run = {key: value for key, value in self._first.run.items() if key != "seeded"}
         return (
             run
             | names
             | seeded
             | {"seed": str(self._run.seed), "created": self._run.created_text, "environments": "1"}
-            | {"spaces": self._spaces(), "shards": json.dumps([vars(shard) for shard in shards])}
+            | {"spaces": json.dumps(spaces), "shards": json.dumps([vars(shard) for shard in shards])}
         )
-
-    def _spaces(self) -> str:
-        """Return the description of the spaces, with the widest numbers of all recorded actions."""
-        spaces = dict(self._first.spaces)
-        for source in self._sources[1:]:
-            spaces["action"] = _widest(spaces["action"], source.recording.spaces["action"])
-        return json.dumps(spaces)
 
     def _own_makers(self) -> dict[str, EnvironmentMaker]:
         """Return how the environments of shards were made, where they differ from the run's."""
@@ -289,14 +292,12 @@ class _Fold:
         """
         if source.is_placed and not source.stops["train"]:
             return position - evaluated
-        return self._alongside((trained if source.stops["train"] else evaluated) / source.n)
-
-    def _alongside(self, times: Array) -> Floats:
-        """Return the training steps of the run when every process had stepped its environments so often."""
+        # What the run had when every process had stepped its environments as often.
+        times = (trained if source.stops["train"] else evaluated) / source.n
         total = np.zeros(len(times))
-        for source in self._sources:
-            if stop := source.stops["train"]:
-                total += np.minimum(times * source.n, stop) * (source.taken["train"] / stop)
+        for other in self._sources:
+            if stop := other.stops["train"]:
+                total += np.minimum(times * other.n, stop) * (other.taken["train"] / stop)
         return total
 
     # --- steps ----------------------------------------------------------------------------------------
@@ -505,24 +506,63 @@ class Content:
                 )
 
 
-def left_out(source: Source, read: Mapping[str, int]) -> str:
-    """Return how much of what a process recorded is in the run, if not all of it is.
+class CopiedExtras:
+    """The extras of all processes, with the names of all of them."""
 
-    Args:
-        read: the number of messages by topic that the fold read.
-    """
-    steps, others = [], []
-    for topic in source.recording.topics:
-        if topic.name.endswith("/episode") or topic in _OWN_TOPICS:
-            continue
-        copied = read.get(topic.name, 0)
-        recorded = source.stated.get(topic.name, 0)
-        recorded = max([recorded, *(stop for _, stop in source.recording.lost.get(topic.name, []))])
-        if topic.message is schema.STEP:
-            copied = source.stops[topic.phase]
-            recorded = max(recorded, source.recording.phase(topic.phase).steps.total())
-            if copied < recorded:
-                steps.append(f"{copied:,} of {recorded:,} {schema.PHASE_NAMES[topic.phase]} steps")
-        elif copied < recorded:
-            others.append(f"{copied:,} of {recorded:,} messages of {topic.name}")
-    return ", ".join(steps or others)
+    def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
+        self._recorder = recorder
+        columns: dict[str, Description] = {}
+        self._names: dict[tuple[int, str], str] = {}
+        """The names in the run, by number of the process and the name there."""
+        for source, phase in itertools.product(sources, PHASES):
+            for name, column in source.recording.phase(phase).extras.columns.items():
+                new = name
+                before = columns.get(name, column)
+                both = united(before, column)
+                if both is None or before["type"] == column["type"] != both["type"]:
+                    new = f"{name} ({source.name})"[:MAX_NAME_LENGTH]
+                    both = united(columns.get(new, column), column) or column
+                columns[new], self._names[source.number, name] = both, new
+        self._layout = ExtraLayout(0, 0, columns)
+        if len(columns) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
+            raise ConfigError(
+                f"extras: found {len(columns)} names and {self._layout.values.itemsize:,} bytes a step in "
+                f"all shards, expected at most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
+            )
+        self._is_described = False
+
+    def copy(self, source: Source, phase: str, numbers: Ints, new_step: int, new_position: int) -> int:
+        """Copy the extras of some steps, which follow each other in the run; return how many had some.
+
+        Args:
+            numbers: of the steps, as their process counted them.
+            new_step: the number of the first step in the run.
+            new_position: the steps of the run before it.
+        """
+        extras = source.recording.phase(phase).extras
+        if not extras:
+            return 0
+        n = len(numbers)
+        named = {self._names[source.number, name]: values for name, values in extras.at(numbers).items()}
+        flags = {name: ~np.ma.getmaskarray(values).reshape(n, -1)[:, 0] for name, values in named.items()}
+        rows = np.flatnonzero(np.logical_or.reduce(list(flags.values())))
+        if not len(rows):
+            return 0
+        if not self._is_described:
+            begin_layout(self._recorder, 0, self._layout.columns, new_position + int(rows[0]) + 1)
+            self._is_described = True
+        columns, given = {}, {}
+        for name, column in self._layout.columns.items():
+            given[name] = flags.get(name, np.zeros(n, np.bool_))[rows]
+            columns[name] = blank_extras(column, len(rows))
+            if name not in named:
+                continue
+            values = named[name].data[rows]
+            if leaf_dtype(column) is not None:
+                columns[name][:] = values
+                continue
+            for k in np.flatnonzero(given[name]).tolist():
+                columns[name][k] = encoded(column, values[k])
+        positions = (new_position + rows + 1).astype(np.uint64)
+        put_extras(self._recorder, phase, self._layout, new_step + rows, positions, columns, given)
+        return len(rows)

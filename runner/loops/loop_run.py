@@ -64,13 +64,13 @@ class LoopRun:
         self._code = CodeCollector(self.run.folder.parent, options.packing.code and not is_shard)
         path = self.run.folder / RECORDING_FILE
         with unless_empty(self.run):
-            self._file = create_recording(path)
+            self.file = create_recording(path)
         mark(self.run.folder, maker)
-        self._beat_code = self._code.beat(self.run, self._file)
+        self._beat_code = self._code.beat(self.run, self.file)
         self._facts = self._run_facts()
         self.outcomes = Outcomes(described.mdp)
         self.recorder = Recorder(
-            self._file,
+            self.file,
             described.layout,
             packing=options.packing.packing,
             record_steps=options.steps == "all",
@@ -92,10 +92,10 @@ class LoopRun:
             try:
                 self.describe()
             except BaseException as error:
-                self._file.close()
+                self.file.close()
                 self._mark_failed(truncated_message(error))
                 raise
-        self._follower = Follower(client, self.run, lambda: self._file.size) if client else None
+        self._follower = Follower(client, self.run, lambda: self.file.size) if client else None
         self._absolute = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
         if not is_shard:
             os.environ[RUN_VARIABLE] = self._absolute
@@ -126,7 +126,7 @@ class LoopRun:
 
     def _write_makers(self) -> None:
         for phase, maker in list(self.own_makers.items()):
-            write_maker(self._file, phase, maker)
+            write_maker(self.file, phase, maker)
             mark(self.run.folder, maker)
             del self.own_makers[phase]
 
@@ -156,7 +156,7 @@ class LoopRun:
             self._is_described = True
             self.is_settled = True
             environment = self.described.attachments(), self._maker
-            write_description(self._file, self._facts, self._config, self._provenance, *environment)
+            write_description(self.file, self._facts, self._config, self._provenance, *environment)
 
     def settle(self, action: object) -> bool:
         """Fix the dtype of all actions by the first one; return whether it is not the space's own."""
@@ -179,7 +179,7 @@ class LoopRun:
     def finish(self, status: str, error: str, rewards_off_table: int) -> Json:
         """Write everything and the result; return the summary."""
         topic_digests = self.recorder.drain()
-        self._code.write(self._file, wait=True)
+        self._code.write(self.file, wait=True)
         self._write_makers()
         if self._actions is not None and self._follower is None:  # which has sent the file as it is
             self._compact()
@@ -192,25 +192,21 @@ class LoopRun:
             result["rewards_off_table"] = rewards_off_table
         if error:
             result["error"] = truncated_message(error)
-        write_result(self._file, status, result, synced=False)
+        write_result(self.file, status, result, synced=False)
         seconds = round(time.monotonic() - self.started, 3)
-        return result | {"seconds": seconds, "bytes": self._file.size}
+        return result | {"seconds": seconds, "bytes": self.file.size}
 
     def _compact(self) -> None:
         """Write a recording of actions alone again, in fewer chunks, if there are several."""
         counts = self.recorder.counts
         if any(counts.get(topic.name, 0) > 1 for topic in ACTION_TOPICS.values()):
             with contextlib.suppress(OSError):  # without the space for both, the recording stays as it is
-                self._file, messages = compacted(self._file, self._options.packing.packing)
+                self.file, messages = compacted(self.file, self._options.packing.packing)
                 counts |= messages
-
-    def close_file(self) -> None:
-        """Close the file, finished or not."""
-        self._file.close()
 
     def write_status(self, status: str, summary: Mapping[str, object]) -> None:
         """Write how the run ended next to its recording, which is synced to disk within seconds."""
-        SYNCER.add(self._file.path, partial(_mark_unsynced, self.run.folder))
+        SYNCER.add(self.file.path, partial(_mark_unsynced, self.run.folder))
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
 
     def fold(self) -> Run:
@@ -232,7 +228,7 @@ class LoopRun:
         with contextlib.suppress(Exception):  # the first error is the one that matters
             self.recorder.abandon()
         with contextlib.suppress(StorageError):
-            write_result(self._file, "failed", {"error": reason})
+            write_result(self.file, "failed", {"error": reason})
         self._mark_failed(reason)
         if self._follower:
             self._follower.stop()

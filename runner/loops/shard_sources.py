@@ -36,6 +36,8 @@ UNIT: Final = np.dtype([("key", "f8"), *((name, "i8") for name in (*_NUMBERS, *_
 """A unit: `key` is how many training steps of the whole run it comes after; `position`, `reset`, `first` and
 `stop` (steps of the phase) are as its process counted them, `steps` is how many it took; the `new_`
 fields are its numbers in the run."""
+_OWN_TOPICS: Final = (*schema.MACHINE_TOPICS, schema.EXTRA_COLUMNS_TOPIC)
+"""Topics of one process alone, or recorded again, as are episodes, which follow from the steps."""
 _RESET: Final = ("reset", "step", "environment", "log_time")
 
 
@@ -165,6 +167,28 @@ class Source:
         at = int(np.searchsorted(units["first"][low:high], step, side="right"))
         unit: np.void = units[low + max(at - 1, 0)]
         return unit
+
+    def left_out(self, read: Mapping[str, int]) -> str:
+        """Return how much of what the process recorded is in the run, if not all of it is.
+
+        Args:
+            read: the number of messages by topic that the fold read.
+        """
+        steps, others = [], []
+        for topic in self.recording.topics:
+            if topic.name.endswith("/episode") or topic in _OWN_TOPICS:
+                continue
+            copied = read.get(topic.name, 0)
+            recorded = self.stated.get(topic.name, 0)
+            recorded = max([recorded, *(stop for _, stop in self.recording.lost.get(topic.name, []))])
+            if topic.message is schema.STEP:
+                copied = self.stops[topic.phase]
+                recorded = max(recorded, self.recording.phase(topic.phase).steps.total())
+                if copied < recorded:
+                    steps.append(f"{copied:,} of {recorded:,} {schema.PHASE_NAMES[topic.phase]} steps")
+            elif copied < recorded:
+                others.append(f"{copied:,} of {recorded:,} messages of {topic.name}")
+        return ", ".join(steps or others)
 
 
 def open_sources(run: Run, stack: ExitStack) -> tuple[list[Source], dict[str, str]]:

@@ -15,7 +15,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
 from runner.environments.layers import final_observations
-from runner.environments.mdp import Mdp, step_counts
+from runner.environments.mdp import step_counts
 from runner.errors import RecordingError
 from runner.loops.description import Copied, Described
 from runner.loops.generators import States
@@ -595,7 +595,13 @@ class StepBuffer:
         terminated, truncated = self._ends[:rows, 0], self._ends[:rows, 1]
         columns = self._columns(rows, resets, only_reset)
         columns |= {"rewards": rewards, "terminated": terminated, "truncated": truncated}
-        counts = None if self._mdp is None else self._counts(self._mdp, columns)
+        counts = None
+        if self._mdp is not None:
+            names = ("state", "action", "next_state")
+            transitions = (columns[name].ravel().astype(np.int64, copy=False) for name in names)
+            counts, excluded = step_counts(self._mdp, self._rewards[:rows, 0], *transitions)
+            counts = counts[:, np.newaxis]
+            self.off_table += int(np.count_nonzero(excluded))
         environment = self._marks["environment"][:rows, np.newaxis] if self._is_copied else None
         ends = rewards, terminated, truncated
         steps = TurnBlock(first, *ends, begins, only_reset, is_over, counts, environment)
@@ -667,14 +673,6 @@ class StepBuffer:
                     f"found {name} {known.min()} to {known.max()}, outside of its Discrete space."
                 )
         return columns
-
-    def _counts(self, mdp: Mdp, columns: Columns) -> Ints:
-        """Return the events and penalties of each step, and count the rewards that the table excludes."""
-        names = ("state", "action", "next_state")
-        transitions = (columns[name].ravel().astype(np.int64, copy=False) for name in names)
-        counts, excluded = step_counts(mdp, self._rewards[: self.filled, 0], *transitions)
-        self.off_table += int(np.count_nonzero(excluded))
-        return counts[:, np.newaxis]
 
     def _put_ends(self, ended: Columns, first: int, before: int) -> None:
         """Record the ends of episodes, each at the time of its last step, which may be committed already."""

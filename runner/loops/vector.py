@@ -127,12 +127,8 @@ class RecordedVector(Recorded, _Wrapper):
             self._log_return(infos, ended)
         if self._options.frames_every:
             self._until_frame -= 1
-            if self._resets_within:
-                self._record_frames(resets=ended)
-            elif self._mode == AutoresetMode.NEXT_STEP:
-                self._record_frames(resets=over, ends=ended)
-            else:
-                self._record_frames(ends=ended)
+            resets = {AutoresetMode.SAME_STEP: ended, AutoresetMode.NEXT_STEP: over}
+            self._record_frames(resets.get(self._mode, False), ended)
 
     def _pictures(self, due: Sequence[int]) -> Any:
         inside = getattr(self.env.unwrapped, "envs", None)
