@@ -253,17 +253,13 @@ def settings_of(model: BaseAlgorithm) -> dict[str, object]:
     }
     for name in names:
         if name not in {*_NOT_SETTINGS, *settings} and hasattr(model, name):
-            settings[name] = _setting(getattr(model, name))
+            value = getattr(model, name)
+            settings[name] = as_setting(value)
+            if callable(value) and not isinstance(value, type):
+                with contextlib.suppress(Exception):  # it is no schedule, but any function
+                    first, last = float(value(1.0)), float(value(0.0))
+                    settings[name] = first if first == last else {"first": first, "last": last}
     return settings
-
-
-def _setting(value: object) -> object:
-    """Return a hyperparameter as JSON holds it."""
-    if callable(value) and not isinstance(value, type):
-        with contextlib.suppress(Exception):  # it is no schedule, but any function
-            first, last = float(value(1.0)), float(value(0.0))
-            return first if first == last else {"first": first, "last": last}
-    return as_setting(value)
 
 
 def _observations_in_progress(model: BaseAlgorithm, base: object) -> object:

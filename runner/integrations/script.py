@@ -318,15 +318,6 @@ class ScriptRun:
     def arguments(self) -> dict[str, Any]:
         """The arguments of `record` that do not depend on the environment."""
         seed = self.settings.get("seed")
-        return self._options | {
-            "recordings": self._recordings,
-            "name": self.name,
-            "seed": seed if is_whole(seed, 0, 2**64 - 1) else None,
-            "config": self._recordable_settings(),
-            "run_id": self.run_id,
-        }
-
-    def _recordable_settings(self) -> Json:
         settings = {}
         for key, value in self.settings.items():
             try:
@@ -334,7 +325,13 @@ class ScriptRun:
                 settings[key] = value
             except (ValueError, RecursionError) as error:
                 self.leave_out(ConfigError(f"config: {key!r}: {error}."), "config", "a setting")
-        return settings
+        return self._options | {
+            "recordings": self._recordings,
+            "name": self.name,
+            "seed": seed if is_whole(seed, 0, 2**64 - 1) else None,
+            "config": settings,
+            "run_id": self.run_id,
+        }
 
     def _begin_values(self) -> None:
         """Begin a recording without an environment."""

@@ -114,23 +114,16 @@ class WithoutEffect:
     def __init__(self, name: str) -> None:
         self._name = name
 
-    def __call__(self, *_: object, **__: object) -> WithoutEffect:  # noqa: D102
-        return self
-
     def __getattr__(self, name: str) -> WithoutEffect:
         if name.startswith("__"):
             raise AttributeError(name)
         return self
 
-    def __getitem__(self, key: object) -> WithoutEffect:
+    def __call__(self, *_: object, **__: object) -> WithoutEffect:
+        """Return itself."""
         return self
 
-    def __setitem__(self, key: object, value: object) -> None: ...
-
-    def __enter__(self) -> WithoutEffect:
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
+    __enter__ = __exit__ = __getitem__ = __setitem__ = __call__
 
     def __iter__(self) -> Iterator[object]:
         return iter(())

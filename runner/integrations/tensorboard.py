@@ -213,7 +213,8 @@ def run_name(log_dir: str) -> str | None:
 # --- other writers ------------------------------------------------------------------------------------------
 
 
-_left_out: weakref.WeakSet[object] = weakref.WeakSet()
+not_forwarded: weakref.WeakSet[object] = weakref.WeakSet()
+"""Writers of other libraries whose values are left out, as they are recorded otherwise."""
 
 
 def _other_writers() -> list[Any]:
@@ -244,22 +245,17 @@ def end_forwarding() -> None:
                 setattr(writer, name, method.__wrapped__)
 
 
-def do_not_forward(writer: object) -> None:
-    """Leave out what is written with this writer of another library, as it is recorded otherwise."""
-    _left_out.add(writer)
-
-
 def _forwarding(name: str, method: Callable[..., object], ours: SummaryWriter) -> Callable[..., object]:
     @wraps(method)
     def both(self: object, *arguments: object, **named: object) -> object:
-        if ours.script.closed or self in _left_out:
+        if ours.script.closed or self in not_forwarded:
             return method(self, *arguments, **named)
         getattr(ours, name)(*arguments, **named)
-        _left_out.add(self)  # it may call its other methods, as `add_figure` calls `add_image`
+        not_forwarded.add(self)  # it may call its other methods, as `add_figure` calls `add_image`
         try:
             return method(self, *arguments, **named)
         finally:
-            _left_out.discard(self)
+            not_forwarded.discard(self)
 
     both.forwards = True  # type: ignore[attr-defined]
     return both

@@ -201,12 +201,24 @@ class Messages:
         return digest
 
     def info(self, phase: str, info: Mapping[str, object], is_reset: bool = False) -> None:
-        """Record the chosen fields of an info, of the step or reset that was just put down."""
+        """Record the chosen fields of an info, of the step or reset that was just put down.
+
+        Where a field cannot be recorded, the reason stands.
+        """
         names = self._options.info
         fields = info if ALL_INFO in names else {key: info[key] for key in names if key in info}
         if not fields:
             return
-        text = self._json_of(fields)
+        pieces = []
+        size = 0
+        for key, value in fields.items():
+            try:
+                text = _info_text(value, MAX_INFO_BYTES - size)
+            except (ValueError, RecursionError) as error:
+                text = self._reason(f"info[{key!r}] is", error)
+            size += len(text)
+            pieces.append(f"{json.dumps(str(key))}: {text}")
+        text = "{" + ", ".join(pieces) + "}"
         with self._loop.lock:
             if not self._loop.records():
                 return
@@ -232,19 +244,6 @@ class Messages:
                 "differs, they may be the reason. This warning is given once."
             )
         return text
-
-    def _json_of(self, fields: Mapping[str, object]) -> str:
-        """Return fields of an info as a JSON object; where one cannot be recorded the reason stands."""
-        pieces = []
-        size = 0
-        for key, value in fields.items():
-            try:
-                text = _info_text(value, MAX_INFO_BYTES - size)
-            except (ValueError, RecursionError) as error:
-                text = self._reason(f"info[{key!r}] is", error)
-            size += len(text)
-            pieces.append(f"{json.dumps(str(key))}: {text}")
-        return "{" + ", ".join(pieces) + "}"
 
     def _reason(self, what: str, error: Exception) -> str:
         """Warn that something is not recorded, and return the reason as JSON."""

@@ -107,20 +107,16 @@ def play_checkpoint(
         recorded = record_alone(env, recordings, name=name, seed=seed, config=settings)
     with recorded as rec, rec.phase("eval"):
         for number in range(episodes):
-            _play(rec, act, seed + number, policy)
+            observation, _ = rec.reset(seed=seed + number)
+            over = False
+            while not over:
+                with from_policy(policy):
+                    action = act(observation)
+                observation, _, terminated, truncated, _ = rec.step(action)
+                over = rec.is_over(terminated, truncated)
             report(number + 1)
     played: Run = rec.run
     return played
-
-
-def _play(rec: Any, act: Policy, seed: int, name: str) -> None:
-    observation = rec.reset(seed=seed)[0]
-    over = False
-    while not over:
-        with from_policy(name):
-            action = act(observation)
-        observation, _, terminated, truncated, _ = rec.step(action)
-        over = rec.is_over(terminated, truncated)
 
 
 @dataclass(frozen=True)

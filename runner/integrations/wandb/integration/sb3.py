@@ -16,7 +16,7 @@ from pathlib import Path
 from runner.errors import RunnerError
 from runner.integrations import wandb
 from runner.integrations.sb3 import Recording
-from runner.integrations.tensorboard import do_not_forward
+from runner.integrations.tensorboard import not_forwarded
 
 from stable_baselines3.common.base_class import BaseAlgorithm  # isort: skip
 from stable_baselines3.common.logger import TensorBoardOutputFormat  # isort: skip
@@ -86,7 +86,7 @@ class WandbCallback(Recording):
     def _init_callback(self) -> None:
         for output in self.logger.output_formats:
             if isinstance(output, TensorBoardOutputFormat):
-                do_not_forward(output.writer)
+                not_forwarded.add(output.writer)
         self._write_into(self.log)
 
     def _on_training_end(self) -> None:
