@@ -33,7 +33,7 @@ from runner.recording.gym_values import SCALARS
 from runner.recording.messages import encode
 from runner.recording.recorder import Recorder
 from runner.recording.spaces import Description, Value, item_dtype, leaf_dtype, row_dtype
-from runner.util.arrays import Array, Flags, Ints, Unsigned
+from runner.util.arrays import Array, Flags, Ints
 from runner.util.values import is_utf8
 
 _MAX_ROWS: Final = 4096
@@ -63,6 +63,45 @@ class _Column:
     """[rows, *shape]."""
 
 
+class ExtrasWriter:
+    """Hands the extras of steps to the recorder, and begins a layout where names are new or begin to vary."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.described: dict[str, Description] = {}
+        """The description of each name's values of one environment."""
+        self.layout = ExtraLayout(-1, 0, {})
+        """The last layout that the recording has."""
+
+    def put(self, phase: str, steps: Ints, columns: Mapping[str, Array], given: Mapping[str, Flags]) -> None:
+        """Record the extras of steps, given by their numbers in the phase that is recorded now.
+
+        Args:
+            columns: [steps, ...] by name, values of varying size as bytes; names that are missing have none.
+            given: [steps], whether a step has the value, by name.
+        """
+        recorder = self._recorder
+        # The steps of the other phase came before all of these.
+        positions = (steps + (recorder.position - recorder.steps[phase] + 1)).astype(np.uint64)
+        if self.layout.columns != self.described:
+            position = int(positions[0])
+            number = self.layout.number + 1
+            self.layout = layout = ExtraLayout(number, position * schema.STEP_NANOSECONDS, self.described)
+            recorder.append(schema.EXTRA_COLUMNS_TOPIC, encode(schema.EXTRA_COLUMNS, layout.fields), position)
+            recorder.begin_extras(number, layout.message)
+        varying = self.layout.varying["spaces"]
+        nothing = _objects([NOTHING] * len(steps))
+        for block, part in recorder.fill(schema.extra_topic(phase, self.layout.number), positions):
+            block["step"] = steps[part]
+            for name in self.described:
+                block["given"][name] = given[name][part] if name in given else False
+                if name not in varying:
+                    block["values"][name] = columns[name][part] if name in columns else 0
+            if varying:
+                parts = (columns.get(name, nothing)[part].tolist() for name in varying)
+                block["varying"] = _objects(map(b"".join, zip(*parts, strict=True)))
+
+
 class PendingExtras:
     """The extras of a loop that the recorder does not have yet; the caller holds the loop's lock.
 
@@ -74,15 +113,11 @@ class PendingExtras:
     def __init__(
         self, recorder: Recorder, leave_out: Callable[[Exception], None], batch: tuple[int, ...] = ()
     ) -> None:
-        self._recorder = recorder
+        self._writer = ExtrasWriter(recorder)
         self._leave_out = leave_out
         self._batch = batch
         self._n = batch[0] if batch else 1
         self._taken = recorder.steps
-        self._described: dict[str, Description] = {}
-        """The description of each name's values of one environment."""
-        self._layout = ExtraLayout(-1, 0, {})
-        """The last layout that the recording has."""
         self._columns: dict[str, _Column] = {}
         self._room = 0
         """The rows that the columns hold."""
@@ -187,7 +222,7 @@ class PendingExtras:
         sizes = np.full(shape[0] * self._n, self._fixed_bytes)
         flat = {}
         for name, value in values.items():
-            column = self._described[name]
+            column = self._writer.described[name]
             whole = _values(name, value, shape)
             if leaf_dtype(column) is None:
                 flat[name] = _objects([encoded(column, item) for item in _listed(whole, shape)])
@@ -209,11 +244,10 @@ class PendingExtras:
         self._phase = phase
         count = len(next(iter(values.values())))
         first = self._taken[phase] + rows.pending - count
-        columns = {
-            name: values.get(name, blank_extras(column, count)) for name, column in self._described.items()
-        }
-        given = {name: np.full(count, name in values) for name in self._columns}
-        self._send(np.arange(first, first + count), columns, given)
+        self._writer.put(
+            phase, np.arange(first, first + count), values, dict.fromkeys(values, np.ones(count, np.bool_))
+        )
+        self._final[phase] = first + count - 1
 
     def _grow(self, row: int, values: Any, lead: tuple[int, ...] | None = None) -> Mapping[str, object]:
         """Add the names that are new, and let arrays vary in length that have another one for the first time.
@@ -229,18 +263,18 @@ class PendingExtras:
             return {}
         described, size = self._descriptions(values, self._batch if lead is None else lead)
         fitting = {name: value for name, value in values.items() if name in described}
-        described = self._described | described
-        if described == self._described:
+        described = self._writer.described | described
+        if described == self._writer.described:
             return fitting
         self._write(row)  # with the names so far, which begins a layout if they are new
-        if self._layout.number + 1 == schema.MAX_LAYOUTS:
-            changed = [name for name in fitting if self._described.get(name) != described[name]]
+        if self._writer.layout.number + 1 == schema.MAX_LAYOUTS:
+            changed = [name for name in fitting if self._writer.described.get(name) != described[name]]
             self._leave_out(_too_many(changed[0]))
             return {name: value for name, value in fitting.items() if name not in changed}
         if self._steps:
-            self._partial.setdefault(0, set(self._described))
+            self._partial.setdefault(0, set(self._writer.described))
         self._fixed_bytes = size
-        self._described = described
+        self._writer.described = described
         width = row_dtype({"type": "Dict", "spaces": described}).itemsize * self._n
         self._room = self._max_rows = max(1, min(_MAX_ROWS, _MAX_BYTES // width))
         left = len(self._steps)
@@ -264,13 +298,13 @@ class PendingExtras:
         described = dict[str, Description]()
         size = self._fixed_bytes
         for name, value in values.items():
-            known = self._described.get(name)
+            known = self._writer.described.get(name)
             try:
                 needed = _needed(name, known, value, lead)
                 larger = size + _fixed_size(needed) - _fixed_size(known)
                 if larger > MAX_EXTRA_BYTES:
                     raise _too_large(name, larger)
-                if len({*self._described, *described, name}) > MAX_NAMES:
+                if len({*self._writer.described, *described, name}) > MAX_NAMES:
                     raise _too_many(name)
             except ConfigError as error:
                 self._leave_out(error)
@@ -298,7 +332,7 @@ class PendingExtras:
             _OtherValues: it has another dtype or shape than the column.
             ConfigError: it cannot be recorded.
         """
-        column, description, batch = self._columns[name], self._described[name], self._batch
+        column, description, batch = self._columns[name], self._writer.described[name], self._batch
         values = _values(name, value, batch)
         if column.dtype is not None:
             if isinstance(values, list) or values.shape != column.shape:
@@ -345,7 +379,8 @@ class PendingExtras:
         for name, column in self._columns.items():
             columns[name] = column.values[:n].reshape(-1, *column.shape[len(self._batch) :])
         steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
-        self._send(steps, columns, given)
+        self._writer.put(self._phase, steps, columns, given)
+        self._final[self._phase] = int(steps[-1])
         del self._steps[:n]
         left = len(self._steps)
         for column in self._columns.values():
@@ -354,18 +389,6 @@ class PendingExtras:
         self._max_rows = self._room
         self._held = 0
         self._held_row -= n
-
-    def _send(self, steps: Ints, columns: Mapping[str, Array], given: Mapping[str, Flags]) -> None:
-        """Hand the values with these steps, and whether each was given, to the recorder."""
-        recorder = self._recorder
-        # The steps of the other phase came before all of these.
-        first = recorder.position - recorder.steps[self._phase] + 1
-        if self._layout.columns != self._described:
-            position = first + int(steps[0])
-            self._layout = begin_layout(recorder, self._layout.number + 1, self._described, position)
-        positions = (steps + first).astype(np.uint64)
-        put_extras(recorder, self._phase, self._layout, steps, positions, columns, given)
-        self._final[self._phase] = int(steps[-1])
 
     def _given(self, n: int) -> dict[str, Flags]:
         """Return whether each environment's step has a value, by name, in n rows; blank those without one."""
@@ -379,51 +402,9 @@ class PendingExtras:
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
 
-def begin_layout(
-    recorder: Recorder, number: int, columns: Mapping[str, Description], position: int
-) -> ExtraLayout:
-    """Record the names of extras from a position on."""
-    layout = ExtraLayout(number, position * schema.STEP_NANOSECONDS, columns)
-    recorder.append(schema.EXTRA_COLUMNS_TOPIC, encode(schema.EXTRA_COLUMNS, layout.fields), position)
-    recorder.begin_extras(number, layout.message)
-    return layout
-
-
-def put_extras(
-    recorder: Recorder,
-    phase: str,
-    layout: ExtraLayout,
-    steps: Ints,
-    positions: Unsigned,
-    columns: Mapping[str, Array],
-    given: Mapping[str, Flags],
-) -> None:
-    """Record the extras of steps, given by number and position.
-
-    Args:
-        columns: the values of each name; values of varying size as bytes.
-    """
-    varying = layout.varying["spaces"]
-    for block, part in recorder.fill(schema.extra_topic(phase, layout.number), positions):
-        block["step"] = steps[part]
-        for name in layout.columns:
-            block["given"][name] = given[name][part]
-            if name not in varying:
-                block["values"][name] = columns[name][part]
-        if varying:
-            parts = zip(*(columns[name][part].tolist() for name in varying), strict=True)
-            block["varying"] = _objects(map(b"".join, parts))
-
-
 def _objects(items: Iterable[bytes]) -> Array:
     """Return objects as an array."""
     return np.fromiter(items, object)
-
-
-def blank_extras(description: Description, count: int) -> Array:
-    """Return values that stand where none are given."""
-    dtype = leaf_dtype(description)
-    return _objects([NOTHING] * count) if dtype is None else np.zeros(count, dtype)
 
 
 def _fixed_size(description: Description | None) -> int:

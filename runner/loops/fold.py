@@ -26,7 +26,7 @@ from runner.client.outbox import forget_upload
 from runner.config.loading import recorded_packing
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Copied
-from runner.loops.extras import begin_layout, blank_extras, put_extras
+from runner.loops.extras import ExtrasWriter
 from runner.loops.outcomes import Outcomes
 from runner.loops.shard_sources import PHASES, UNIT, Source, open_sources
 from runner.loops.step_buffer import StepBuffer
@@ -35,6 +35,7 @@ from runner.recording.extras import (
     MAX_EXTRA_BYTES,
     MAX_NAME_LENGTH,
     MAX_NAMES,
+    NOTHING,
     ExtraLayout,
     encoded,
     united,
@@ -331,8 +332,7 @@ class _Fold:
             unit["new_episode"] = begun[phase]
             for steps, numbers in source.steps(phase, unit):
                 self.content.take(topics.steps, steps)
-                position = recorder.position + buffer.pending
-                read[topics.extras.name] += extras.copy(source, phase, numbers, buffer.progress[0], position)
+                read[topics.extras.name] += extras.copy(source, phase, numbers, buffer.progress[0])
                 buffer.copy(steps, environment)
                 begun[phase] += int(np.count_nonzero(steps["t"] == 0))
                 copied_steps += len(numbers)
@@ -510,7 +510,6 @@ class CopiedExtras:
     """The extras of all processes, with the names of all of them."""
 
     def __init__(self, recorder: Recorder, sources: Sequence[Source]) -> None:
-        self._recorder = recorder
         columns: dict[str, Description] = {}
         self._names: dict[tuple[int, str], str] = {}
         """The names in the run, by number of the process and the name there."""
@@ -523,21 +522,21 @@ class CopiedExtras:
                     new = f"{name} ({source.name})"[:MAX_NAME_LENGTH]
                     both = united(columns.get(new, column), column) or column
                 columns[new], self._names[source.number, name] = both, new
-        self._layout = ExtraLayout(0, 0, columns)
-        if len(columns) > MAX_NAMES or self._layout.values.itemsize > MAX_EXTRA_BYTES:
+        size = ExtraLayout(0, 0, columns).values.itemsize
+        if len(columns) > MAX_NAMES or size > MAX_EXTRA_BYTES:
             raise ConfigError(
-                f"extras: found {len(columns)} names and {self._layout.values.itemsize:,} bytes a step in "
-                f"all shards, expected at most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
+                f"extras: found {len(columns)} names and {size:,} bytes a step in all shards, expected at "
+                f"most {MAX_NAMES} and {MAX_EXTRA_BYTES:,}"
             )
-        self._is_described = False
+        self._writer = ExtrasWriter(recorder)
+        self._writer.described = columns
 
-    def copy(self, source: Source, phase: str, numbers: Ints, new_step: int, new_position: int) -> int:
+    def copy(self, source: Source, phase: str, numbers: Ints, new_step: int) -> int:
         """Copy the extras of some steps, which follow each other in the run; return how many had some.
 
         Args:
             numbers: of the steps, as their process counted them.
             new_step: the number of the first step in the run.
-            new_position: the steps of the run before it.
         """
         extras = source.recording.phase(phase).extras
         if not extras:
@@ -548,21 +547,13 @@ class CopiedExtras:
         rows = np.flatnonzero(np.logical_or.reduce(list(flags.values())))
         if not len(rows):
             return 0
-        if not self._is_described:
-            begin_layout(self._recorder, 0, self._layout.columns, new_position + int(rows[0]) + 1)
-            self._is_described = True
-        columns, given = {}, {}
-        for name, column in self._layout.columns.items():
-            given[name] = flags.get(name, np.zeros(n, np.bool_))[rows]
-            columns[name] = blank_extras(column, len(rows))
-            if name not in named:
-                continue
-            values = named[name].data[rows]
-            if leaf_dtype(column) is not None:
-                columns[name][:] = values
-                continue
-            for k in np.flatnonzero(given[name]).tolist():
-                columns[name][k] = encoded(column, values[k])
-        positions = (new_position + rows + 1).astype(np.uint64)
-        put_extras(self._recorder, phase, self._layout, new_step + rows, positions, columns, given)
+        given = {name: are_given[rows] for name, are_given in flags.items()}
+        columns = {name: values.data[rows] for name, values in named.items()}
+        for name, values in columns.items():
+            column = self._writer.described[name]
+            if leaf_dtype(column) is None:
+                pairs = zip(values, given[name], strict=True)
+                data = [encoded(column, value) if is_given else NOTHING for value, is_given in pairs]
+                columns[name] = np.fromiter(data, object)
+        self._writer.put(phase, new_step + rows, columns, given)
         return len(rows)
