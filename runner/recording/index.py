@@ -23,7 +23,6 @@ from mcap.records import (
     AttachmentIndex,
     Channel,
     DataEnd,
-    Footer,
     Header,
     MetadataIndex,
     Schema,
@@ -267,13 +266,23 @@ class Index:
             self.add(raw)
             self.end = raw.end
 
-    def _take_summary(self, stream: BinaryIO, footer: Footer) -> None:
-        """Add the records of the summary section, after comparing its checksum."""
-        start, end = footer.summary_start, self.size - _TAIL.size
-        if not len(MAGIC) < start <= footer.summary_offset_start <= end:
+    def take_summary(self, stream: BinaryIO) -> bool:
+        """Add the records of the summary section, after comparing its checksum; return whether there is one.
+
+        Raises:
+            RecordingError: it is damaged.
+        """
+        end = self.size - _TAIL.size
+        if end < len(MAGIC):
+            return False
+        stream.seek(end)
+        opcode, length, start, offsets_start, crc, magic = _TAIL.unpack(stream.read(_TAIL.size))
+        if (opcode, length, magic) != (Opcode.FOOTER, _FOOTER_BODY_BYTES, MAGIC):
+            return False
+        if not len(MAGIC) < start <= offsets_start <= end:
             raise RecordingError(f"the footer points to a summary at {start}, outside the file; try `repair`")
-        fields = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, footer.summary_offset_start)
-        if crc32(fields, checksum(stream, start, end)) != footer.summary_crc:
+        fields = _FOOTER_HEAD.pack(Opcode.FOOTER, _FOOTER_BODY_BYTES, start, offsets_start)
+        if crc32(fields, checksum(stream, start, end)) != crc:
             raise RecordingError(f"the summary at {start} does not match its checksum; try `repair`")
         self.finished = True
         self.end = start
@@ -282,6 +291,7 @@ class Index:
             start = raw.end
         if start != end:
             raise RecordingError(f"found {end - start} stray bytes at {start}, expected a record")
+        return True
 
     def declare(self, beginning: Beginning) -> None:
         """Add schemas and channels that are written."""
@@ -305,10 +315,22 @@ class Index:
             # All but its times, the lengths of its texts and data, and its checksum.
             size = length - RECORD_HEAD.size - 2 * 8 - 2 * 4 - len(f"{name}{kind}".encode()) - 8 - 4
             attachments.append(AttachmentIndex(offset, length, 0, 0, size, name, kind))
+        chunks, counts = self.chunks.columns, self.count_messages()
+        statistics = Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=counts,
+            chunk_count=len(chunks),
+            message_count=sum(counts.values()),
+            metadata_count=len(self.metadata),
+            message_start_time=int(chunks["start_time"].min()) if len(chunks) else 0,
+            message_end_time=int(chunks["end_time"].max(initial=0)),
+            schema_count=len(self.schemas),
+        )
         groups = [
             (Opcode.SCHEMA, self.schema_records),
             (Opcode.CHANNEL, self.channel_records),
-            (Opcode.STATISTICS, bytes_of(self._statistics())),
+            (Opcode.STATISTICS, bytes_of(statistics)),
             (Opcode.CHUNK_INDEX, b"".join(map(_chunk_index, self.chunks))),
             (Opcode.ATTACHMENT_INDEX, bytes_of(*attachments)),
             (Opcode.METADATA_INDEX, bytes_of(*metadata)),
@@ -331,21 +353,6 @@ class Index:
             for channel in np.unique(chunks["channel"]).tolist()
         }
 
-    def _statistics(self) -> Statistics:
-        chunks = self.chunks.columns
-        counts = self.count_messages()
-        return Statistics(
-            attachment_count=len(self.attachments),
-            channel_count=len(self.channels),
-            channel_message_counts=counts,
-            chunk_count=len(chunks),
-            message_count=sum(counts.values()),
-            metadata_count=len(self.metadata),
-            message_start_time=int(chunks["start_time"].min()) if len(chunks) else 0,
-            message_end_time=int(chunks["end_time"].max(initial=0)),
-            schema_count=len(self.schemas),
-        )
-
 
 def read_index(stream: BinaryIO, path: str) -> Index:
     """Return the index of a recording: by its summary if it is finished, else by walking its records.
@@ -356,11 +363,8 @@ def read_index(stream: BinaryIO, path: str) -> Index:
     index = Index(size=stream.seek(0, 2))
     try:
         check_beginning(stream)
-        footer = _footer(stream, index.size)
-        if footer is None:
+        if not index.take_summary(stream):
             index.take_records(stream)
-        else:
-            index._take_summary(stream, footer)
         if not index.channels:
             raise RecordingError("the recording was cut off before its first message")
     except RecordingError as error:
@@ -435,16 +439,6 @@ def _beginning(messages: Mapping[Topic, MessageType]) -> Beginning:
     ]
     channels = [*map(channel_of, sorted(messages, key=attrgetter("channel")))]
     return Beginning(schemas, channels, bytes_of(*schemas), bytes_of(*channels))
-
-
-def _footer(stream: BinaryIO, size: int) -> Footer | None:
-    """Return the footer if the file ends as a finished one does."""
-    if size < _TAIL.size + len(MAGIC):
-        return None
-    stream.seek(size - _TAIL.size)
-    opcode, length, start, offsets, crc, magic = _TAIL.unpack(stream.read(_TAIL.size))
-    is_footer = (opcode, length, magic) == (Opcode.FOOTER, _FOOTER_BODY_BYTES, MAGIC)
-    return Footer(start, offsets, crc) if is_footer else None
 
 
 def _chunk_entry(raw: RawRecord) -> ChunkEntry:

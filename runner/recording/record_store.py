@@ -27,7 +27,8 @@ from runner.recording.records import (
     MetadataRecord,
     Place,
     RawRecord,
-    first_channel,
+    chunk_head,
+    first_message,
     read_record,
     unpack_chunk,
 )
@@ -173,7 +174,8 @@ class RecordStore:
         chunks = self.index.chunks
         channels: NDArray[np.uint16] = chunks.columns["channel"].copy()
         for k in np.flatnonzero(channels == 0).tolist():  # the file was cut off before the chunk's index
-            channels[k] = first_channel(self.chunk_body(chunks[k]), self.where(chunks[k]))
+            body, where = self.chunk_body(chunks[k]), self.where(chunks[k])
+            _, channels[k] = first_message(body, chunk_head(body, len(body), where), where)
         for k in np.flatnonzero(~np.isin(channels, list(self.index.channels))).tolist():
             raise RecordingError(
                 f"{self.where(chunks[k])}: found messages of channel {channels[k]}, which the recording "

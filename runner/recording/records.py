@@ -356,39 +356,24 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
     view = memoryview(body)
     head = chunk_head(view, len(view), where)
     if head.uncompressed_size > _PLAIN_BYTES:
-        _check_message_count(view, head, where)
+        # A few kilobytes can unpack to the largest chunk there is; thousands of them would keep a reader busy
+        # for minutes before their messages were found to make no sense.
+        length, channel = first_message(view, head, where)
+        messages = head.uncompressed_size // (RECORD_HEAD.size + length)
+        topic = schema.TOPIC_OF.get(channel)
+        is_row = topic in schema.ROW_TOPICS or (topic is not None and topic.message is schema.EXTRA)
+        if is_row and messages > MAX_CHUNK_STEPS:
+            raise RecordingError(
+                f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most"
+            )
     records = decompress(view[head.data_at :], head.compression, head.uncompressed_size, where)
     if crc32(records) != head.crc:
         raise RecordingError(f"{where}: its content does not match its checksum")
     return head, records
 
 
-def _check_message_count(body: memoryview, head: ChunkHead, where: str) -> None:
-    """Check that a chunk can hold no more messages than a recorder writes, by its first message alone.
-
-    A few kilobytes can unpack to the largest chunk there is; thousands of them would keep a reader busy for
-    minutes before their messages were found to make no sense.
-
-    Raises:
-        RecordingError: it declares more, or holds no message.
-    """
-    length, channel = _first_message(body, head, where)
-    messages = head.uncompressed_size // (RECORD_HEAD.size + length)
-    topic = schema.TOPIC_OF.get(channel)
-    is_row = topic in schema.ROW_TOPICS or (topic is not None and topic.message is schema.EXTRA)
-    if is_row and messages > MAX_CHUNK_STEPS:
-        raise RecordingError(f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most")
-
-
-def first_channel(body: bytes | memoryview, where: str) -> int:
-    """Return the channel of a chunk's first message; only that is unpacked."""
-    view = memoryview(body)
-    _, channel = _first_message(view, chunk_head(view, len(view), where), where)
-    return channel
-
-
-def _first_message(body: memoryview, head: ChunkHead, where: str) -> tuple[int, int]:
-    """Return the record length and the channel of a chunk's first message."""
+def first_message(body: memoryview, head: ChunkHead, where: str) -> tuple[int, int]:
+    """Return the record length and the channel of a chunk's first message; only that is unpacked."""
     beginning, _ = _unpack(body[head.data_at :], head.compression, MESSAGE_HEAD.size, where)
     if len(beginning) < MESSAGE_HEAD.size:
         raise RecordingError(f"{where}: holds no whole message")
@@ -416,26 +401,6 @@ def _unpack(data: bytes | memoryview, compression: str, size: int, where: str) -
         raise RecordingError(f"{where}: the chunk cannot be decompressed ({error})") from error
 
 
-def _read_chunk(body: bytes, offset: int) -> ReadChunk:
-    """Return the chunk in a record, after comparing its checksum and looking at each of its messages."""
-    where = f"chunk at {offset}"
-    head, records = unpack_chunk(body, where)
-    channel, times, offsets = checked_messages(records, where)
-    length = RECORD_HEAD.size + len(body)
-    size = head.uncompressed_size
-    span = head.start_time, head.end_time
-    entry = ChunkEntry(offset, length, size, *span, channel, head.compression.encode(), len(times))
-    return ReadChunk(body, entry, records, times, offsets)
-
-
-def _have_one_size(records: bytes, size: int) -> bool:
-    """Return whether messages follow one another that have the size of the first."""
-    if size < HEADER_BYTES or len(records) % size:
-        return False
-    heads = np.frombuffer(records, np.uint8).reshape(-1, size)[:, : RECORD_HEAD.size]
-    return bool((heads == heads[0]).all())
-
-
 def checked_messages(records: bytes, where: str) -> tuple[int, Unsigned, Unsigned]:
     """Return channel, times and offsets of a chunk's messages.
 
@@ -448,9 +413,11 @@ def checked_messages(records: bytes, where: str) -> tuple[int, Unsigned, Unsigne
     if channel not in schema.TOPIC_OF:
         raise RecordingError(f"{where}: found messages of channel {channel}, which no recording has")
     size = RECORD_HEAD.size + length
-    if _have_one_size(records, size):
+    data = np.frombuffer(records, np.uint8)
+    rows = data.reshape(-1, size) if size >= HEADER_BYTES and not len(records) % size else None
+    if rows is not None and (rows[:, : RECORD_HEAD.size] == rows[0, : RECORD_HEAD.size]).all():
         offsets = np.arange(0, len(records), size, dtype=np.uint64)
-        heads = np.frombuffer(records, np.uint8).reshape(-1, size)[:, :HEADER_BYTES]
+        heads = rows[:, :HEADER_BYTES]
     else:
         starts = []
         at = 0
@@ -461,7 +428,7 @@ def checked_messages(records: bytes, where: str) -> tuple[int, Unsigned, Unsigne
         if at != len(records):
             raise RecordingError(f"{where}: its messages do not fill it")
         offsets = np.array(starts, dtype=np.uint64)
-        heads = sliding_window_view(np.frombuffer(records, np.uint8), HEADER_BYTES)[starts]
+        heads = sliding_window_view(data, HEADER_BYTES)[starts]
     block = heads.view(np.dtype(HEADER))[:, 0]
     lengths = np.diff(offsets, append=np.uint64(len(records))) - np.uint64(RECORD_HEAD.size)
     as_written = (
@@ -503,7 +470,12 @@ def read_record(raw: RawRecord) -> Record | RawRecord:
     """
     try:
         if raw.kind == Opcode.CHUNK:
-            return _read_chunk(raw.body, raw.offset)
+            where = f"chunk at {raw.offset}"
+            head, records = unpack_chunk(raw.body, where)
+            channel, times, offsets = checked_messages(records, where)
+            size, span = head.uncompressed_size, (head.start_time, head.end_time)
+            entry = ChunkEntry(*raw.place, size, *span, channel, head.compression.encode(), len(times))
+            return ReadChunk(raw.body, entry, records, times, offsets)
         if raw.kind == Opcode.ATTACHMENT:
             return attachment_of(raw.body, raw.offset)
         return metadata_of(raw.body) if raw.kind == Opcode.METADATA else raw

@@ -91,7 +91,11 @@ def repair(path: Path, report: Report = lambda *_: None, stated: Summary | None 
     try:
         fresh.unlink(missing_ok=True)
         done = _salvage(path, fresh, report, counts)
-        _read_back(fresh, done, report)
+        check_integrity(fresh, report)
+        with open_recording(fresh) as recording:
+            for name, found in _stated_counts(recording).items():
+                if found != (expected := done.kept.get(name, 0)):
+                    raise RecordingError(f"{fresh}: found {found} messages of {name}, expected {expected}.")
         if done.lost:
             number = 1
             while (free := path.with_name(f"{path.stem}.damaged-{number}{path.suffix}")).exists():
@@ -151,19 +155,6 @@ def _stated_counts(recording: Recording) -> dict[str, int]:
     return counts
 
 
-def _read_back(fresh: Path, done: Repair, report: Report) -> None:
-    """Check every byte of the new file, and count its messages.
-
-    Raises:
-        RecordingError: it is not as it should be; the old file stays.
-    """
-    check_integrity(fresh, report)
-    with open_recording(fresh) as recording:
-        for name, found in _stated_counts(recording).items():
-            if found != (expected := done.kept.get(name, 0)):
-                raise RecordingError(f"{fresh}: found {found} messages of {name}, expected {expected}.")
-
-
 class _Salvage:
     """Copies the good records of a damaged file into a new one.
 
@@ -192,19 +183,16 @@ class _Salvage:
                 if isinstance(record, ReadChunk):
                     self._take_chunk(file, record)
                 elif isinstance(record, MetadataRecord) and record.name == "result":
-                    self._take_result(record.entries)
+                    problems: list[str] = []
+                    with contextlib.suppress(RecordingError):  # one without sense is worth as much as none
+                        entry = json_object(record.entries.get("json"), "the metadata 'result'")
+                        result = parse_result(entry, problems)
+                        if not problems:
+                            self._counts, self._result = _recorded_counts(result), record.entries
                 elif record.name != "repair":
                     file.copy(record)
             self._finish(file)
         return self._done
-
-    def _take_result(self, entries: dict[str, str]) -> None:
-        problems: list[str] = []
-        with contextlib.suppress(RecordingError):  # one that makes no sense is worth as much as none
-            result = parse_result(json_object(entries.get("json"), "the metadata 'result'"), problems)
-            if not problems:
-                self._counts = _recorded_counts(result)
-                self._result = entries
 
     def _take_chunk(self, file: RecordingFile, chunk: ReadChunk) -> None:
         """Copy a good chunk; note a hole before it."""
@@ -255,22 +243,16 @@ class _Salvage:
         for name, holes in _missing(self._counts, self._next).items():
             done.lost.setdefault(name, []).extend(holes)
         done.lost_bytes = self._damaged.lost_bytes
-        if self._damaged.torn_chunk is not None:
-            done.torn_steps = self._steps_in(self._damaged.torn_chunk)
+        torn, dtype = self._damaged.torn_chunk, self._layout.dtype(schema.TRAIN_STEP)
+        if len(torn) >= _CHUNK_TIMES_AND_SIZE.size and dtype is not None:
+            start, end, size = _CHUNK_TIMES_AND_SIZE.unpack_from(torn)
+            ticks = (end - start) // schema.STEP_NANOSECONDS + 1  # a step takes one
+            done.torn_steps = ticks if size == ticks * dtype.itemsize else 0
         if done.lost:
             file.add_metadata("repair", {"json": json.dumps({"lost": done.lost}, sort_keys=True)})
         elif self._result is not None:
             file.add_metadata("result", self._result)
         file.finish()
-
-    def _steps_in(self, torn: bytes) -> int:
-        """Return how many steps a chunk that was cut off held, by its head: a step takes one tick."""
-        dtype = self._layout.dtype(schema.TRAIN_STEP)
-        if len(torn) < _CHUNK_TIMES_AND_SIZE.size or dtype is None:
-            return 0
-        start, end, size = _CHUNK_TIMES_AND_SIZE.unpack_from(torn)
-        ticks = (end - start) // schema.STEP_NANOSECONDS + 1
-        return ticks if size == ticks * dtype.itemsize else 0
 
 
 def _missing(stated: Mapping[str, int], found: Mapping[str, int]) -> LostRanges:
@@ -314,8 +296,8 @@ class DamagedFile:
         self._allowance = self.size * _MAX_WASTED_RATIO + _ALWAYS_WASTED
         self.lost_bytes = 0
         """Bytes that belong to no good record, as far as the file was read."""
-        self.torn_chunk: bytes | None = None
-        """The beginning of a chunk that was cut off at the end of the file, after its head."""
+        self.torn_chunk = b""
+        """The beginning of a chunk that was cut off at the end of the file, after its head; else empty."""
         if not self.size:
             raise RecordingError(f"{path}: found an empty file, expected a recording.")
         if self._read(0, len(MAGIC)) != MAGIC:
