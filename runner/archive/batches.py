@@ -154,7 +154,7 @@ class Batches:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self.shape = Shape(recording, extra_layouts(recording))
+        self.shape = Shape(recording, list(extra_layouts(recording).values()))
         self._hashes = {topic.name: blake3() for topic in recording.topics}
         self._counts = dict.fromkeys(self._hashes, 0)
 

@@ -21,7 +21,7 @@ from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, is_inside
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.description import RunDescription
-from runner.recording.extras import read_layouts
+from runner.recording.extras import ExtraNames
 from runner.recording.metadata import check_run, json_object
 from runner.recording.records import MAX_UNPACKED_RATIO
 from runner.recording.schema import MAX_LAYOUTS, STEP_NANOSECONDS, Topic
@@ -129,7 +129,8 @@ class Archive(RunDescription):
             for batch in self.batches(table.name, table.columns, count, MAX_LAYOUTS)
             for row in batch.to_pylist()
         ]
-        return Shape(self, read_layouts(columns, str(self.folder / table.name)))
+        names = ExtraNames(str(self.folder / table.name), columns)
+        return Shape(self, list(names.layouts.values()))
 
     def attachment(self, name: str) -> bytes:
         """Return the data of an attachment.

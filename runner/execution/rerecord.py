@@ -229,7 +229,7 @@ def _rerecord_loop(path: Path, fresh: Path, trust: bool) -> None:
             path,
             fresh,
             _with_all_steps,
-            left_out=[topic.name for topic in ACTION_TOPICS.values()],
+            left_out=[topic.name for topic in ACTION_TOPICS],
             add=lambda file: _add_steps(recording, file, trust),
         )
 
@@ -243,7 +243,7 @@ def _with_all_steps(name: str, entries: dict[str, str]) -> dict[str, str]:
         values["recording"]["steps"] = "all"
     else:
         values["steps_recorded"] = True
-        for topic in ACTION_TOPICS.values():
+        for topic in ACTION_TOPICS:
             values["messages"].pop(topic.name, None)
     return entries | {"json": json.dumps(values, sort_keys=True)}
 

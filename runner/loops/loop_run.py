@@ -199,7 +199,7 @@ class LoopRun:
     def _compact(self) -> None:
         """Write a recording of actions alone again, in fewer chunks, if there are several."""
         counts = self.recorder.counts
-        if any(counts.get(topic.name, 0) > 1 for topic in ACTION_TOPICS.values()):
+        if any(counts.get(topic.name, 0) > 1 for topic in ACTION_TOPICS):
             with contextlib.suppress(OSError):  # without the space for both, the recording stays as it is
                 self.file, messages = compacted(self.file, self._options.packing.packing)
                 counts |= messages

@@ -35,7 +35,7 @@ from runner.recording.spaces import Description, encode_bytes, encode_text, leaf
 from runner.recording.spaces import decode as decode_value
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.writer import RecordingFile
-from runner.util.arrays import Array, DType, Flags, Ints, MaskedArray, Records, zeros
+from runner.util.arrays import Array, DType, Ints, MaskedArray, Records, zeros
 from runner.util.values import is_whole
 
 MAX_NAMES: Final = 256
@@ -139,39 +139,6 @@ def united(first: Description, second: Description) -> Description | None:
     return lengthened(column) if is_alike else None
 
 
-def read_layout(time: int, fields: Message, last: ExtraLayout | None, where: str) -> ExtraLayout:
-    """Return the layout that follows the last one of a recording; after a repair, numbers may be missing.
-
-    Args:
-        time: log time of its `ExtraColumns`, in nanoseconds.
-        fields: the fields of that message.
-        last: None for the first layout.
-
-    Raises:
-        RecordingError: it is not what a recorder writes.
-    """
-    what = f"{where}: the names of extras at {time} ns"
-    layout = ExtraLayout(fields["layout"], time, _columns_of(json_object(fields["json"], what), what))
-    if not is_whole(layout.number, 0, schema.MAX_LAYOUTS - 1):
-        raise RecordingError(f"{what}: found layout {layout.number}, expected {schema.MAX_LAYOUTS} at most.")
-    if last is not None:
-        same = list(layout.columns)[: len(last.columns)] == list(last.columns) and all(
-            column == united(before, column) and column.get("dtype") == before.get("dtype")
-            for before, column in zip(last.columns.values(), layout.columns.values(), strict=False)
-        )
-        if not same or layout.number <= last.number or time <= last.start_time:
-            raise RecordingError(f"{what} do not continue those before them.")
-    return layout
-
-
-def read_layouts(columns: Iterable[tuple[int, Message]], where: str) -> list[ExtraLayout]:
-    """Return the layouts of a recording, from the log time and the fields of each, as `read_layout` does."""
-    layouts: list[ExtraLayout] = []
-    for time, fields in columns:
-        layouts.append(read_layout(time, fields, layouts[-1] if layouts else None, where))
-    return layouts
-
-
 def _columns_of(description: dict[str, object], what: str) -> dict[str, Description]:
     parts = description.get("spaces")
     if description.get("type") != "Dict" or not isinstance(parts, dict) or not 0 < len(parts) <= MAX_NAMES:
@@ -189,13 +156,18 @@ def _columns_of(description: dict[str, object], what: str) -> dict[str, Descript
 
 
 class ExtraNames:
-    """The layouts of extras, as the chunks of a recording name them, one after the other."""
+    """The layouts of extras, as a recording names them, one after the other.
 
-    def __init__(self, where: str) -> None:
+    Args:
+        columns: log time, in nanoseconds, and fields of each `ExtraColumns` read so far.
+    """
+
+    def __init__(self, where: str, columns: Iterable[tuple[int, Message]] = ()) -> None:
         self._where = where
-        self._last: ExtraLayout | None = None
         self.layouts: dict[int, ExtraLayout] = {}
         """Those named so far, by number."""
+        for time, fields in columns:
+            self._add(time, fields)
 
     def take(self, chunk: ReadChunk) -> None:
         """Take the names in a chunk of `ExtraColumns`.
@@ -204,9 +176,25 @@ class ExtraNames:
             RecordingError: they are not what a recorder writes.
         """
         for time, record in zip(chunk.times.tolist(), chunk.messages, strict=True):
-            fields = decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:])
-            self._last = read_layout(time, fields, self._last, self._where)
-            self.layouts[self._last.number] = self._last
+            self._add(time, decode(schema.EXTRA_COLUMNS, record[HEADER_BYTES:]))
+
+    def _add(self, time: int, fields: Message) -> None:
+        """Add the layout that follows the last one; after a repair, numbers may be missing."""
+        what = f"{self._where}: the names of extras at {time} ns"
+        layout = ExtraLayout(fields["layout"], time, _columns_of(json_object(fields["json"], what), what))
+        if not is_whole(layout.number, 0, schema.MAX_LAYOUTS - 1):
+            raise RecordingError(
+                f"{what}: found layout {layout.number}, expected {schema.MAX_LAYOUTS} at most."
+            )
+        if self.layouts:
+            last = next(reversed(self.layouts.values()))
+            same = list(layout.columns)[: len(last.columns)] == list(last.columns) and all(
+                column == united(before, column) and column.get("dtype") == before.get("dtype")
+                for before, column in zip(last.columns.values(), layout.columns.values(), strict=False)
+            )
+            if not same or layout.number <= last.number or time <= last.start_time:
+                raise RecordingError(f"{what} do not continue those before them.")
+        self.layouts[layout.number] = layout
 
     def of(self, chunk: ReadChunk) -> ExtraLayout | None:
         """Return the layout of a chunk of extras; None if its names are lost."""
@@ -337,7 +325,9 @@ class Extras(Mapping[str, DType]):
                         size += len(value) if isinstance(value, str) else value.nbytes
                     self._check_size(size, n)
         return {
-            name: np.ma.MaskedArray(column, np.broadcast_to(_column(~given[name], column.ndim), column.shape))
+            name: np.ma.MaskedArray(
+                column, np.broadcast_to(~given[name].reshape(-1, *[1] * (column.ndim - 1)), column.shape)
+            )
             for name, column in values.items()
         }
 
@@ -347,11 +337,6 @@ class Extras(Mapping[str, DType]):
                 f"{self._where}: the extras of {n:,} steps take {size:,} bytes, expected at most "
                 f"{MAX_READ_BYTES:,}; read them in blocks."
             )
-
-
-def _column(flags: Flags, dimensions: int) -> Flags:
-    """Return [n] flags as [n, 1, ...]."""
-    return flags.reshape(-1, *[1] * (dimensions - 1))
 
 
 def filled(values: MaskedArray) -> Array:

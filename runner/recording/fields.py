@@ -34,7 +34,6 @@ from runner.recording.spaces import (
     item_dtype,
     leaf_dtype,
     parts_of,
-    varying_length,
 )
 from runner.util.arrays import Array, DType
 
@@ -160,7 +159,7 @@ class Field:
                 data = np.frombuffer(data, dtype.base).astype(self.stored_dtype.base).tobytes()
             return self.tag + data, end
         if self.parts is None:
-            end = at + 4 + varying_length(value, at)
+            end = at + 4 + int.from_bytes(value[at : at + 4], "little")
             data = value[at + 4 : end]
             return self.heads[_is_utf8(data)] + varint(len(data)) + data, end
         pieces = []

@@ -76,12 +76,17 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
     """Change the labels of the run in a folder, under a lock, and return them.
 
     Raises:
+        RunnerError: a tag or the note is not valid.
         StorageError: the folder cannot be written.
     """
     with file_lock(folder / LABELS_FILE):
         before = read_labels(folder)
         after = change(before)
-        _check(after)
+        check_tags(after.tags)
+        if not is_utf8(after.note):
+            raise RunnerError(f"note: found {after.note[:100]!r}, expected text in UTF-8.")
+        if len(after.note) > MAX_NOTE:
+            raise RunnerError(f"note: found {len(after.note):,} characters, expected at most {MAX_NOTE:,}.")
         if after != before:
             write_object(folder / LABELS_FILE, as_json(after))
         return after
@@ -129,11 +134,3 @@ def check_tags(tags: Collection[str]) -> None:
             raise RunnerError(f"tag: found {tag!r}, expected {_TAG_EXPECTED}.")
     if len(tags) > MAX_TAGS:
         raise RunnerError(f"tag: found {len(tags)} tags, expected at most {MAX_TAGS}.")
-
-
-def _check(labels: Labels) -> None:
-    check_tags(labels.tags)
-    if not is_utf8(labels.note):
-        raise RunnerError(f"note: found {labels.note[:100]!r}, expected text in UTF-8.")
-    if len(labels.note) > MAX_NOTE:
-        raise RunnerError(f"note: found {len(labels.note):,} characters, expected at most {MAX_NOTE:,}.")

@@ -40,6 +40,24 @@ NUMBERS: Final[Mapping[int, str]] = {
     Pb.TYPE_BOOL: "?",
 }
 """The dtypes of numbers by their types."""
+MAGIC: Final = b"\x89MCAP0\r\n"
+"""The first and the last bytes of an MCAP file; `mcap.writer`, which has them too, takes 20 ms to load."""
+HEADER: Final = [
+    ("opcode", "u1"),
+    ("record_length", "<u8"),
+    ("channel_id", "<u2"),
+    ("sequence", "<u4"),
+    ("log_time", "<u8"),
+    ("publish_time", "<u8"),
+]
+"""An MCAP message record up to its data: 31 bytes. `sequence` is not used and is 0."""
+
+HEADER_BYTES: Final = np.dtype(HEADER).itemsize
+RECORD_HEAD: Final = struct.Struct("<BQ")
+"""The head of any MCAP record: opcode, and the length of its body."""
+MESSAGE: Final = int(Opcode.MESSAGE)
+MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
+"""`HEADER` for one message: opcode, length, channel, sequence, log time, publish time."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +115,7 @@ class Layout:
             if not self.has_states:
                 after = space_field(3, "next_observation", spaces["observation"])
                 types["step"] = _with_values(schema.STEP, space_field(2, "action", spaces["action"]), after)
-                more = schema.MORE_FIELDS.get(self.kind, ())
+                more = schema.AGENT_FIELDS if self.kind == "game" else ()
                 types["step"] = replace(types["step"], fields=types["step"].fields + more)
         if self.has_turns:
             turns = schema.ENVIRONMENT_OF_STEP, *types["step"].fields, schema.TAKEN
@@ -105,7 +123,7 @@ class Layout:
             types["step"] = replace(types["step"], fields=turns)
             types["episode"] = replace(types["episode"], fields=episodes)
         sizes = {"rewards": self.learners, "returns": self.learners, "events": self.events}
-        types = {name: sized(message, sizes) for name, message in types.items()}
+        types = {name: _sized(message, sizes) for name, message in types.items()}
         if not all(field.has_one_size for message in types.values() for field in message.values):
             for name, message in types.items():
                 if message.values:  # they come last, so that the rest has one size
@@ -129,43 +147,14 @@ def _with_values(message: MessageType, *values: Field) -> MessageType:
     return replace(message, fields=(*values, *others))
 
 
-def sized(message: MessageType, sizes: Mapping[str, int | DType]) -> MessageType:
-    """Return a message with the dtypes of its numbers.
-
-    Args:
-        sizes: of each repeated field the number of elements, of each field of bytes its dtype.
-    """
-
-    def with_dtype(field: Field) -> Field:
-        size = sizes.get(field.name)
-        if isinstance(size, np.dtype):
-            return replace(field, dtype=size)
-        if field.is_value or field.kind not in NUMBERS:
-            return field
-        number = NUMBERS[field.kind]
-        return replace(field, dtype=np.dtype((number, (size,)) if field.repeated else number))
-
-    return replace(message, fields=tuple(map(with_dtype, message.fields)))
-
-
-MAGIC: Final = b"\x89MCAP0\r\n"
-"""The first and the last bytes of an MCAP file; `mcap.writer`, which has them too, takes 20 ms to load."""
-HEADER: Final = [
-    ("opcode", "u1"),
-    ("record_length", "<u8"),
-    ("channel_id", "<u2"),
-    ("sequence", "<u4"),
-    ("log_time", "<u8"),
-    ("publish_time", "<u8"),
-]
-"""An MCAP message record up to its data: 31 bytes. `sequence` is not used and is 0."""
-
-HEADER_BYTES: Final = np.dtype(HEADER).itemsize
-RECORD_HEAD: Final = struct.Struct("<BQ")
-"""The head of any MCAP record: opcode, and the length of its body."""
-MESSAGE: Final = int(Opcode.MESSAGE)
-MESSAGE_HEAD: Final = struct.Struct("<BQHIQQ")
-"""`HEADER` for one message: opcode, length, channel, sequence, log time, publish time."""
+def _sized(message: MessageType, sizes: Mapping[str, int]) -> MessageType:
+    """Return a message with the dtypes of its numbers; `sizes` has the lengths of repeated ones."""
+    fields = []
+    for field in message.fields:
+        number = None if field.is_value else NUMBERS.get(field.kind)
+        shape = (sizes.get(field.name),) if field.repeated else ()
+        fields.append(field if number is None else replace(field, dtype=np.dtype((number, shape))))
+    return replace(message, fields=tuple(fields))
 
 
 @lru_cache(256)

@@ -292,7 +292,11 @@ def decode(message: MessageType, payload: bytes) -> Message:
     """
     if message.values:
         row = decode_rows(message, [(0, payload)])[0]
-        return {field.name: _plain(row[field.name]) for field in message.fields}
+        return {
+            field.name: value if isinstance(value, bytes) else value.tolist()
+            for field in message.fields
+            for value in (row[field.name],)
+        }
     try:
         parsed = message_class(message).FromString(payload)
     except DecodeError as error:
@@ -302,10 +306,6 @@ def decode(message: MessageType, payload: bytes) -> Message:
         for field in message.fields
         for value in (getattr(parsed, field.stored_name),)
     }
-
-
-def _plain(value: Any) -> Any:
-    return value if isinstance(value, bytes) else value.tolist()
 
 
 def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:

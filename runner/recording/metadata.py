@@ -344,7 +344,7 @@ def write_description(
 ) -> None:
     """Write what makes a recording self-contained; `maker` is how a loop's environment was made."""
     with writing(file):
-        file.begin(layout_of_run(run, str(file.path)))
+        file.begin(beginning_of(layout_of_run(run, str(file.path))))
         file.add_metadata("run", run)
         file.add_metadata("config", _json_entry(config))
         file.add_metadata("provenance", packed_provenance(provenance))

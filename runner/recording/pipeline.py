@@ -246,21 +246,18 @@ class Pipeline:
         if work.encode is not None:
             self._group.append(work.encode() if encoded is None else encoded.result())
         if self._group and (work.topic is None or not self._grouped):
-            self._write_group(self._file)
-
-    def _write_group(self, file: RecordingFile) -> None:
-        group, self._group = self._group, []
-        try:
-            file.add_chunks(sorted(group, key=_rank))
-        except OSError:
-            file.cut_back()
-            if self._is_empty:  # a part of the first group is better than nothing
-                with contextlib.suppress(OSError):
-                    for chunk in group:
-                        file.add_chunk(chunk)
-                file.cut_back()
-            raise
-        self._is_empty = False
+            group, self._group = self._group, []
+            try:
+                self._file.add_chunks(sorted(group, key=_rank))
+            except OSError:
+                self._file.cut_back()
+                if self._is_empty:  # a part of the first group is better than nothing
+                    with contextlib.suppress(OSError):
+                        for chunk in group:
+                            self._file.add_chunk(chunk)
+                    self._file.cut_back()
+                raise
+            self._is_empty = False
 
 
 def _rank(chunk: Chunk) -> int:

@@ -26,7 +26,7 @@ from runner.environments.naming import action_names, actions_in_words
 from runner.errors import NotInRecording, RecordingError
 from runner.recording import schema
 from runner.recording.description import RunDescription, environment_count
-from runner.recording.extras import ExtraLayout, Extras, read_layouts
+from runner.recording.extras import ExtraLayout, ExtraNames, Extras
 from runner.recording.labels import read_labels
 from runner.recording.maker import MAKER_RECORD, SHARD_MAKER, EnvironmentMaker
 from runner.recording.messages import (
@@ -400,7 +400,7 @@ class Phase:
         """
         table = self._recording.table(self.topics.extras)
         where = str(self._recording.path)
-        layouts = {layout.number: layout for layout in extra_layouts(self._recording)} if table else {}
+        layouts = extra_layouts(self._recording) if table else {}
         index = self._recording.file.index
         parts = []
         channels = self._recording.file.channels[table.places]
@@ -493,7 +493,8 @@ class Phase:
         return names
 
 
-def extra_layouts(recording: Recording) -> list[ExtraLayout]:
-    """Return the names of extras, from when on; each entry has those of the one before it."""
+def extra_layouts(recording: Recording) -> Mapping[int, ExtraLayout]:
+    """Return the names of extras, from when on, by number; each layout has the names of the one before it."""
     columns = recording.table(schema.EXTRA_COLUMNS_TOPIC).decoded()
-    return read_layouts(((fields["log_time"], fields) for fields in columns), str(recording.path))
+    named = ((fields["log_time"], fields) for fields in columns)
+    return ExtraNames(str(recording.path), named).layouts

@@ -80,7 +80,13 @@ class Reference:
             n = min(len(block), len(records) - done)
             expected = records[done : done + n]
             if block[:n].tobytes() != expected.tobytes():
-                raise _block_difference(topic, block[:n], expected)
+                # Constant bytes are named if nothing else differs.
+                names = sorted(block.dtype.names or (), key=lambda name: name.startswith("tag_"))
+                difference = first_difference(block[:n], expected, names)
+                assert difference is not None  # their bytes differ
+                first, name = difference
+                was, should = (np.asarray(rows[first][name]).tolist() for rows in (block, expected))
+                raise Diverged(topic.name, name, was, should, **_position(expected[first]))
             self._block[topic] = block[n:]
             self._remaining[topic] -= n
             done += n
@@ -123,15 +129,6 @@ class Reference:
         for topic, messages in self._messages.items():
             if next(messages, None) is not None:
                 raise Diverged(topic.name, "messages", "more", "none")
-
-
-def _block_difference(topic: Topic, found: Records, expected: Records) -> Diverged:
-    names = sorted(found.dtype.names or (), key=lambda name: name.startswith("tag_"))
-    difference = first_difference(found, expected, names)
-    assert difference is not None  # their bytes differ
-    first, name = difference
-    was, should = (np.asarray(block[first][name]).tolist() for block in (found, expected))
-    return Diverged(topic.name, name, was, should, **_position(expected[first]))
 
 
 def _message_difference(topic: Topic, found: Logged, expected: Logged) -> Diverged:

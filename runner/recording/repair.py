@@ -24,7 +24,7 @@ from runner.recording.extras import ExtraNames
 from runner.recording.integrity import check_integrity
 from runner.recording.layout import HEADER_BYTES, MAGIC, RECORD_HEAD, record_dtype
 from runner.recording.messages import decode
-from runner.recording.metadata import REQUIRED_RECORDS, LostRanges, check_run, json_object, layout_of_run
+from runner.recording.metadata import REQUIRED_RECORDS, LostRanges, json_object, layout_of_run
 from runner.recording.reader import Recording, open_recording
 from runner.recording.records import (
     MetadataRecord,
@@ -142,7 +142,6 @@ def _salvage(path: Path, fresh: Path, report: Report, stated: Mapping[str, int])
                 f"{path}: found no metadata {', '.join(sorted(missing))}, damaged or never written: its "
                 "messages cannot be interpreted. `dualtaxi resume` retrains the run."
             )
-        check_run(described["run"], str(path))
         return _Salvage(path, DamagedFile(stream, path), described["run"], stated).write(fresh, report)
 
 

@@ -108,28 +108,22 @@ class ResetState(NamedTuple):
     def to_payload(self) -> bytes:
         """Return the message."""
         seed = self.np_random_seed
-        generator = self.bit_generator
+        generator = b""
+        if self.bit_generator is not None:
+            state: JsonView = self.bit_generator
+            inner = state["state"]
+            numbers = (inner[name].to_bytes(16, "little") for name in ("state", "inc"))
+            generator = _PCG64.pack(*numbers, state["uinteger"], state["has_uint32"])
         return encode(
             schema.RESET_STATE,
             {
                 "reset": self.reset,
                 "environment": self.environment,
                 "np_random_seed": b"" if seed is None else seed.to_bytes(SEED_BYTES, "little"),
-                "bit_generator": b"" if generator is None else packed_generator(generator),
+                "bit_generator": generator,
                 "ale_state": self.ale_state,
             },
         )
-
-
-def packed_generator(state: JsonView) -> bytes:
-    """Return the state of a PCG64 as bytes."""
-    inner = state["state"]
-    return _PCG64.pack(
-        inner["state"].to_bytes(16, "little"),
-        inner["inc"].to_bytes(16, "little"),
-        state["uinteger"],
-        state["has_uint32"],
-    )
 
 
 def decode_reset_state(payload: bytes) -> ResetState:

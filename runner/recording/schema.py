@@ -387,8 +387,6 @@ KINDS: Final = {
     "game": (*_LOOP_TOPICS, *MACHINE_TOPICS),
 }
 """The topics of each kind of recording, as the metadata record `run` names it."""
-MORE_FIELDS: Final = {"game": AGENT_FIELDS}
-"""The fields of a step that one of these kinds has besides those of the others."""
 ALL_TOPICS: Final = tuple(
     sorted({topic for topics in KINDS.values() for topic in topics}, key=lambda topic: topic.channel)
 )

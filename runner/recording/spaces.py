@@ -116,12 +116,6 @@ def encode_bytes(data: bytes) -> bytes:
     return _LENGTH.pack(len(data)) + data
 
 
-def varying_length(value: bytes, at: int) -> int:
-    """Return how many bytes a leaf of varying size has that stands at `at` in a value."""
-    (length,) = _LENGTH.unpack_from(value, at)
-    return int(length)
-
-
 def parts_of(description: Description) -> list[tuple[str, Description]] | None:
     """Return the parts of a `Dict` or `Tuple` by name; None for a leaf."""
     kind = description["type"]

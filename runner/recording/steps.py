@@ -409,5 +409,5 @@ def _is_over(rows: Records) -> Flags:
     return np.asarray(rows["terminated"] | rows["truncated"])
 
 
-ACTION_TOPICS: Final = {"/train/step": schema.TRAIN_ACTIONS, "/eval/step": schema.EVAL_ACTIONS}
-"""Where the actions of the steps of a topic are recorded."""
+ACTION_TOPICS: Final = (schema.TRAIN_ACTIONS, schema.EVAL_ACTIONS)
+"""The topics of actions that are recorded alone."""

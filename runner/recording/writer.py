@@ -64,17 +64,14 @@ class RecordingFile:
         try:
             self._append(MAGIC + bytes_of(Header(PROFILE, _LIBRARY)))
             if layout is not None:
-                self.begin(layout)
+                self.begin(beginning_of(layout))
         except OSError:
             self._stream.close()
             path.unlink(missing_ok=True)
             raise
 
-    def begin(self, layout: Layout) -> None:
-        """Append the schemas and channels of a run."""
-        self._write_beginning(beginning_of(layout))
-
-    def _write_beginning(self, beginning: Beginning) -> None:
+    def begin(self, beginning: Beginning) -> None:
+        """Append schemas and channels, at first those of the run."""
         self._append(beginning.schema_records + beginning.channel_records)
         self._index.declare(beginning)
 
@@ -120,7 +117,7 @@ class RecordingFile:
         for channel in {chunk.entry.channel for chunk in chunks} - self._index.channels.keys():
             beginning = self._later.get(channel)
             if beginning is not None and channel not in self._index.channels:
-                self._write_beginning(beginning)
+                self.begin(beginning)
         start, _ = self._append(b"".join(part for chunk in chunks for part in (chunk.record, chunk.index)))
         for chunk in chunks:
             self._index.chunks.append(chunk.entry._replace(offset=start, index_length=len(chunk.index)))
