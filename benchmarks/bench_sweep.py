@@ -11,11 +11,10 @@ import psutil
 from benchmarks.figures import Figure, figure, seconds
 from runner.runs.listing import list_runs
 from runner.sweep import state
-from runner.sweep.cluster import RayWorkers
 from runner.sweep.loading import from_values
-from runner.sweep.local import LocalWorkers
 from runner.sweep.model import Sweep
 from runner.sweep.running import run_sweep
+from runner.sweep.workers import LocalWorkers, RayWorkers
 
 STUDY = 1000
 

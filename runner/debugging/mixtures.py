@@ -31,8 +31,8 @@ from runner.learning.learner import Learner
 from runner.planning.evaluation import ExactEvaluator
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
-from runner.sweep.local import Workers
 from runner.sweep.objective import readings
+from runner.sweep.workers import Workers
 from runner.util import __version__
 from runner.util.arrays import Floats
 from runner.util.files import storage_errors

@@ -21,8 +21,7 @@ from runner.analysis.contents import require_steps
 from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef, StepLike, training_step
 from runner.analysis.sections import Answer, Grid, Link, Section
 from runner.archive.places import opened
-from runner.debugging.expressions import Array, Columns, Expression, JobParser, Series
-from runner.debugging.quantities import JobColumns, check_lost
+from runner.debugging.expressions import Array, Columns, Expression, JobColumns, JobParser, Series, check_lost
 from runner.errors import RecordingError, RunnerError
 from runner.recording.reader import Recording
 from runner.runs.run import Run

@@ -6,19 +6,25 @@
 
 An update is linear in the tables once it is known which of their values it takes, and the recording
 determines that. So the sum is exact: it is the value, but for the rounding of both.
+
+The recorded steps are replayed once, and what decides the weights of each update goes into a temporary file.
+That file is then read from its end, which gives the weights: see `learning.ledger`. So memory does not grow
+with the run.
 """
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from runner.analysis.episodes import EpisodeRef, StepLike
 from runner.archive.places import opened
 from runner.debugging.q_value import EpisodesPart, RewardPart, StepPart, ValuePart, Why
-from runner.debugging.weights import Cell, weights_of
 from runner.drawing import svg
 from runner.drawing.svg_maps import Move, moves_map
 from runner.environments.mdp import Mdp, events_of
@@ -33,14 +39,146 @@ from runner.environments.naming import (
     state_of,
     states_in_words,
 )
-from runner.errors import ConfigError, RunnerError, nearest
+from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, nearest
+from runner.execution.estimate import free_bytes
 from runner.learning.algorithms import ALGORITHMS
+from runner.learning.ledger import SHARE, UPDATE, Ledger, spread
 from runner.recording import schema
 from runner.recording.reader import Recording
 from runner.replay.steps import last_step
+from runner.replay.tables import TableReplay
 from runner.runs.run import Run
 from runner.util.arrays import Array, Floats, Records
+from runner.util.files import storage_errors
+from runner.util.humanize import size
 from runner.util.processes import Report
+
+# --- weights of rewards and initial values ------------------------------------------------------------
+
+STRETCHES: Final = 20
+"""The most stretches of equally many episodes by which weights are counted."""
+STEPS_AT_ONCE: Final = 1 << 18
+
+
+class Cell(NamedTuple):
+    """The place of a Q-value."""
+
+    learner: int
+    state: int
+    action: int
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights of a Q-value."""
+
+    value: float
+    """The Q-value in the replayed table."""
+    initial_values: Floats
+    """[tables, S * width]."""
+    ledger: Ledger
+    """The weights of the initial values, and of the rewards by outcome and by stretch of episodes."""
+    stretch: int
+    """Episodes of a stretch."""
+    last_episode: int
+    """The episode of the last step."""
+    counted: int
+    """Number of steps whose rewards have a weight."""
+    largest: Records
+    """[limit] of `SHARE`: the steps that add or take most, these first."""
+
+
+def weights_of(recording: Recording, cell: Cell, stop: int, limit: int, report: Report) -> Weights:
+    """Return the weights of a Q-value after a number of training steps of a job that learns.
+
+    `limit` is the most steps in `Weights.largest`; `report` is called with the number of steps read so far.
+
+    Raises:
+        StorageError: the temporary file cannot be written.
+    """
+    replay = TableReplay(recording)
+    learner = replay.learner
+    model = replay.learner.model
+    tables = learner.algorithm.tables if learner.algorithm.is_double else ("q",)
+    initial_values = np.stack([replay.named_tables[cell.learner][name].reshape(-1) for name in tables])
+    advice = "set TMPDIR to a folder with more space"
+    free = free_bytes(Path(tempfile.gettempdir()))
+    if stop * UPDATE.itemsize > free:
+        raise StorageError(
+            f"{tempfile.gettempdir()}: has {size(free)} free, and {size(stop * UPDATE.itemsize)} are needed "
+            f"for a temporary file; {advice}."
+        )
+    with storage_errors("a temporary file", advice), tempfile.TemporaryFile() as spool:
+        episode = 0
+        for updates in _updates(recording, replay, cell.learner, stop):
+            spool.write(updates.view(np.uint8).data)
+            episode = int(updates["episode"][-1])
+            report(replay.step)
+        stretch = episode // STRETCHES + 1
+        ledger = Ledger(
+            np.zeros_like(initial_values),
+            np.zeros_like(initial_values),
+            np.zeros(len(model.next_state)),
+            np.zeros((episode // stretch + 1, 2)),
+        )
+        ledger.weights[:, cell.state * model.width[cell.learner] + cell.action] = 1 / len(tables)
+        counted = 0
+        largest = np.empty(0, SHARE)
+        shares = np.empty(min(stop, STEPS_AT_ONCE), SHARE)
+        for start in reversed(range(0, stop, STEPS_AT_ONCE)):
+            updates = np.empty(min(STEPS_AT_ONCE, stop - start), UPDATE)
+            spool.seek(start * UPDATE.itemsize)
+            spool.readinto(updates.view(np.uint8).data)
+            end = start + len(updates)
+            while end > start:  # from branch to branch: each changes the rules
+                segment = learner.segment_at(end - 1)
+                first = max(segment.start, start)
+                filled = spread(
+                    model,
+                    segment.rules,
+                    cell.learner,
+                    first,
+                    updates[first - start : end - start],
+                    ledger,
+                    stretch,
+                    shares,
+                )
+                counted += filled
+                added = shares[:filled]
+                largest = np.concatenate([largest, added[added["contribution"] != 0]])
+                order = np.lexsort((largest["step"], -np.abs(largest["contribution"])))
+                largest = largest[order[:limit]]
+                end = first
+    return Weights(
+        value=float(replay.tables[cell.learner][cell.state, cell.action]),
+        initial_values=initial_values,
+        ledger=ledger,
+        stretch=stretch,
+        last_episode=episode,
+        counted=counted,
+        largest=largest,
+    )
+
+
+def _updates(recording: Recording, replay: TableReplay, learner: int, stop: int) -> Iterator[Records]:
+    """Yield what decides the weights of a learner's updates up to a step, in parts of `STEPS_AT_ONCE`.
+
+    Raises:
+        RecordingError: the numbers of the steps' episodes decrease; compiled code uses them as indices.
+    """
+    episode = 0
+    while replay.step < stop:
+        first = replay.step
+        updates = replay.updates(min(first + STEPS_AT_ONCE, stop), learner)
+        episodes = updates["episode"]
+        if episodes[0] < episode or (episodes[1:] < episodes[:-1]).any():
+            raise RecordingError(
+                f"{recording.path}: found decreasing numbers of episodes from training step {first} on; "
+                "`dualtaxi verify` checks the whole recording."
+            )
+        episode = episodes[-1]
+        yield updates
+
 
 POLICY_NOTE: Final = (
     "WoLF-PHC acts by a policy, which is no such sum: its moves have a fixed size. This is the Q-value that "

@@ -25,7 +25,7 @@ from runner.export.plots.chart import SMALL, Canvas, Chart, Scale, labelled, ser
 from runner.export.plots.curves import HEIGHT, WIDTH, curves_section, panel_chart
 from runner.export.reports.rendering import render
 from runner.runs.resolve import find_run
-from runner.sweep.parameters import Parameter, Range
+from runner.sweep.model import Parameter, Range
 from runner.sweep.results import Ranked, Results, value_text, values_text
 from runner.util.arrays import Floats
 

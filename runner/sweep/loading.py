@@ -19,8 +19,7 @@ from runner.config.problems import found, problems_at, problems_in, refuse
 from runner.config.schema import Schema, without_references
 from runner.config.shipped import config_path
 from runner.errors import RunnerError
-from runner.sweep.model import Sweep, SweepFile
-from runner.sweep.parameters import samples_of
+from runner.sweep.model import Sweep, SweepFile, samples_of
 from runner.util.yaml_text import write_yaml
 
 MAX_NAME: Final = 50

@@ -1,23 +1,201 @@
-"""The contents of a sweep file, and the sweep that it describes."""
+"""The contents of a sweep file, and the sweep that it describes.
+
+A parameter is a list of values to try, or a range of numbers. A strategy is a row of `STRATEGIES`, from which
+everything else follows: it proposes values by a sampler of Optuna, asked for a batch at a time.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from decimal import Decimal
+from types import ModuleType
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import SECTION_OF, Name, Seed, SeveralSeeds
 from runner.config.values import ConfigSection, Count, refusal
-from runner.sweep.parameters import MAX_TRIALS, Parameter
-from runner.sweep.strategies import STRATEGIES, Strategy, StrategyName
 from runner.util.values import Json, JsonView
+
+if TYPE_CHECKING:
+    from optuna.samplers import BaseSampler
+
+MAX_TRIALS: Final = 100_000
+
+
+def _number_kind(value: object) -> str | None:
+    if isinstance(value, float):
+        return "number"
+    return "integer" if isinstance(value, int) and not isinstance(value, bool) else None
+
+
+Number = Annotated[
+    Annotated[int, Field(ge=-(10**15), le=10**15), Tag("integer")] | Annotated[float, Tag("number")],
+    Discriminator(_number_kind),
+]
+
+
+class Range(ConfigSection):
+    """Numbers from `low` to `high`, both included; whole ones if both are whole."""
+
+    low: Number = Field(description="The lowest value.")
+    high: Number = Field(description="The highest value.")
+    log: bool = Field(default=False, description="Draw evenly in the logarithm, for values over magnitudes.")
+    step: Number | None = Field(default=None, description="Only low, low + step, ...; required by a grid.")
+
+    @model_validator(mode="after")
+    def _is_a_range(self) -> Self:
+        if not self.low < self.high:
+            raise refusal(("high",), f"found {self.high:g}, expected a number above low, {self.low:g}")
+        if self.log and self.low <= 0:
+            raise refusal(("low",), f"found {self.low:g}, expected a number above 0: log is true")
+        if self.step is not None and self.step <= 0:
+            raise refusal(("step",), f"found {self.step:g}, expected a number above 0")
+        if self.log and self.step is not None:
+            raise refusal(("step",), f"found {self.step:g}, but log is true: leave out one of them")
+        return self
+
+    @property
+    def is_integer(self) -> bool:
+        """Whether its values are whole numbers."""
+        return all(isinstance(bound, int) for bound in (self.low, self.high, self.step or 1))
+
+    @property
+    def steps(self) -> int:
+        """The number of whole steps from `low` up to `high`."""
+        low, high, step = (Decimal(str(number)) for number in (self.low, self.high, self.step or 1))
+        return int((high - low) / step)
+
+    def at(self, number: int) -> int | float:
+        """Return the value after this number of steps, in decimal arithmetic: 0.3, not 0.1 + 0.2."""
+        value = Decimal(str(self.low)) + number * Decimal(str(self.step or 1))
+        return int(value) if self.is_integer else float(value)
+
+    def nearest(self, value: float) -> int | float:
+        """Return the value of whole steps next to one that was added up in floating point."""
+        return value if self.step is None else self.at(round((value - self.low) / self.step))
+
+    @property
+    def last(self) -> int | float:
+        """The highest value that whole steps reach."""
+        return self.high if self.step is None else self.at(self.steps)
+
+
+def _parameter_kind(value: object) -> str | None:
+    if isinstance(value, Mapping | Range):
+        return "Range"
+    return "array" if isinstance(value, list | tuple) else None
+
+
+_Choices = Annotated[list[object], Field(min_length=1)]
+Parameter = Annotated[
+    Annotated[_Choices, Tag("array")] | Annotated[Range, Tag("Range")], Discriminator(_parameter_kind)
+]
+"""The values to try: each of a list, or numbers of a range."""
+
+
+def count_of(parameter: Parameter) -> int:
+    """Return the number of values that a grid tries of a parameter."""
+    return parameter.steps + 1 if isinstance(parameter, Range) else len(parameter)
+
+
+def points_of(parameters: Iterable[Parameter]) -> int:
+    """Return the number of points of the grid of these parameters."""
+    return math.prod(map(count_of, parameters))
+
+
+def samples_of(parameter: Parameter) -> Sequence[object]:
+    """Return the choices of a parameter, or the first and the last value of its range."""
+    return (parameter.at(0), parameter.last) if isinstance(parameter, Range) else parameter
+
+
+# --- strategies ---------------------------------------------------------------------------------------
+
+
+def _check_search(strategy: str, trials: int | None, _: Mapping[str, Parameter]) -> None:
+    if trials is None:
+        raise refusal(("trials",), f"missing, expected a whole number: {strategy} has no end")
+
+
+def _check_grid(_: str, trials: int | None, parameters: Mapping[str, Parameter]) -> None:
+    if trials is not None:
+        raise refusal(("trials",), f"found {trials}, but a grid tries all of its points")
+    for name, parameter in parameters.items():
+        if isinstance(parameter, Range) and parameter.step is None and not parameter.is_integer:
+            raise refusal(("parameters", name), "found a range without step: a grid needs one")
+        if isinstance(parameter, Range) and parameter.log:
+            raise refusal(("parameters", name, "log"), "found true, but a grid has steps")
+    if points_of(parameters.values()) > MAX_TRIALS:
+        message = (
+            f"found a grid of more points than {MAX_TRIALS:,}: take larger steps, or a strategy that "
+            "tries some of them"
+        )
+        raise refusal(("parameters",), message)
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """How the values of trials are found."""
+
+    text: str
+    """The values that it tries, for the help of the key `strategy` and the documentation."""
+    sampler: Callable[[ModuleType, int, int], BaseSampler]
+    """Returns the sampler, from the module `optuna.samplers`, the size of a batch and a seed of 32 bits."""
+    check: Callable[[str, int | None, Mapping[str, Parameter]], None] = _check_search
+    """Refuses a number of trials, or parameters, that do not fit the strategy, which has this name."""
+    is_grid: bool = False
+    """Whether it tries every point of a grid, rather than a number of trials."""
+    is_adaptive: bool = True
+    """Whether its suggestions depend on earlier results, so that it is asked for one batch at a time."""
+    skips_repeats: bool = False
+    """Whether it draws again what it suggested before, unless the sweep has `repeats`."""
+
+
+STRATEGIES: Final = {
+    "grid": Strategy(
+        "all combinations",
+        lambda samplers, _, seed: samplers.RandomSampler(seed=seed),  # its points are given to Optuna
+        _check_grid,
+        is_grid=True,
+        is_adaptive=False,
+    ),
+    "random": Strategy(
+        "`trials` combinations, drawn independently",
+        lambda samplers, _, seed: samplers.RandomSampler(seed=seed),
+        is_adaptive=False,
+    ),
+    "tpe": Strategy(
+        "`trials` combinations, by a tree-structured Parzen estimator of good values",
+        lambda samplers, batch, seed: samplers.TPESampler(seed=seed, n_startup_trials=2 * batch),
+        skips_repeats=True,
+    ),
+    "genetic": Strategy(
+        "`trials` combinations, by the genetic algorithm NSGA-II; a batch is a generation",
+        lambda samplers, batch, seed: samplers.NSGAIISampler(population_size=max(2, batch), seed=seed),
+    ),
+}
+"""By the name in a sweep's file."""
+
+
+def _known(name: str) -> str:
+    if name not in STRATEGIES:
+        raise ValueError(name)  # reported by the choices of the schema
+    return name
+
+
+StrategyName = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"enum": [*STRATEGIES]})]
+"""The name of a strategy."""
+
 
 At = Literal["last", "best", "area", "first_over"]
 Direction = Literal["maximize", "minimize"]
+
+
+# --- the contents of a sweep file ---------------------------------------------------------------------
 
 
 class Objective(ConfigSection):

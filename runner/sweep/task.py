@@ -60,7 +60,7 @@ class Task:
     """Whether the worker has more than one processor, so that recording can run in parallel to learning."""
 
     def placed(self, threads: bool, on_own_disk: bool = False) -> Task:
-        """Return the task for a worker; see `runner.sweep.local.Work`."""
+        """Return the task for a worker; see `runner.sweep.workers.Work`."""
         return replace(self, threads=threads, on_own_disk=self.on_own_disk or on_own_disk)
 
     def run(self, stop: Callable[[], bool]) -> Result:

@@ -14,7 +14,7 @@ from typing import Final, Self
 import pytest
 from selenium.webdriver.remote.webdriver import WebDriver
 
-from runner.debugging.explanation_files import explanations_in
+from runner.debugging.explanation import explanations_in
 from runner.runs.listing import list_runs
 from runner.runs.run import UNLISTED
 from runner.service.app import create_app

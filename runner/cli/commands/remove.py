@@ -140,7 +140,7 @@ def prune_command(
 
 def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool) -> Iterator[Reply]:
     """Show what explanations trained, ask, and remove it."""
-    from runner.debugging.explanation_files import remove_trained, trained_in
+    from runner.debugging.explanation import remove_trained, trained_in
 
     explanations = [each for folder in recordings for each in trained_in(folder)]
     rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]

@@ -30,10 +30,8 @@ from runner.util.humanize import UNKNOWN, amount, duration, size
 from runner.util.values import checked_name
 
 if TYPE_CHECKING:
-    from runner.sweep.model import Sweep
-    from runner.sweep.parameters import Parameter
-    from runner.sweep.plan import Plan
-    from runner.sweep.running import SweepStatus
+    from runner.sweep.model import Parameter, Sweep
+    from runner.sweep.running import Plan, SweepStatus
     from runner.sweep.trials import Trials
 
 
@@ -95,10 +93,9 @@ def run(
     from runner.api import interruptible
     from runner.execution.session import resolve_initial_q
     from runner.sweep.loading import load_sweep
-    from runner.sweep.plan import plan_of
-    from runner.sweep.search import require_optuna
+    from runner.sweep.running import plan_of, run_whole_sweep
     from runner.sweep.state import with_resolved_tables
-    from runner.sweep.whole import run_whole_sweep
+    from runner.sweep.trials import require_optuna
 
     require_optuna()
     folder = recordings_folder(recordings)

@@ -13,8 +13,7 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.axes import EPISODES
 from runner.analysis.frames import Phase, episode_columns, step_columns
 from runner.analysis.histograms import ValueCounts
-from runner.debugging.explanation import Explanation
-from runner.debugging.explanation_files import explanations_in, read_explanation
+from runner.debugging.explanation import Explanation, explanations_in, read_explanation
 from runner.errors import RunNotFound
 from runner.recording.reader import Recording
 from runner.runs.run import Run

@@ -53,11 +53,9 @@ from runner.service.jobs.store import QueuedJob, read_values
 from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
 from runner.sweep import state
-from runner.sweep.cluster import worker_pool
 from runner.sweep.loading import from_values
-from runner.sweep.local import Workers
-from runner.sweep.running import SweepStatus
-from runner.sweep.whole import run_whole_sweep
+from runner.sweep.running import SweepStatus, run_whole_sweep
+from runner.sweep.workers import Workers, worker_pool
 from runner.util.compilation import MESSAGE, announced
 from runner.util.extras import require
 from runner.util.processes import OWN_ONLY

@@ -21,7 +21,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Paging
 from runner.client.jobs import JobStatus
 from runner.config.schema import branches, expected, json_schema, without_references
-from runner.debugging.explanation_files import explanations_in
+from runner.debugging.explanation import explanations_in
 from runner.environments.naming import numbered_actions
 from runner.errors import RunnerError
 from runner.export.values import actions_at

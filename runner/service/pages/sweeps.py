@@ -15,8 +15,7 @@ from fastapi.responses import HTMLResponse
 
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Grid, Link
-from runner.debugging.explanation import Explanation, drawn_sections
-from runner.debugging.explanation_files import explanations_in
+from runner.debugging.explanation import Explanation, drawn_sections, explanations_in
 from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
 from runner.service import computed

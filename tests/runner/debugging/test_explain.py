@@ -17,8 +17,17 @@ from runner.analysis.statistics import Estimate
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.debugging.explain import EPISODES, RUNS
-from runner.debugging.explanation import Explanation, Mixture, Setting, Side, sections, signed, summary
-from runner.debugging.explanation_files import explanations_in, read_explanation
+from runner.debugging.explanation import (
+    Explanation,
+    Mixture,
+    Setting,
+    Side,
+    explanations_in,
+    read_explanation,
+    sections,
+    signed,
+    summary,
+)
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs

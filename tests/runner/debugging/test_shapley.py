@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from runner.debugging.shapley import minimal_set, shapley_interactions, shapley_values
+from runner.debugging.game import minimal_set, shapley_interactions, shapley_values
 
 
 def over_all_orders(values, count):

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.debugging import weights
+from runner.debugging import why
 from runner.debugging.q_value import EpisodesPart
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.recording.reader import open_recording
@@ -48,7 +48,7 @@ def last_steps(run, count):
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_sum_is_the_value(case, tmp_path, monkeypatch):
-    monkeypatch.setattr(weights, "STEPS_AT_ONCE", 100)
+    monkeypatch.setattr(why, "STEPS_AT_ONCE", 100)
     run = make_run(tmp_path, PLAIN, CASES[case])
     steps, total = last_steps(run, 1)
     with open_recording(run.recording) as recording:
@@ -130,7 +130,7 @@ def test_the_value_before_a_step_is_that_of_its_state_and_action(tmp_path):
 def test_the_largest_steps_do_not_depend_on_the_parts_they_are_read_in(tmp_path, monkeypatch):
     run = make_run(tmp_path, PLAIN)
     found = runner.why(run, at="20:3")
-    monkeypatch.setattr(weights, "STEPS_AT_ONCE", 64)
+    monkeypatch.setattr(why, "STEPS_AT_ONCE", 64)
     assert runner.why(run, at="20:3") == found
     assert runner.why(run, at="20:3", limit=3).steps == found.steps[:3]
 

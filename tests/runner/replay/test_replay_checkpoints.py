@@ -10,7 +10,7 @@ import pytest
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import open_recording
-from runner.replay import checkpoints, tables
+from runner.replay import tables
 from runner.replay.tables import TableReplay, tables_at
 from runner.runs.catalogue.usage import cached
 from runner.util.files import TABLES, cache_folder
@@ -32,7 +32,6 @@ KINDS = {
 def _near(monkeypatch, tmp_path):
     """Keep checkpoints every 300 steps, in a cache of this test's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(checkpoints, "CHECKPOINT_STEPS", 300)
     monkeypatch.setattr(tables, "CHECKPOINT_STEPS", 300)
 
 
@@ -124,7 +123,7 @@ def test_the_cache_stays_within_its_size(tmp_path, monkeypatch):
         for age, file in enumerate(whole):
             os.utime(file, (age, age))
         limit = sum(file.stat().st_size for file in whole[1:]) + 10
-        monkeypatch.setattr(checkpoints, "MAX_CACHE_BYTES", limit)
+        monkeypatch.setattr(tables, "MAX_CACHE_BYTES", limit)
         tables_at(recording, 2100)
         assert whole[0] not in files()
         assert sum(file.stat().st_size for file in files()) <= limit

@@ -11,7 +11,7 @@ from test_service_branch import finished
 
 import runner
 from runner.debugging.explain import ask
-from runner.debugging.explanation_files import FOLDER, LOCK
+from runner.debugging.explanation import FOLDER, LOCK
 from runner.errors import RunnerError
 from runner.runs.locking import acquired
 from runner.runs.resolve import find_run

@@ -69,12 +69,12 @@ def attempt(task, stop):
 
 
 def serve(pipe, stopping):
-    """Run tasks as `runner.sweep.local.serve` does, and die."""
+    """Run tasks as `runner.sweep.workers.serve` does, and die."""
     with contextlib.suppress(EOFError):
         while True:
             pipe.send(attempt(pipe.recv(), stopping.is_set))
 
 
 def run_on_ray(actor, task):
-    """Run a task as `runner.sweep.cluster._run` does, and die."""
+    """Run a task as `runner.sweep.workers._run` does, and die."""
     return attempt(task, actor.stop)

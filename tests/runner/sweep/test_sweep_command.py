@@ -13,7 +13,7 @@ import runner
 from runner.cli import cli
 from runner.config import from_mapping, load
 from runner.runs.listing import list_runs
-from runner.sweep import cluster, plan
+from runner.sweep import running, workers
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_runs_that_are_tried_need_a_step(type_in, file, tmp_path):
 
 def test_a_full_disk_is_reported_before_anything_runs(type_in, file, monkeypatch, tmp_path):
     with monkeypatch.context() as small:
-        small.setattr(plan, "free_bytes", lambda _: 1000)
+        small.setattr(running, "free_bytes", lambda _: 1000)
         output = type_in("run", str(file()), code=1).output
     assert "12 runs need about" in output
     assert "and 1.0 kB are free" in output
@@ -145,7 +145,7 @@ def test_output_of_ray_goes_to_stderr(type_in, file, monkeypatch):
         def __exit__(self, *_):
             pass
 
-    monkeypatch.setattr(cluster, "RayWorkers", lambda *_: Talking())
+    monkeypatch.setattr(workers, "RayWorkers", lambda *_: Talking())
     reply = type_in("run", str(file()), "--ray", "--json")
     assert json.loads(reply.stdout)["done"] == 12
     assert "(raylet) A worker died" in reply.stderr

@@ -10,8 +10,8 @@ from sweeping import BASE, described
 
 from runner.config import ConfigError
 from runner.sweep.loading import from_values, load_sweep
-from runner.sweep.plan import plan_of
-from runner.sweep.strategies import STRATEGIES
+from runner.sweep.model import STRATEGIES
+from runner.sweep.running import plan_of
 
 SHIPPED = sorted((Path(__file__).parents[3] / "configs" / "sweeps").glob("*.yaml"))
 

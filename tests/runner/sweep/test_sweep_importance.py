@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
-from runner.sweep.importance import effects_of, effects_of_grid, shares_of_variance
-from runner.sweep.parameters import Range
+from runner.sweep.model import Range
+from runner.sweep.results import effects_of, effects_of_grid, shares_of_variance
 
 
 def test_the_variance_of_a_sum_is_that_of_its_terms():

@@ -9,9 +9,8 @@ import pytest
 from sweeping import described, digests, swept
 
 from runner.runs.listing import list_runs
-from runner.sweep import local
 from runner.sweep.loading import from_values
-from runner.sweep.local import LocalWorkers
+from runner.sweep.workers import LocalWorkers, RayWorkers
 
 pytestmark = [
     pytest.mark.long,
@@ -27,23 +26,22 @@ class OnOwnDisk(LocalWorkers):
 
 
 def processes(monkeypatch, own):
-    monkeypatch.setattr(local, "serve", dying.serve)
+    monkeypatch.setattr("runner.sweep.workers.serve", dying.serve)
     return LocalWorkers(2)
 
 
 def processes_on_own_disk(monkeypatch, own):
-    monkeypatch.setattr(local, "serve", dying.serve)
+    monkeypatch.setattr("runner.sweep.workers.serve", dying.serve)
     monkeypatch.setenv("TMPDIR", str(own))
     return OnOwnDisk(2)
 
 
 def ray_workers(monkeypatch, own):
     ray = pytest.importorskip("ray")
-    from runner.sweep import cluster
 
     ray.cloudpickle.register_pickle_by_value(dying)
-    monkeypatch.setattr(cluster, "_run", dying.run_on_ray)
-    return cluster.RayWorkers(2, None, 6)
+    monkeypatch.setattr("runner.sweep.workers._run", dying.run_on_ray)
+    return RayWorkers(2, None, 6)
 
 
 @pytest.mark.parametrize(

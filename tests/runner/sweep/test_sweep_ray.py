@@ -9,7 +9,7 @@ from runner.sweep.model import Objective
 from runner.sweep.task import Task
 
 pytest.importorskip("ray")
-from runner.sweep.cluster import RayWorkers
+from runner.sweep.workers import RayWorkers
 
 pytestmark = [
     pytest.mark.long,

@@ -15,12 +15,10 @@ from runner.recording.topic_chunks import TopicChunks
 from runner.sweep import state
 from runner.sweep.charts import parameters_section, picture_of
 from runner.sweep.loading import from_values
-from runner.sweep.model import Objective
+from runner.sweep.model import STRATEGIES, Objective
 from runner.sweep.objective import curve_of, pruning_bounds, should_prune, value_of
 from runner.sweep.results import results_of
-from runner.sweep.search import Search
-from runner.sweep.strategies import STRATEGIES
-from runner.sweep.trials import Trials
+from runner.sweep.trials import Search, Trials
 
 CURVE = {0: 0.0, 100: 40.0, 200: 80.0, 300: 60.0}
 

@@ -18,15 +18,13 @@ from runner.runs import provenance
 from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
-from runner.sweep import local, state
+from runner.sweep import state
 from runner.sweep.loading import from_values
-from runner.sweep.local import LocalWorkers
-from runner.sweep.model import Objective
-from runner.sweep.parameters import Range
-from runner.sweep.plan import plan_of
+from runner.sweep.model import Objective, Range
 from runner.sweep.results import ranking, results_of
-from runner.sweep.running import run_sweep
+from runner.sweep.running import plan_of, run_sweep
 from runner.sweep.task import Task, move_files
+from runner.sweep.workers import LocalWorkers, _SweepWorker
 
 
 def test_each_run_is_tagged_with_the_sweep(done):
@@ -147,7 +145,7 @@ def test_a_task_whose_worker_dies_twice_fails_and_the_sweep_continues(tmp_path):
 
 
 def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
-    real, gone = local._SweepWorker.send, []
+    real, gone = _SweepWorker.send, []
 
     def send(worker, task):
         if not gone:
@@ -156,7 +154,7 @@ def test_a_process_that_dies_before_its_task_is_replaced(done, monkeypatch):
             worker._process.join()
         return real(worker, task)
 
-    monkeypatch.setattr(local._SweepWorker, "send", send)
+    monkeypatch.setattr(_SweepWorker, "send", send)
     folder, trials, _ = done
     expected = trials.done[0].results[0]
     objective = Objective(metric="mean_length")
