@@ -25,7 +25,7 @@ from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
 from runner.client.client import Client
-from runner.client.uploads import append_upload, put_upload
+from runner.client.transfer import append_upload, put_upload
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run
 from runner.runs.run import Run

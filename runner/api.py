@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.config import ConfigError, ExperimentConfig, from_mapping, load
-from runner.config.job import Job, jobs_of
+from runner.config.model import Job, jobs_of
 from runner.config.sections import RunTable
 from runner.errors import RunNotFound
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from runner.config import load
-from runner.config.job import jobs_of
+from runner.config.model import jobs_of
 from runner.execution.session import run_job
 from runner.recording import schema
 from runner.recording.integrity import check_integrity

@@ -10,7 +10,7 @@ Bytes that were sent before a connection broke are not sent again; the same run 
 
 from __future__ import annotations
 
-from runner.client import jobs, pull, uploads
+from runner.client import jobs, transfer
 from runner.client.connection import Connection
 from runner.client.jobs import JobsPage, JobStatus
 
@@ -19,8 +19,8 @@ class Client(Connection):
     """A connection to a server, with everything that can be requested of it."""
 
     watch = jobs.watch
-    pull = pull.pull
-    push = uploads.push
+    pull = transfer.pull
+    push = transfer.push
 
     def submit(self, text: str, source: str = "job.yaml", workers: int | None = None) -> JobStatus:
         """Submit the text of a configuration or a sweep; `source` is the file's name, for messages.

@@ -20,7 +20,7 @@ from platformdirs import user_state_path
 
 from runner.client.client import Client
 from runner.client.connection import Report, ServerUnavailable, find_token
-from runner.client.uploads import UploadStatus, append_upload, put_upload
+from runner.client.transfer import UploadStatus, append_upload, put_upload
 from runner.errors import RunnerError
 from runner.runs.listing import list_runs
 from runner.runs.locking import locked

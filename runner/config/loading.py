@@ -25,8 +25,7 @@ from runner.config.model import (
     SeedRange,
     Tables,
 )
-from runner.config.problems import found, problems_in, refuse
-from runner.config.schema import schema_at
+from runner.config.schema import found, problems_in, refuse, schema_at
 from runner.config.sections import RecordingSection
 from runner.config.shipped import config_path, suggestion
 from runner.config.values import MAX_DEPTH, ConfigSection, Path, position_in, value_at

@@ -1,17 +1,19 @@
 """An experiment: what a YAML file may contain, and the resolved object that every part of a run uses.
 
 `ExperimentFile` has the shorthands (`mode`, `seed`) and keys that may be left out; `runner.config.loading`
-resolves it to an `ExperimentConfig`, where every value is present.
+resolves it to an `ExperimentConfig`, where every value is present. With one seed it is a `Job`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, Self, get_args
 
+from blake3 import blake3
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
-from runner.config.schedules import Probability, StepSize
 from runner.config.sections import (
     Algorithm,
     AlgorithmSection,
@@ -23,14 +25,16 @@ from runner.config.sections import (
     InitialTable,
     Log,
     NStep,
+    Probability,
     Quirks,
     RecordingSection,
     SarsaLambda,
     Snapshots,
+    StepSize,
     WolfPhc,
 )
 from runner.config.values import ConfigSection, Optional, refusal
-from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json
+from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
 from runner.util.yaml_text import write_yaml
 
 Mode = Literal["cooperative", "competitive"]
@@ -178,14 +182,11 @@ class ExperimentFile(Settings):
     )
 
 
-def _keys() -> tuple[str, ...]:
-    keys = list(Settings.model_fields)
-    keys.insert(keys.index("tables"), "mode")
-    keys.insert(keys.index("seeds"), "seed")
-    return tuple(keys)
-
-
-KEYS: Final = _keys()
+_BEFORE: Final = {"tables": "mode", "seeds": "seed"}
+"""The shorthands of a file, each by the key that it stands before."""
+KEYS: Final = tuple(
+    key for shared in Settings.model_fields for key in (_BEFORE.get(shared), shared) if key is not None
+)
 """The keys of a file in the order in which people read them."""
 
 SECTION_OF: Final[dict[str, type[AlgorithmSection]]] = {
@@ -277,3 +278,33 @@ class ExperimentConfig(Settings):
     def to_yaml(self) -> str:
         """Return `to_mapping` as YAML, which `load` takes back to an equal object."""
         return write_yaml(self.to_mapping())
+
+
+NOT_CONTENT = ("name", "seeds", "recording")
+"""Keys of a configuration that change neither what is learned nor what is recorded."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One seed of an experiment."""
+
+    config: ExperimentConfig
+    seed: int
+
+    @property
+    def identity(self) -> str:
+        """A hash of the values that determine the content of its recording; the name is none of them."""
+        return identity_of(self.config.to_mapping(), self.seed)
+
+
+def identity_of(config: JsonView, seed: int) -> str:
+    """Return the identity of the job of a resolved configuration, given as plain values, and a seed."""
+    content = {key: value for key, value in config.items() if key not in NOT_CONTENT} | {"seed": seed}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return blake3(text.encode()).hexdigest()[:32]
+
+
+def jobs_of(config: ExperimentConfig) -> Iterator[Job]:
+    """Yield the jobs of an experiment, one per seed."""
+    for seed in config.seeds:
+        yield Job(config, seed)

@@ -29,7 +29,7 @@ from runner.analysis.diff.sections import where_in_words
 from runner.analysis.diff.updates import replay_to
 from runner.archive.places import opened
 from runner.config import ExperimentConfig, from_mapping, load
-from runner.config.job import Job, identity_of
+from runner.config.model import Job, identity_of
 from runner.config.shipped import shipped
 from runner.debugging.explanation import FOLDER, LOCK, TAG, Explanation, FirstStep, Side, write_explanation
 from runner.debugging.factors import MAX_ALL, Mixing, mix

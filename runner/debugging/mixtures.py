@@ -21,7 +21,7 @@ from blake3 import blake3
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import identity_of
+from runner.config.model import identity_of
 from runner.debugging.factors import Mixing
 from runner.environments.loading import load_once
 from runner.environments.mdp import Mdp

@@ -18,7 +18,7 @@ from typing import Final
 from runner.analysis.diff.divergence import first_difference, unbroken
 from runner.analysis.episodes import EpisodeRef, StepLike, reference_to, training_step, training_steps
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.config.sections import BranchSection, ChangesSection
 from runner.environments.mdp import Mdp
 from runner.environments.naming import agent_actions, agent_of, joint_action, numbered_actions, own_action

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import Job
 from runner.config.loading import recorded_packing
+from runner.config.model import Job
 from runner.environments.loading import load_mdp
 from runner.errors import CannotRedo, Diverged, RunnerError
 from runner.execution.session import Report, Session, address, recorded_tables, recorder_for, run_job

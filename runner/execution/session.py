@@ -20,7 +20,7 @@ import numpy as np
 
 from runner.archive.places import opened
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.config.sections import RunTable
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import (

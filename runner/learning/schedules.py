@@ -13,7 +13,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from runner.config.schedules import Exponential, Linear, Piecewise, Schedule
+from runner.config.sections import Exponential, Linear, Piecewise, Schedule
 from runner.util.arrays import Floats
 
 CONSTANT, LINEAR, EXPONENTIAL, PIECEWISE = 0.0, 1.0, 2.0, 3.0

@@ -15,7 +15,7 @@ from pathlib import Path
 from blake3 import blake3
 
 from runner.client.outbox import Follower, connect, is_server, outbox_folder
-from runner.config.job import NOT_CONTENT
+from runner.config.model import NOT_CONTENT
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
 from runner.loops.fold import OWNER_WAITS, fold_if_over

@@ -17,7 +17,7 @@ from fastapi.params import Path as InPath
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from runner.config.problems import found
+from runner.config.schema import found
 from runner.errors import (
     ConfigError,
     ConfigProblem,

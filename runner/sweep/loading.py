@@ -15,8 +15,7 @@ from runner.config import ConfigError, ExperimentConfig, load
 from runner.config.document import Document, Place, Problem, read_yaml
 from runner.config.loading import experiment_in, put, read_text
 from runner.config.model import SECTION_OF
-from runner.config.problems import found, problems_at, problems_in, refuse
-from runner.config.schema import Schema, without_references
+from runner.config.schema import Schema, found, problems_at, problems_in, refuse, without_references
 from runner.config.shipped import config_path
 from runner.errors import RunnerError
 from runner.sweep.model import Sweep, SweepFile, samples_of

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.config import ConfigError, ExperimentConfig, from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import StorageError

@@ -14,8 +14,8 @@ from typing import Any, Final
 
 from runner.config import from_mapping
 from runner.config.document import read_yaml
-from runner.config.job import identity_of
 from runner.config.loading import read_text
+from runner.config.model import identity_of
 from runner.errors import ConfigError, RunnerError, nearest
 from runner.execution.resume import require_same_makers
 from runner.execution.session import resolve_initial_q

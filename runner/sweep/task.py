@@ -16,7 +16,7 @@ from typing import Literal
 
 from runner.archive.places import at_hand
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.environments.loading import load_once
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError, RunnerError

@@ -19,7 +19,7 @@ from gymnasium.vector import SyncVectorEnv
 
 import runner
 from runner.config import load
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.execution import session
 from runner.loops import loop_run
 from runner.recording.reader import open_recording

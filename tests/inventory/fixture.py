@@ -20,7 +20,7 @@ import runner
 from dualtaxi.parallel import DualTaxiParallelEnv
 from runner.cli import cli
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
 from runner.integrations.tensorboard import SummaryWriter

@@ -18,7 +18,7 @@ from PIL import Image
 import runner
 from dualtaxi.parallel import DualTaxiParallelEnv
 from runner.archive.runs import archive_run, restore_run
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.recording import schema

@@ -36,7 +36,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from runner.config import ExperimentConfig
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RecordingError, RunnerError
 from runner.execution.resume import resume
 from runner.execution.session import run_job

@@ -23,7 +23,7 @@ from starlette.testclient import TestClient
 import runner
 from runner.cli import cli
 from runner.cli.views import command_of
-from runner.config.job import identity_of
+from runner.config.model import identity_of
 from runner.errors import CannotRedo, RunnerError
 from runner.execution.resume import resume
 from runner.execution.verify import verify

@@ -26,7 +26,7 @@ from runner.util.values import checked_name
 if TYPE_CHECKING:  # a run is written to disk before heavy packages are imported
     from runner.cli.output import Part
     from runner.config import ExperimentConfig
-    from runner.config.job import Job
+    from runner.config.model import Job
 
 
 @click.command("run", cls=Command)

@@ -17,7 +17,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.config import ExperimentConfig, from_mapping, from_text
 from runner.config.document import Document, Problem, read_yaml
 from runner.config.loading import MAX_BYTES
-from runner.config.problems import problems_at, refuse
+from runner.config.schema import problems_at, refuse
 from runner.config.sections import RunTable
 from runner.debugging.explain import (
     DEFAULT_SEEDS,

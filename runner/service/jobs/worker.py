@@ -30,7 +30,7 @@ from runner.client.jobs import (
     SweepProgress,
 )
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.debugging.explain import (
     EPISODES,
     RUNS,

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.execution.session import run_job
 from runner.runs import run as runs
 

@@ -18,7 +18,7 @@ from runner.analysis.diff.sections import sections
 from runner.analysis.sections import markdown
 from runner.cli import cli
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.environments.naming import states_in_words
 from runner.execution.session import run_job
 from runner.recording import schema

@@ -9,8 +9,7 @@ import pytest
 from pydantic import ValidationError
 
 from runner.config import ExperimentConfig, from_mapping, load
-from runner.config.schedules import Exponential, Linear, Piecewise
-from runner.config.sections import RandomTable, RunTable
+from runner.config.sections import Exponential, Linear, Piecewise, RandomTable, RunTable
 from runner.errors import ConfigError
 
 

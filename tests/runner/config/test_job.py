@@ -7,7 +7,7 @@ import json
 import pytest
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import Job, jobs_of
+from runner.config.model import Job, jobs_of
 
 BASE = {"episodes": 100, "epsilon": {"schedule": "linear", "start": 1.0, "end": 0.1, "over": 50}}
 

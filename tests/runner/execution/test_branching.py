@@ -17,7 +17,7 @@ from runner.analysis.diff.sections import summary
 from runner.analysis.episodes import reference_to, training_step
 from runner.cli import cli
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.execution.branching import branch_training
 from runner.execution.rerecord import evaluate, rerecord

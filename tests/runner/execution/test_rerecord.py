@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import Diverged, RecordingError, RunnerError
 from runner.execution import rerecord as again
 from runner.execution.rerecord import evaluate, rerecord

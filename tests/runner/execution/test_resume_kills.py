@@ -9,7 +9,7 @@ import time
 import pytest
 
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RunnerError
 from runner.execution import verify
 from runner.execution.resume import resume

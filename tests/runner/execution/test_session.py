@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 import runner
 from runner.config import ConfigError
-from runner.config.job import Job, jobs_of
+from runner.config.model import Job, jobs_of
 from runner.environments.loading import load_mdp
 from runner.errors import EnvironmentNotUsable, RunnerError, RunNotFound
 from runner.execution.session import run_job

@@ -10,7 +10,7 @@ import pytest
 from mcap.writer import Writer
 
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RecordingError
 from runner.execution.session import run_job
 from runner.execution.verify import verify

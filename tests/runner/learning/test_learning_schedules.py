@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.config.schedules import Exponential, Linear, Piecewise
+from runner.config.sections import Exponential, Linear, Piecewise
 from runner.learning.schedules import compile_schedule, schedule_value
 from tests.runner.learning import plain_schedules
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.config import ExperimentConfig, from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.execution.session import run_job
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import runner
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RecordingError
 from runner.execution.resume import resume
 from runner.execution.session import run_job

@@ -10,7 +10,7 @@ import pytest
 from blake3 import blake3
 from mcap.reader import make_reader
 
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.environments.loading import load_mdp
 from runner.execution.session import Session, recorder_for
 from runner.learning.learner import Learner

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from runner.config import load
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.execution.session import run_job
 from runner.runs.run import create_run
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import StorageError
 from runner.execution.session import run_job
 from runner.recording import pipeline, schema

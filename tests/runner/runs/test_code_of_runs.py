@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from runner.archive.restoring import restore
 from runner.cli import cli
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RecordingError
 from runner.execution.rerecord import rerecord
 from runner.execution.resume import resume

@@ -14,7 +14,7 @@ import runner
 from runner.cli import cli
 from runner.client.client import Client
 from runner.client.connection import ServerError
-from runner.client.uploads import put_upload
+from runner.client.transfer import put_upload
 from runner.runs.store import Store
 
 pytestmark = pytest.mark.usefixtures("outbox")

@@ -19,10 +19,10 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.client import uploads as client_module
+from runner.client import transfer as client_module
 from runner.client.client import Client
 from runner.client.connection import Backoff, ServerError, ServerUnavailable, checked_url, find_token
-from runner.client.uploads import append_upload, put_upload
+from runner.client.transfer import append_upload, put_upload
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
 from runner.runs.listing import list_runs

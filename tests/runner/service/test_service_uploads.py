@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from uploading import ANNA, BEN, begin, grow, over, send, source, start, visible
 
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RunnerError, RunNotFound
 from runner.execution.resume import resume
 from runner.execution.session import run_job

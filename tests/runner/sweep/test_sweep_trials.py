@@ -9,7 +9,7 @@ import pytest
 from sweeping import Here, described, digests, swept
 
 from runner.config import from_mapping
-from runner.config.job import Job
+from runner.config.model import Job
 from runner.errors import RunnerError
 from runner.execution.rerecord import rerecord
 from runner.execution.session import run_job
