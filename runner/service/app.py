@@ -217,7 +217,8 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         )
         if any(sweeps_in(folder) for folder in settings.recordings):
             app.state.sweep_processes.submit(limits.work_seconds, load_sweep_libraries)
-        LOG.info("started", extra=settings.log_fields())
+        logged = {name: getattr(settings, name) for name in ("host", "port", "needs_token", "workers")}
+        LOG.info("started", extra={"recordings": list(map(str, settings.recordings)), **logged})
         yield
         app.state.stopping.set()
         LOG.info("stopping")

@@ -53,8 +53,11 @@ class Catalogue:
 
     def version(self) -> Version | None:
         """Return what changes with every change of the index; None if the folders must be scanned first."""
-        now = version()
-        if now is None or not self._is_current(now):
+        now, scanned = version(), self._scanned_version
+        is_recent = time.monotonic() - self._scanned < 3 * self._interval
+        if now is None or not is_recent or self._scanned <= self._changed:
+            return None
+        if now.file != scanned.file or now.changes < scanned.changes:
             return None
         if time.monotonic() - self._started > self._interval:
             self.start_scan()
@@ -108,12 +111,6 @@ class Catalogue:
         _refuse_path(name)
         alike = self.read(lambda index: of_name(name, index))
         return [candidate.run() for candidate in alike] or [self.find(name)]
-
-    def _is_current(self, now: Version) -> bool:
-        """Return whether a recent scan has updated the index."""
-        recent = time.monotonic() - self._scanned < 3 * self._interval
-        same_file = now.file == self._scanned_version.file and now.changes >= self._scanned_version.changes
-        return recent and same_file and self._scanned > self._changed
 
     @property
     def _interval(self) -> float:

@@ -117,7 +117,10 @@ class Guard:
                 raise Unauthorized("token: found none, expected `Authorization: Bearer TOKEN`, or a login.")
             if "authorization" in headers:
                 return  # which no page of another site can make a browser send
-        if is_read and is_embedded_elsewhere(headers):
+        # A page of another site that embeds this one could not read it, but make the service work; following
+        # a link is another matter.
+        site, mode = headers.get("sec-fetch-site"), headers.get("sec-fetch-mode")
+        if is_read and site in ("cross-site", "same-site") and mode != "navigate":
             raise Refused(
                 HTTPStatus.FORBIDDEN, "origin: found a page of another site, expected the service's own."
             )
@@ -213,15 +216,6 @@ def is_allowed_host(header: str, hosts: tuple[str, ...]) -> bool:
     except ValueError:
         return False
     return True
-
-
-def is_embedded_elsewhere(headers: Mapping[str, str]) -> bool:
-    """Return whether a page of another site loads this as a part of itself, according to the browser.
-
-    It could not read the response, but make the service work; following a link is another matter.
-    """
-    site, mode = headers.get("sec-fetch-site"), headers.get("sec-fetch-mode")
-    return site in ("cross-site", "same-site") and mode != "navigate"
 
 
 def is_same_origin(headers: Mapping[str, str]) -> bool:

@@ -40,23 +40,22 @@ _QUIET: Final = ("/healthz", "/readyz", "/static/")
 """Successful requests below these paths are not logged."""
 
 
-class TextFormatter(logging.Formatter):
-    """Formats a record as a line for people, without secrets."""
+class LineFormatter(logging.Formatter):
+    """Formats a record as a line without secrets.
+
+    For people it is text; else one JSON object: time, level, event, and its extra fields.
+    """
+
+    def __init__(self, for_people: bool) -> None:
+        super().__init__()
+        self._for_people = for_people
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
-        return printable(_SECRET.sub(f"{PREFIX}***", self.line(record)))
+        line = super().format(record) if self._for_people else self._json(record)
+        return printable(_SECRET.sub(f"{PREFIX}***", line))
 
-    def line(self, record: logging.LogRecord) -> str:
-        """Return the line, perhaps with secrets."""
-        return super().format(record)
-
-
-class JsonFormatter(TextFormatter):
-    """Formats a record as one line of JSON: time, level, event, and its extra fields; without secrets."""
-
-    def line(self, record: logging.LogRecord) -> str:
-        """Return the line, perhaps with secrets."""
+    def _json(self, record: logging.LogRecord) -> str:
         moment = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
         fields = {"time": moment, "level": record.levelname.lower(), "event": record.getMessage()}
         fields |= {key: value for key, value in vars(record).items() if key not in _OWN}
@@ -74,7 +73,7 @@ def logged_to(stream: TextIO, for_people: bool = False) -> Iterator[None]:
     lines: queue.Queue[logging.LogRecord] = queue.Queue(MAX_WAITING)
     handler = _DroppingHandler(lines)
     handler.addFilter(_Thinning())
-    handler.setFormatter(TextFormatter() if for_people else JsonFormatter())
+    handler.setFormatter(LineFormatter(for_people))
     for name in _LOGGERS:
         logger = logging.getLogger(name)
         logger.handlers = [handler]

@@ -110,13 +110,3 @@ class ServiceSettings:
         """Return a message with paths relative to the service's folders."""
         archives = Path(default_target(self.recordings[0]))
         return without_folders(text, *self.recordings, archives, self.tokens.parent, cache_folder())
-
-    def log_fields(self) -> dict[str, object]:
-        """Return what is logged of the settings when the service starts."""
-        return {
-            "recordings": [str(folder) for folder in self.recordings],
-            "host": self.host,
-            "port": self.port,
-            "needs_token": self.needs_token,
-            "workers": self.workers,
-        }
