@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from runner.config import ExperimentConfig, from_mapping
@@ -73,13 +71,6 @@ def test_a_section_of_one_algorithm_counts_by_its_values(key):
 def test_every_key_is_covered_by_a_test_of_identity():
     tried = {key for values in (*SAME.values(), *OTHER.values()) for key in values} - {"mode"}
     assert tried | set(OF_ONE_ALGORITHM) == set(ExperimentConfig.model_fields)
-
-
-def test_the_content_of_a_job_is_json():
-    content = job().content()
-    assert json.loads(json.dumps(content)) == content
-    assert content["seed"] == 3
-    assert content["epsilon"]["over"] == 50
 
 
 def test_an_experiment_has_one_job_per_seed_in_order():
