@@ -185,7 +185,7 @@ class Field:
             if self.is_widened:
                 stored = np.frombuffer(data, self.stored_dtype.base)
                 values = stored.astype(self.dtype.base)
-                if values.astype(stored.dtype).tobytes() != data:
+                if not self.are_exact(values, stored):
                     raise self._refused()
                 return values.tobytes(), end
             return data, end

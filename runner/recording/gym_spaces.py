@@ -126,15 +126,19 @@ class RecordedSpace(Generic[SpaceT]):
     """A space as it is recorded; here one that Gymnasium knows nothing more of: its values become text.
 
     The text of a string is the string, of other values JSON, or their `repr`.
+
+    Args:
+        structure: describes the space of values that are recorded as JSON which gives them back.
     """
 
-    comes_from_text = False
-    """Whether values are recorded as JSON that gives them back."""
     dtype: DType | None = None
     """The dtype of a leaf's values with their shape; None for values that are recorded as text."""
 
-    def __init__(self, space: SpaceT) -> None:
+    def __init__(self, space: SpaceT, structure: Description | None = None) -> None:
         self.space = space
+        self._structure = structure
+        self.comes_from_text = structure is not None
+        """Whether values are recorded as JSON that gives them back."""
 
     def leaves(self, where: str) -> Iterator[tuple[Keys, RecordedSpace[Any]]]:  # noqa: ARG002
         """Yield the parts without parts, and their keys, in the order of the description.
@@ -168,12 +172,7 @@ class RecordedSpace(Generic[SpaceT]):
     def describe(self) -> Description:
         """Return the space as JSON, which `runner.recording.spaces` reads."""
         text = {"type": "Text", "max_length": _MAX_TEXT, "holds": repr(self.space)[:_MAX_REPR]}
-        structure = self.structure()
-        return text | ({"space": structure} if structure else {})
-
-    def structure(self) -> Description:
-        """Return what describes the space of values that are recorded as text; empty if it is unknown."""
-        return {}
+        return text if self._structure is None else text | {"space": self._structure}
 
     def widened(self, value: object) -> Space:  # noqa: ARG002
         """Return an action space in whose dtypes an action, or a batch of actions, is exact.
@@ -248,11 +247,10 @@ class _Composite(RecordedSpace[Space]):
 
 
 class _Sequence(RecordedSpace[spaces.Sequence]):
-    comes_from_text = True
-
     def __init__(self, space: spaces.Sequence) -> None:
-        super().__init__(space)
         self.part = recorded_space(space.feature_space)
+        structure = {"type": "Sequence", "space": self.part.describe(), "stack": bool(space.stack)}
+        super().__init__(space, structure)
 
     def to_json(self, value: Value) -> Value:
         values = iterate(self.space.stacked_feature_space, value) if self.space.stack else value
@@ -261,16 +259,11 @@ class _Sequence(RecordedSpace[spaces.Sequence]):
     def from_json(self, data: Value) -> Value:
         return self.part.batch(data) if self.space.stack else tuple(map(self.part.from_json, data))
 
-    def structure(self) -> Description:
-        return {"type": "Sequence", "space": self.part.describe(), "stack": bool(self.space.stack)}
-
 
 class _OneOf(RecordedSpace["spaces.OneOf[Any]"]):
-    comes_from_text = True
-
     def __init__(self, space: spaces.OneOf[Any]) -> None:
-        super().__init__(space)
         self.parts = [*map(recorded_space, space.spaces)]
+        super().__init__(space, {"type": "OneOf", "spaces": [part.describe() for part in self.parts]})
 
     def to_json(self, value: Value) -> Value:
         index = int(value[0])
@@ -281,17 +274,13 @@ class _OneOf(RecordedSpace["spaces.OneOf[Any]"]):
             raise ValueError(f"found the part {data[0]} of {self.space}")
         return np.int64(data[0]), self.parts[data[0]].from_json(data[1])
 
-    def structure(self) -> Description:
-        return {"type": "OneOf", "spaces": [part.describe() for part in self.parts]}
-
 
 class _Graph(RecordedSpace[spaces.Graph]):
-    comes_from_text = True
-
     def __init__(self, space: spaces.Graph) -> None:
-        super().__init__(space)
         self.node = recorded_space(space.node_space)
         self.edge = None if space.edge_space is None else recorded_space(space.edge_space)
+        edge = None if self.edge is None else self.edge.describe()
+        super().__init__(space, {"type": "Graph", "node_space": self.node.describe(), "edge_space": edge})
 
     def to_json(self, value: Value) -> Value:
         nodes, edges = (
@@ -308,15 +297,9 @@ class _Graph(RecordedSpace[spaces.Graph]):
             edge_links=None if links is None else np.array(links, np.int64).reshape(-1, 2),
         )
 
-    def structure(self) -> Description:
-        edge = None if self.edge is None else self.edge.describe()
-        return {"type": "Graph", "node_space": self.node.describe(), "edge_space": edge}
-
 
 class _Registered(RecordedSpace[Space]):
     """A space of a user's own."""
-
-    comes_from_text = True
 
     def __init__(
         self,
@@ -325,8 +308,7 @@ class _Registered(RecordedSpace[Space]):
         from_json: Callable[[Value], object],
         space: Space,
     ) -> None:
-        super().__init__(space)
-        self._cls = cls
+        super().__init__(space, {"type": f"{cls.__module__}:{cls.__qualname__}"})
         self._to_json = to_json
         self._from_json = from_json
 
@@ -335,9 +317,6 @@ class _Registered(RecordedSpace[Space]):
 
     def from_json(self, data: Value) -> Value:
         return self._from_json(data)
-
-    def structure(self) -> Description:
-        return {"type": f"{self._cls.__module__}:{self._cls.__qualname__}"}
 
 
 class _Text(RecordedSpace[spaces.Text]):

@@ -209,21 +209,19 @@ class Index:
                 self.chunks.set_channel(int.from_bytes(raw.body[:2], "little"))
             case Opcode.CHUNK_INDEX:
                 entry = _chunk_entry(raw)
-                self._check_place("chunk", *entry[:2])
+                self._place("chunk", entry)
                 self.chunks.append(entry)
             case Opcode.METADATA:
                 self.add_metadata(_text(raw, 0)[0], raw.place)
             case Opcode.METADATA_INDEX:
                 metadata = _parse(MetadataIndex, raw)
-                self._check_place("metadata", metadata.offset, metadata.length)
-                self.add_metadata(metadata.name, (metadata.offset, metadata.length))
+                self.add_metadata(metadata.name, self._place("metadata", metadata))
             case Opcode.ATTACHMENT:
                 name, at = _text(raw, 16)
                 self.add_attachment(name, raw.place, _text(raw, at)[0])
             case Opcode.ATTACHMENT_INDEX:
                 attachment = _parse(AttachmentIndex, raw)
-                self._check_place("attachment", attachment.offset, attachment.length)
-                place = attachment.offset, attachment.length
+                place = self._place("attachment", attachment)
                 self.add_attachment(attachment.name, place, attachment.media_type)
             case Opcode.SCHEMA:
                 schema = _parse(Schema, raw)
@@ -247,11 +245,14 @@ class Index:
         _add_once(self.attachments, name, place, "attachment")
         self.media_types[name] = media_type
 
-    def _check_place(self, what: str, offset: int, length: int) -> None:
+    def _place(self, what: str, entry: ChunkEntry | MetadataIndex | AttachmentIndex) -> Place:
+        """Return the place that an entry of the index states, within the data."""
+        offset, length = entry.offset, entry.length
         if offset < len(MAGIC) or length < RECORD_HEAD.size or offset + length > self.end:
             raise RecordingError(
                 f"the index points to {what} of {length} bytes at {offset}, outside the data"
             )
+        return offset, length
 
     def take_records(self, stream: BinaryIO) -> None:
         """Add the records of the data section, up to the last whole one, by their beginnings.

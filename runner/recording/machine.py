@@ -65,11 +65,6 @@ class Stopwatch:
         return True
 
     @property
-    def has_begun(self) -> bool:
-        """Whether the session has begun."""
-        return self._origin is not None
-
-    @property
     def seconds(self) -> float:
         """Seconds since the beginning of the session; 0 before."""
         return 0.0 if self._origin is None else time.monotonic() - self._origin

@@ -65,7 +65,7 @@ class Observer:
 
     def wants_host(self) -> bool:
         """Return whether a sample of the machine is due."""
-        return self.host and self._stopwatch.has_begun and self._stopwatch.seconds >= self._next_host
+        return self.host and self._stopwatch.seconds_at(time.monotonic()) >= self._next_host
 
     def see_host(self, sample: Message) -> None:
         """Take in a sample of the machine."""
@@ -83,7 +83,7 @@ class Observer:
 
     def write(self, now: float, stream: int, text: str) -> None:
         """Take in output; what came before the run began, or in its pause, is none of it."""
-        if self.console is not None and self._stopwatch.has_begun and self._stopwatch.seconds_at(now) >= 0:
+        if self.console is not None and self._stopwatch.seconds_at(now) >= 0:
             self.console.write(now, stream, text)
 
     def _see(self, topic: Topic, now: float, fields: dict[str, object]) -> None:
