@@ -65,7 +65,7 @@ from runner.sweep.results import Results, effects_sections, ranking_sections
 from runner.util.extras import require
 from runner.util.humanize import sentence
 from runner.util.values import finite
-from runner.views.sweep_show import sweep_show
+from runner.views.sweeps import sweep_show
 from runner.views.view import Given
 
 MAX_ROWS: Final = 1000

@@ -36,8 +36,7 @@ from runner.service.errors import EXPECTED
 from runner.service.pages.rendering import Page, StatusName, installed_names, run_page
 from runner.service.problems import filled, media_docs, status_of
 from runner.views import shipped_views, view_named
-from runner.views.find import VIEW as FIND
-from runner.views.sql import VIEW as SQL
+from runner.views.queries import FIND, SQL
 from runner.views.view import Input, View, rows_in
 
 api = APIRouter()

@@ -1,6 +1,6 @@
 """Views: questions about recorded runs, each asked once. Commands, routes and pages are derived from them.
 
-A view is a module with a `VIEW`. It imports heavy packages in its function, so that help is quick. Installed
+A view is a function and a `View`. It imports heavy packages in its function, so that help is quick. Installed
 packages add views by entry points, see `runner.util.extras`.
 """
 
@@ -14,30 +14,31 @@ from typing import Final
 from runner.util import extras
 from runner.views.view import View
 
-NAMES: Final = (
-    "episodes",
-    "evaluations",
-    "qtable",
-    "when",
-    "why",
-    "checkpoints",
-    "system",
-    "console",
-    "code",
-    "diff",
-    "compare",
-    "show",
-    "verify",
-    "values",
-    "du",
-    "ls",
-    "find",
-    "sql",
-    "table",
-    "sweep show",
-    "sweep ls",
-)
-"""The shipped views, each the module of its name with `_`; those of one run in the order of their tabs."""
+_MODULES: Final = {
+    "episodes": "recorded",
+    "evaluations": "recorded",
+    "qtable": "tables",
+    "when": "tables",
+    "why": "tables",
+    "checkpoints": "recorded",
+    "system": "recorded",
+    "console": "recorded",
+    "code": "recorded",
+    "diff": "compare",
+    "compare": "compare",
+    "show": "runs",
+    "verify": "verify",
+    "values": "tables",
+    "du": "runs",
+    "ls": "runs",
+    "find": "queries",
+    "sql": "queries",
+    "table": "tables",
+    "sweep show": "sweeps",
+    "sweep ls": "sweeps",
+}
+"""The shipped views, each in capitals in its module; those of one run in the order of their tabs."""
+NAMES: Final = tuple(_MODULES)
 
 
 def shipped_views() -> Iterator[View]:
@@ -54,5 +55,6 @@ def view_named(name: str) -> View:
     """
     if name not in NAMES:
         return extras.load_plugin(extras.VIEWS, name, View)
-    view: View = import_module(f"runner.views.{name.replace(' ', '_')}").VIEW
+    module = import_module(f"runner.views.{_MODULES[name]}")
+    view: View = getattr(module, name.upper().replace(" ", "_"))
     return view

@@ -156,4 +156,4 @@ def _as_json(found: Verification) -> Json:
     }
 
 
-VIEW: Final = View("verify", "Verification", verify, subject="file")
+VERIFY: Final = View("verify", "Verification", verify, subject="file")

@@ -31,7 +31,7 @@ from runner.service.catalogue import Catalogue
 from runner.service.computed import link
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
 from runner.service.pages.rendering import Page, message_of, render, viewer_of
-from runner.views.ls import VIEW as LS
+from runner.views.runs import LS
 
 router = APIRouter(include_in_schema=False)
 

@@ -8,7 +8,7 @@ from runner.analysis.episodes import EXPECTED_OF_TRAINING, EpisodeRef
 from runner.errors import RunnerError
 from runner.recording import recorder
 from runner.recording.reader import open_recording
-from runner.views.episodes import episodes
+from runner.views.recorded import episodes
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from loop_replays import serving
 import runner
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from runner.views.why import VIEW
+from runner.views.tables import WHY
 from tests.runner.export.outline import Outline
 from tests.runner.recording.making import LAKE, make_run
 
@@ -108,6 +108,6 @@ def test_the_page_and_the_api_do_not_share_what_is_cached(client, recordings):
     answer = client.get(
         f"/api/v1{RUN}/why",
         params={name: str(value) for name, value in asked.items()}
-        | {"limit": dict(VIEW.page_values)["limit"]},
+        | {"limit": dict(WHY.page_values)["limit"]},
     )
     assert answer.json()["run_id"]

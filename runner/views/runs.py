@@ -1,4 +1,4 @@
-"""`ls`: the recorded runs as a table, ids, CSV or JSON."""
+"""Views of runs: the list of them, all about one, and the disk that they use."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -26,11 +27,16 @@ from runner.runs.catalogue.columns import (
 from runner.util.humanize import capitalised
 from runner.util.row_text import csv_lines, json_list
 from runner.util.values import Json
-from runner.views.view import NO_PROGRESS, ONLY_HERE, ShownProgress, View, view_input
+from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
+    from runner.analysis.sections import Section
+    from runner.analysis.summary import RunDetails
     from runner.runs.catalogue.filters import Filter
     from runner.runs.catalogue.index import CatalogueIndex
+    from runner.runs.catalogue.usage import Sums, Usage
+    from runner.runs.run import Run
+    from runner.util.values import Json
 
 ON_A_TERMINAL: Final = 50
 """Runs listed on a terminal by default."""
@@ -273,7 +279,7 @@ def ls(
     return Listing(folders, matching, shown, sort, limit, offset, progress.say)
 
 
-VIEW: Final = View(
+LS: Final = View(
     "ls",
     "Runs",
     ls,
@@ -283,3 +289,127 @@ VIEW: Final = View(
     '`age < "12h"`, `digest is None`, joined by `and`, `or`, `not` and parentheses.',
     forms=("quiet", "csv", "json", "markdown"),
 )
+
+
+def show(run: Run, progress: ShownProgress = NO_PROGRESS) -> ReadyAnswer:
+    """Show a run: its evaluations, tables, configuration and provenance.
+
+    --json also prints the whole series: `eval` has an object for each evaluation, with the training episodes
+    before it, success_percent, mean_length, mean_penalties and the count of every event; `optimality` its
+    exact measures, if the run takes them; `train` an object for each report of training; `loop` the last
+    results of a loop: its last evaluation, the means of its last 100 training episodes and the last values it
+    logged; `extras` the names of the values that it recorded with its steps; `first_resets` the seed and the
+    options of the first reset of each phase; `checkpoints` those of its agent; `marks` the marks at its
+    steps; `processes` the processes that recorded it together; `origin` the run and step that it was branched
+    from; and `branches` its branches by run id.
+
+    Examples:
+      dualtaxi show @latest
+      dualtaxi show k3v9m2xq --json
+    """
+    from runner.analysis.summary import describe_run
+    from runner.runs.catalogue.index import look
+
+    folders = [] if run.stands_alone else [run.folder.parent]
+    branches = look(folders, lambda index: index.branches(run.run_id), progress.say)
+    details = replace(describe_run(run, progress.say), branches=branches)
+    return ReadyAnswer(details.as_json(), _show_sections(details, progress))
+
+
+def _show_sections(details: RunDetails, progress: ShownProgress) -> Iterator[Section]:
+    from runner.analysis.summary import random_policy_sentence
+    from runner.recording.reader import open_recording
+
+    first, *others = details.sections()
+    file = {"file": str(details.run.recording)} if details.bytes else {}
+    yield replace(first, facts={**first.facts, **file})
+    yield from others
+    if details.evaluations:  # after all else: it may take seconds to compute
+        with (
+            progress.stage("evaluating a random policy"),
+            open_recording(details.run.recording) as recording,
+        ):
+            sentence = random_policy_sentence(recording)
+        if sentence:
+            yield Section("Baseline", [sentence])
+
+
+SHOW: Final = View("show", "Overview", show, subject="any run")
+
+
+_LARGEST: Final = 20
+"""Runs in the text by default."""
+
+
+@dataclass(frozen=True)
+class DiskUsage(Answer):
+    """The disk usage of runs, measured when a form of it is needed: the text has a few, JSON has all."""
+
+    measured: Callable[[int | None], tuple[list[Usage], Sums]]
+    """Takes the number of the largest runs to return, None for all."""
+    folders: Sequence[Path]
+    limit: int | None
+    nothing: str
+    """The message where there are no runs."""
+    say: Callable[[str], None]
+
+    def as_json(self) -> Json:
+        """Return the runs, the totals and what could be freed, in bytes."""
+        largest, sums = self.measured(self.limit or None)
+        runs = [
+            {
+                "run_id": usage.row["id"],
+                **{key: usage.row[key] for key in ("name", "status", "same_as")},
+                "path": str(Path(usage.row["root"], usage.row["entry"])),
+                **usage.bytes,
+            }
+            for usage in largest
+        ]
+        return {"runs": runs, "total": sums.bytes, "freeable": sums.freeable(self.folders)}
+
+    def sections(self) -> Iterator[Section]:
+        """Yield the largest runs and the totals, and what could be freed."""
+        from runner.analysis.summary import usage_sections
+
+        largest, sums = self.measured(_LARGEST if self.limit is None else self.limit or None)
+        if sums.runs:
+            yield from usage_sections(largest, sums, sums.freeable(self.folders))
+        else:
+            self.say(self.nothing)
+
+
+def du(
+    folders: Sequence[Path],
+    words: Sequence[str] = ONLY_HERE,
+    limit: int | None = view_input(
+        "limit",
+        f"Maximum number of rows, 0 for all.  [default: {_LARGEST}, with --json all]",
+        kind=int,
+    ),
+    progress: ShownProgress = NO_PROGRESS,
+) -> DiskUsage:
+    """Show the disk usage of the runs that match FILTER (as in `dualtaxi ls`), or of all, largest first.
+
+    It counts recordings; exports made by `view` and recordings restored from archives, both kept in the
+    user's cache and made again when needed; and other files in the folders of runs. The totals and what could
+    be freed come last.
+
+    Examples:
+      dualtaxi du
+      dualtaxi du 'status == "finished" and age > "30d"' --limit 5
+    """
+    from runner.runs.catalogue.filters import parse
+    from runner.runs.catalogue.index import look
+    from runner.runs.catalogue.usage import usage_of
+
+    chosen, searched = parse(" ".join(words)), ", ".join(map(str, folders))
+    return DiskUsage(
+        lambda count: usage_of(lambda work: look(folders, work, progress.say), chosen, count),
+        folders,
+        limit,
+        f"No run in {searched} matches." if words else "No runs yet.",
+        progress.say,
+    )
+
+
+DU: Final = View("du", "Disk", du, subject="folders")

@@ -1,4 +1,4 @@
-"""`sweep show`: the results of a sweep."""
+"""Views of sweeps."""
 
 from __future__ import annotations
 
@@ -6,10 +6,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from runner.views.view import NO_PROGRESS, ShownProgress, View, view_input
+from runner.analysis.sections import Section
+from runner.sweep import sweeps_in
+from runner.views.view import NO_PROGRESS, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.sweep.results import Results
+
+
+def sweep_ls(recordings: Path) -> ReadyAnswer:
+    """List the sweeps of a recordings folder.
+
+    Example:
+      dualtaxi sweep ls
+    """
+    names = sweeps_in(recordings)
+    return ReadyAnswer(
+        {"sweeps": names},
+        [Section("", names)] if names else [],
+        lines={"text": [f"{name}\n" for name in names]},
+        remarks=[] if names else ["No sweeps yet. `dualtaxi sweep run FILE` starts one."],
+    )
+
+
+SWEEP_LS: Final = View("sweep ls", "Sweeps", sweep_ls, subject="folder")
 
 
 def sweep_show(
@@ -36,7 +56,7 @@ def sweep_show(
     return replace(results, shown=None) if everything else results
 
 
-VIEW: Final = View(
+SWEEP_SHOW: Final = View(
     "sweep show",
     "Sweep",
     sweep_show,
