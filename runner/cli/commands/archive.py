@@ -1,7 +1,9 @@
-"""`dualtaxi archive`, `restore` and `import`: runs to and from archives and files."""
+"""`dualtaxi archive`, `restore`, `import` and `checkpoint`: runs and checkpoints in archives and files."""
 
 from __future__ import annotations
 
+import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -9,14 +11,15 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.archive.places import default_target
-from runner.cli.command import Command, argument, option
-from runner.cli.options import recordings_option, runs_argument
-from runner.cli.output import Remark, Reply, say
+from runner.cli.command import Command, CommandGroup, argument, option
+from runner.cli.options import force_option, output_option, recordings_option, runs_argument
+from runner.cli.output import Remark, Reply, path_and_size, say, written
 from runner.cli.parameter_types import PATH, RunName
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import compilation_notice, find, received, run_reply
+from runner.cli.runs import compilation_notice, find, received, recorded_run, run_reply
 from runner.errors import RunnerError
-from runner.runs.run import recordings_folder
+from runner.export.places import new_file
+from runner.runs.run import Run, recordings_folder
 from runner.util.humanize import size
 from runner.util.row_text import json_lines
 
@@ -137,3 +140,40 @@ def import_command(
     is_same = run.summary.get("content_digest", digest) == digest
     existing = ("this content" if is_same else "this content and more") if imported.already else ""
     return received(run, digest, existing, anonymous=imported.anonymous)
+
+
+@click.group("checkpoint", cls=CommandGroup)
+def checkpoint_command() -> None:
+    """Get a checkpoint of a run.
+
+    Example:
+      dualtaxi checkpoint get cartpole @latest -o policy.safetensors
+    """
+
+
+@checkpoint_command.command("get", short_help="Write a checkpoint into a file.")
+def get_command(
+    run: Run = recorded_run,
+    reference: str = argument(metavar="[NAME]@STEP", default="@latest"),
+    output: Path | None = output_option("NAME-STEP.FORMAT"),
+    force: bool = force_option,
+) -> Reply:
+    """Write a checkpoint of RUN into a file, after comparing its digest.
+
+    @STEP is the last checkpoint at or before that step, NAME@STEP the last one of that name; @latest is the
+    last of all, and the default. Nothing is unpickled.
+
+    Examples:
+      dualtaxi checkpoint get cartpole @20000 -o policy.safetensors
+      dualtaxi checkpoint get cartpole policy@latest -o policy.safetensors
+    """
+    from runner.runs.checkpoints import find_checkpoint
+
+    checkpoint = find_checkpoint(run.checkpoints(), reference, f"run {run.run_id}")
+    name = re.sub(r"[^\w.+=-]", "_", checkpoint.name)
+    path = output or Path(f"{name}-{checkpoint.step}.{checkpoint.format}")
+    checkpoint.check()
+    with new_file(path, force) as temporary:
+        shutil.copyfile(checkpoint.path, temporary)
+    text = f"{path_and_size(path)}, {checkpoint.reference}, {checkpoint.format}"
+    return written(text, path, **checkpoint.as_json())

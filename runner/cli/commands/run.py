@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.jobs import job_option
-from runner.cli.options import config_argument, recordings_option, set_option, workers_option
+from runner.cli.options import config_argument, job_option, recordings_option, set_option, workers_option
 from runner.cli.output import Reply, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line

@@ -14,9 +14,9 @@ import click
 
 from runner.cli import ViewGroup
 from runner.cli.command import argument, option
-from runner.cli.jobs import job_option
 from runner.cli.options import (
     accept_changes_option,
+    job_option,
     ray_option,
     recordings_option,
     workers_option,

@@ -15,11 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from runner.cli.commands import remove
+from runner.cli.commands import catalogue
 from runner.config import from_mapping
 from runner.recording.labels import LABELS_FILE
-from runner.runs.listing import list_runs
-from runner.runs.locking import locked
+from runner.runs.listing import list_runs, locked
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
@@ -48,7 +47,7 @@ def answer(monkeypatch):
             def isatty(self):
                 return True
 
-        monkeypatch.setattr(remove.sys, "stdin", Terminal(text))
+        monkeypatch.setattr(catalogue.sys, "stdin", Terminal(text))
         monkeypatch.setattr("click.termui.visible_prompt_func", lambda *_: text)
 
     return answers
@@ -329,7 +328,7 @@ def test_a_run_that_is_tagged_while_others_are_removed_stays_and_is_named(
     def confirmed(*_):
         command("label", runs[1].run_id, "--tag", "keep")
 
-    monkeypatch.setattr(remove, "_confirm", confirmed)
+    monkeypatch.setattr(catalogue, "_confirm", confirmed)
     result = command("prune", 'name == "some"', *(["--json"] if as_json else []))
     assert result.exit_code == 2
     assert f"run {runs[1].run_id} stays: it is tagged keep" in " ".join(result.stderr.split())

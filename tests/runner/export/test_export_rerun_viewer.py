@@ -17,7 +17,7 @@ from click.testing import CliRunner
 
 from runner.analysis.episodes import EpisodeRef
 from runner.cli import cli
-from runner.cli.commands import view
+from runner.cli.commands import play
 from runner.errors import RunnerError, StorageError
 from runner.export.rerun import viewer, writing
 from runner.export.rerun.selection import Request, locate
@@ -117,7 +117,7 @@ def test_the_stages_of_view_are_shown_on_a_terminal(pictured, monkeypatch, names
         shown.append(stage)
         yield shown.append
 
-    monkeypatch.setattr(view, "stage_line", stage_line)
+    monkeypatch.setattr(play, "stage_line", stage_line)
     monkeypatch.setattr(viewer, "screenshot", lambda *_: None)
     runs = [str(pictured(world).folder) for world in ("taxis", "rivals")[:names]]
     done = CliRunner().invoke(cli, ["view", *runs, "--screenshot", "step.png", "--force"])
