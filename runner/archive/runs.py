@@ -22,11 +22,11 @@ from runner.recording.integrity import may_be_cut, survey
 from runner.recording.marks import read_marks
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
+from runner.runs.checkpoints import Store
 from runner.runs.importing import merge_marks
-from runner.runs.locking import locked
+from runner.runs.listing import locked
 from runner.runs.resolve import run_of_id
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
-from runner.runs.store import Store
 from runner.util.processes import Report
 from runner.util.values import Json
 

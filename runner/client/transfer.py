@@ -15,9 +15,9 @@ from filelock import FileLock, Timeout
 
 from runner.client.connection import Connection, Report, ServerError, ServerUnavailable
 from runner.errors import RecordingError, RunnerError
+from runner.runs.checkpoints import Store
 from runner.runs.importing import Imported, import_record, import_recording
 from runner.runs.run import Run
-from runner.runs.store import Store
 from runner.util.files import hash_of, require_room, storage_errors
 from runner.util.values import Json
 

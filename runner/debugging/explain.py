@@ -41,8 +41,7 @@ from runner.execution.session import resolve_initial_q, run_job
 from runner.recording.labels import Labels
 from runner.replay.trust import require_may_train
 from runner.runs.catalogue.removal import plan, remove
-from runner.runs.listing import list_runs
-from runner.runs.locking import acquired
+from runner.runs.listing import acquired, list_runs
 from runner.runs.resolve import find_run
 from runner.runs.run import UNLISTED, Run, new_run, recordings_folder, require_trained
 from runner.sweep.workers import Workers, worker_pool

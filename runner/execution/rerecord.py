@@ -35,7 +35,7 @@ from runner.replay.steps import blank_steps, first_of, last_step, put_states, wh
 from runner.replay.tables import tables_at
 from runner.replay.trust import require_may_train
 from runner.runs import run as runs
-from runner.runs.locking import locked
+from runner.runs.listing import locked
 from runner.runs.provenance import provenance
 from runner.runs.run import Run, unless_empty
 from runner.util.arrays import Ints, Records

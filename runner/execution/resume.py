@@ -48,8 +48,7 @@ from runner.recording.run_file import owner
 from runner.recording.writer import RecordingFile, writing
 from runner.replay.trust import require_may_train
 from runner.runs.code import CodeCollector
-from runner.runs.listing import run_at
-from runner.runs.locking import locked
+from runner.runs.listing import locked, run_at
 from runner.runs.provenance import Differences, differing_provenance, provenance
 from runner.runs.run import RECORDING_FILE, Run
 from runner.util.files import storage_errors

@@ -24,8 +24,7 @@ from runner.recording import schema
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
 from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic, topics_of
-from runner.runs.checkpoints import MAX_CHECKPOINTS, MAX_NAME_LENGTH, is_checkpoint_name
-from runner.runs.store import Store
+from runner.runs.checkpoints import MAX_CHECKPOINTS, MAX_NAME_LENGTH, Store, is_checkpoint_name
 from runner.util.extras import require
 from runner.util.jsonable import as_json, exact_json, is_exact, is_packed, packed
 from runner.util.values import flatten, is_utf8

@@ -23,12 +23,10 @@ from runner.recording.marks import MARKS_FILE, Marks, change_marks, marks_from, 
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
 from runner.recording.run_file import parse_run_file
-from runner.runs.checkpoints import read_checkpoints
-from runner.runs.listing import run_at
-from runner.runs.locking import locked
+from runner.runs.checkpoints import Store, read_checkpoints
+from runner.runs.listing import locked, run_at
 from runner.runs.resolve import run_with_id
 from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, made_by, new_run_id
-from runner.runs.store import Store
 from runner.util.files import require_room, storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView, is_number
 

@@ -1,16 +1,20 @@
-"""The runs of a recordings folder, as they are found on disk."""
+"""The runs of a recordings folder, as they are found on disk, and the locks on them."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from runner.errors import RecordingError, RunNotFound, StorageError
+from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.recording.run_file import RUN_ID
 from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, made_by, recordings_folder
-from runner.util.files import read_object
+from runner.util.files import read_object, storage_errors
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 MAX_RUN_FILE_BYTES: Final = 8 << 20
 
@@ -102,3 +106,50 @@ def _from_recording(path: Path) -> Run:
     if not _is_run(facts):
         raise RecordingError(f"{path}: is damaged: its description of the run is invalid.")
     return Run(path.parent, facts)
+
+
+RUN_LOCK: Final = "owner.lock"
+
+
+@contextlib.contextmanager
+def locked(run: Run, archived: bool = False) -> Iterator[Run]:
+    """Lock the folder of a run, and yield the run as it is now.
+
+    Raises:
+        RunnerError: it is running or archived, or locked by another process.
+        StorageError: the folder cannot be written.
+    """
+    busy = RunnerError(f"run {run.run_id} is locked by another process; try again when it has finished.")
+    lock = acquired(run.folder / RUN_LOCK, busy)
+    try:
+        if not run.stands_alone:
+            run = run_at(run.folder)
+        if run.status == "running":
+            owner = run.file.owner
+            raise RunnerError(
+                f"run {run.run_id} is running (process {owner.get('pid')} on {owner.get('host')}); "
+                "try again when it has finished."
+            )
+        if run.status == "archived" and not archived:
+            raise RunnerError(f"run {run.run_id} is archived; `dualtaxi restore {run.run_id}` restores it.")
+        yield run
+    finally:
+        lock.release()
+
+
+def acquired(path: Path, busy: RunnerError) -> FileLock:
+    """Acquire the lock of a file without waiting; the caller releases it.
+
+    Args:
+        path: the lock file; its folder is created if it is missing.
+        busy: raised if another process has the lock.
+    """
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(path, thread_local=False)
+    with storage_errors(path.parent):
+        try:
+            lock.acquire(blocking=False)
+        except Timeout as error:
+            raise busy from error
+    return lock

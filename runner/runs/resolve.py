@@ -16,8 +16,8 @@ from runner.util.humanize import counted
 from runner.util.values import RUN_NAME_PATTERN
 
 if TYPE_CHECKING:
+    from runner.runs.catalogue.database import Candidate
     from runner.runs.catalogue.index import CatalogueIndex
-    from runner.runs.catalogue.rows import Candidate
     from runner.util.processes import Tell
 
 LATEST: Final = "@latest"

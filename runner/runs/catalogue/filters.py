@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from runner.errors import RunnerError, nearest
 from runner.runs.catalogue.columns import SETTING, STATUSES, TEXT_KINDS, Column, ColumnKind, field_of
-from runner.runs.catalogue.rows import SEED_SHIFT, Sql
+from runner.runs.catalogue.database import SEED_SHIFT, Sql
 from runner.util.expressions import CONDITION, NUMBER, Operation, Parser, Term
 
 MAX_DEPTH: Final = 16

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from runner.recording.labels import LABELS_FILE
-from runner.runs.catalogue.database import transaction, write_rows
-from runner.runs.catalogue.rows import STORED, row_of
+from runner.runs.catalogue.database import STORED, row_of, transaction, write_rows
 from runner.runs.listing import run_entries, run_in
 from runner.runs.run import RECORDING_FILE, RUN_FILE
 

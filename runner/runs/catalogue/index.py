@@ -18,18 +18,21 @@ from runner.errors import RunnerError, nearest
 from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, ColumnKind, IndexRow, field_of, with_same_as
 from runner.runs.catalogue.database import (
+    SEED_SHIFT,
+    Candidate,
+    Sql,
     create,
     identity,
     index_path,
     open_index,
     pragma,
     renew,
+    text,
     transaction,
     version,
 )
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.catalogue.folders import Folders
-from runner.runs.catalogue.rows import SEED_SHIFT, Candidate, Sql, text
 from runner.runs.run import check_folder_name
 
 if TYPE_CHECKING:

@@ -23,14 +23,13 @@ from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_readable
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.catalogue.columns import IndexRow, moment
+from runner.runs.catalogue.database import Sql
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
-from runner.runs.catalogue.rows import Sql
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
-from runner.runs.listing import listed_run
-from runner.runs.locking import locked
+from runner.runs.checkpoints import Store
+from runner.runs.listing import listed_run, locked
 from runner.runs.run import Run
-from runner.runs.store import Store
 from runner.util.files import EPISODES, cache_folder
 from runner.util.humanize import listed
 

@@ -18,9 +18,9 @@ from runner.recording.marks import MARKS_FILE, MARKS_LOCK
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
-from runner.runs.locking import RUN_LOCK
+from runner.runs.checkpoints import Store
+from runner.runs.listing import RUN_LOCK
 from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
-from runner.runs.store import Store
 from runner.runs.trust_marks import MARK_FILE
 from runner.util.files import EPISODES, EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 

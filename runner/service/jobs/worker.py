@@ -44,8 +44,7 @@ from runner.execution.branching import train_branch
 from runner.execution.resume import resume
 from runner.execution.session import Progress, Report, evaluation_brief, run_job
 from runner.recording.reader import open_recording
-from runner.runs.listing import run_at
-from runner.runs.locking import locked
+from runner.runs.listing import locked, run_at
 from runner.runs.resolve import run_of_id
 from runner.runs.run import Run, create_run
 from runner.service.jobs.checking import BranchQuestion, ExplainQuestion

@@ -15,9 +15,8 @@ from blake3 import blake3
 import runner
 from runner.errors import ConfigError, RecordingError, RunnerError
 from runner.execution.verify import verify
-from runner.runs.checkpoints import arrays_in
+from runner.runs.checkpoints import Store, arrays_in
 from runner.runs.resolve import find_run
-from runner.runs.store import Store
 from tests.runner.loops.making import dualtaxi, make, play
 from tests.runner.loops.test_loops_extras import Tensor
 

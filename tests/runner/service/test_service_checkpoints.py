@@ -15,7 +15,7 @@ from runner.cli import cli
 from runner.client.client import Client
 from runner.client.connection import ServerError
 from runner.client.transfer import put_upload
-from runner.runs.store import Store
+from runner.runs.checkpoints import Store
 
 pytestmark = pytest.mark.usefixtures("outbox")
 

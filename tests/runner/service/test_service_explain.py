@@ -13,7 +13,7 @@ import runner
 from runner.debugging.explain import ask
 from runner.debugging.explanation import FOLDER, LOCK
 from runner.errors import RunnerError
-from runner.runs.locking import acquired
+from runner.runs.listing import acquired
 from runner.runs.resolve import find_run
 from tests.waiting import until
 
