@@ -28,6 +28,7 @@ from runner.analysis.diff.divergence import (
     unbroken,
 )
 from runner.analysis.diff.extent import (
+    ActionDiff,
     MetricDiff,
     Overlap,
     TableDiff,
@@ -67,16 +68,6 @@ class Identity(TypedDict):
 
 
 @dataclass(frozen=True)
-class TransitionChange:
-    """The names of a state and a joint action whose outcomes differ, and descriptions of the outcomes."""
-
-    state: str
-    action: str
-    a: str
-    b: str
-
-
-@dataclass(frozen=True)
 class EnvironmentDiff:
     """How two environments differ."""
 
@@ -85,7 +76,8 @@ class EnvironmentDiff:
     """How many (state, action) pairs have other outcomes."""
     of: int = 0
     """How many pairs there are; 0 if the environments have other states or actions."""
-    examples: list[TransitionChange] = field(default_factory=list)
+    examples: list[ActionDiff[str]] = field(default_factory=list)
+    """Some of these pairs, and descriptions of their outcomes."""
     other_starts: bool = False
     """Whether episodes start elsewhere."""
 
@@ -447,13 +439,13 @@ def _outcome(mdp: Mdp, k: int) -> list[Array]:
     return [mdp.probability[..., k], *(np.where(real, column[..., k], 0) for column in columns)]
 
 
-def _examples(a: Mdp, b: Mdp, pairs: NDArray[np.intp]) -> list[TransitionChange]:
+def _examples(a: Mdp, b: Mdp, pairs: NDArray[np.intp]) -> list[ActionDiff[str]]:
     if not len(pairs):
         return []
     states, actions = states_in_words(a), actions_in_words(a)
     states_b = states_in_words(b)
     return [
-        TransitionChange(
+        ActionDiff(
             state=str(states[s]),
             action=str(actions[j]),
             a=_outcomes_in_words(a, states, s, j),

@@ -9,29 +9,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Generic, TypeVar
 
 import numpy as np
 
 from runner.analysis.axes import first_crossing, mean_height
 from runner.analysis.diff.divergence import FIELDS, differing_steps, unbroken
-from runner.analysis.evaluations import evaluation_records
 from runner.analysis.series import (
-    evaluation_readings,
     full_name,
     lines_in,
     points_of,
     read_series,
-    single_agent_unnamed,
-    training_readings,
 )
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words, states_in_words
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.messages import QTable
-from runner.recording.metrics import METRIC_OF, METRICS, is_higher_better
+from runner.recording.metrics import METRICS, is_higher_better
 from runner.recording.reader import Recording
 from runner.util.arrays import Floats, Ints, Records
+
+T = TypeVar("T")
 
 _MAX_STATES: Final = 5
 """States that are named."""
@@ -225,13 +223,13 @@ _MAX_CELLS: Final = 5
 
 
 @dataclass(frozen=True)
-class CellDiff:
-    """One cell of a table, by the names of state and action, and its value in both runs."""
+class ActionDiff(Generic[T]):
+    """An action in a state, by their names, and what differs there between two runs."""
 
     state: str
     action: str
-    a: float
-    b: float
+    a: T
+    b: T
 
 
 @dataclass(frozen=True)
@@ -247,7 +245,7 @@ class TableDiff:
     """Share of the states in which the greedy action differs."""
     greedy_share_visited: float
     """The same, each state weighted by its visits in both runs' training; nan without steps."""
-    cells: list[CellDiff]
+    cells: list[ActionDiff[float]]
     """Where the difference is largest."""
 
 
@@ -293,7 +291,7 @@ def _moment(table: QTable) -> tuple[int, int]:
     return table.episode, table.table
 
 
-def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: Floats) -> list[CellDiff]:
+def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: Floats) -> list[ActionDiff[float]]:
     flat = apart.reshape(-1)
     # Faster than sorting all cells, for each snapshot.
     least = np.partition(flat, -_MAX_CELLS)[-_MAX_CELLS] if flat.size > _MAX_CELLS else 0.0
@@ -305,7 +303,7 @@ def _largest_cells(mdp: Mdp, a: QTable, b: QTable, apart: Floats) -> list[CellDi
     for cell in order.tolist():
         s, j = divmod(cell, apart.shape[1])
         if apart[s, j] > 0:
-            cells.append(CellDiff(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
+            cells.append(ActionDiff(str(states[s]), actions[j], float(a.values[s, j]), float(b.values[s, j])))
     return cells
 
 
@@ -317,8 +315,12 @@ def own_actions_in_words(mdp: Mdp, table: int, width: int) -> list[str]:
     return names[table] if names else [f"action {j}" for j in range(width)]
 
 
-_COMPARED: Final = (*METRICS, METRIC_OF["training.mean_length"], METRIC_OF["training.percent_filled"])
-_OF_LOOPS: Final = ("training.mean_length", "training.mean_return")
+_COMPARED: Final = (
+    *(metric.name for metric in METRICS),
+    "training.mean_length",
+    "training.percent_filled",
+    "training.mean_return",
+)
 
 
 @dataclass(frozen=True)
@@ -387,26 +389,18 @@ def metric_diffs(a: Recording, b: Recording, targets: Mapping[str, float]) -> li
 def _curves(recording: Recording) -> tuple[dict[str, dict[int, float]], dict[str, float]]:
     """Return metric to episode to value, without values that are unknown, and the value at the end of each.
 
-    A loop's training ends with the mean over its last episodes, as in `ls` and `show`.
+    Training is compared at the evaluations of a job, and over the episodes of a loop that ended; a loop's
+    training ends with the mean over its last episodes, as in `ls` and `show`.
     """
     curves: dict[str, dict[int, float]] = {}
-    recent: dict[str, float] = {}
-    for record in evaluation_records(recording):
-        readings = evaluation_readings(record)
-        if not recording.can_train_again:
-            readings = single_agent_unnamed(readings)
-        if record.training is not None:
-            readings |= training_readings(record.training)
-        for metric in _COMPARED:
-            for line, value in readings.get(metric.name, {}).items():
-                curves.setdefault(full_name(metric.name, line), {})[record.episode] = value
-    if not recording.can_train_again and recording.train.episodes.count():
-        series = read_series(recording, metrics=_OF_LOOPS)
-        for name, line in lines_in([series]):
-            if name in _OF_LOOPS:
-                full = full_name(name, line)
-                points = points_of(series, name, line, aligned=False)
-                curves[full] = {int(at): value for at, value in points.items()}
-                if (end := series.recent.get(name, {}).get(line)) is not None:
-                    recent[full] = end
-    return curves, {name: curve[max(curve)] for name, curve in curves.items()} | recent
+    ends: dict[str, float] = {}
+    series = read_series(recording, metrics=_COMPARED)
+    compared = set(_COMPARED)
+    if series.is_unended or (series.can_train_again and not series.evaluation):
+        compared = {name for name in compared if not name.startswith("training.")}
+    for metric, line in lines_in([series]):
+        if metric in compared and (points := points_of(series, metric, line, aligned=True)):
+            name = full_name(metric, line)
+            curves[name] = {int(episode): value for episode, value in points.items()}
+            ends[name] = series.recent.get(metric, {}).get(line, points[max(points)])
+    return curves, ends
