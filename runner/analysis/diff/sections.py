@@ -188,38 +188,23 @@ def _training(difference: RunDiff, most: int) -> Section:
     if divergence is None:
         same = [] if difference.overlap is None else ["Training is the same, step by step."]
         return Section("Training", same)
-    where = divergence_in_words(divergence, cause)
-    sentences = [where, *_updates_in_words(cause), *_overlap_in_words(difference)]
-    return Section("Training", sentences, [*_q_rows(cause, most), *_visits_grids(difference)])
-
-
-def _overlap_in_words(difference: RunDiff) -> list[str]:
-    """Return how far training is the same, and how alike it visits states, if that is known."""
-    overlap = difference.overlap
-    visits = difference.visits
-    sentences = []
-    if overlap is not None:
+    sentences = [divergence_in_words(divergence, cause), *_updates_in_words(cause)]
+    grids = _q_rows(cause, most)
+    if (overlap := difference.overlap) is not None:
         share = overlap.equal_steps / overlap.compared_steps if overlap.compared_steps else math.nan
         sentences.append(
             f"Of the {overlap.episodes:,} episodes of both, {overlap.equal_episodes:,} are the same; of "
             f"their steps {100 * share:.1f} % agree at the same time of the same episode. Mean length "
             f"{overlap.mean_length_a:.1f} in A, {overlap.mean_length_b:.1f} in B."
         )
-    if visits is not None:
+    if (visits := difference.visits) is not None:
         sentences.append(
             f"A acted in {visits.states_a:,} states, B in {visits.states_b:,}; their distributions over the "
             f"states overlap by {100 * visits.alike:.1f} %."
         )
-    return sentences
-
-
-def _visits_grids(difference: RunDiff) -> list[Grid]:
-    """Return the states whose shares of all training steps differ most."""
-    visits = difference.visits
-    if visits is None or not visits.most_apart:
-        return []
-    rows = [(state.state, f"{state.a:,}", f"{state.b:,}") for state in visits.most_apart]
-    return [Grid(("training steps in a state, where the shares differ most", "A", "B"), rows)]
+        if rows := [(state.state, f"{state.a:,}", f"{state.b:,}") for state in visits.most_apart]:
+            grids.append(Grid(("training steps in a state, where the shares differ most", "A", "B"), rows))
+    return Section("Training", sentences, grids)
 
 
 def _evaluation(difference: RunDiff, most: int) -> Section:
