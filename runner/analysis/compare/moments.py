@@ -59,34 +59,29 @@ class Moment:
     axis: Axis = EPISODES
     """The axis on which the runs are read."""
 
-    @property
-    def described(self) -> str:
-        """A description of the moment."""
-        match self.kind:
-            case "last":
-                return "at the last evaluation"
-            case "best":
-                return "at each run's best evaluation"
-            case "area":
-                return "the mean over training, by area under the curve" + (
-                    "" if self.axis is EPISODES else f" over {self.axis.title}"
-                )
-            case "position":
-                return f"after {self.axis.moment(self.number)}"
-            case "crossing":
-                return f"{self.axis.label} until it is first at {self.level:g}"
-
 
 def moment_in_words(moment: Moment, metrics: Sequence[str], groups: Sequence[Group]) -> str:
     """Return at which moment these metrics are read: training has no evaluations."""
-    if moment.kind not in ("last", "best") or not all(name.startswith("training.") for name in metrics):
-        return moment.described
-    if moment.kind == "best":
-        return "at the best report of each run's training"
-    ends = {last_episodes(name, groups) for name in metrics}
-    if "" in ends:
-        return "at the end of training, as last reported"
-    return f"the mean over the {listed(sorted(ends))} of training"
+    is_training = all(name.startswith("training.") for name in metrics)
+    match moment.kind:
+        case "last" if is_training:
+            ends = {last_episodes(name, groups) for name in metrics}
+            words = f"the mean over the {listed(sorted(ends))} of training"
+            if "" in ends:
+                words = "at the end of training, as last reported"
+        case "last":
+            words = "at the last evaluation"
+        case "best":
+            best = "the best report of each run's training" if is_training else "each run's best evaluation"
+            words = f"at {best}"
+        case "area":
+            over = "" if moment.axis is EPISODES else f" over {moment.axis.title}"
+            words = f"the mean over training, by area under the curve{over}"
+        case "position":
+            words = f"after {moment.axis.moment(moment.number)}"
+        case "crossing":
+            words = f"{moment.axis.label} until it is first at {moment.level:g}"
+    return words
 
 
 def last_episodes(metric: str, groups: Sequence[Group]) -> str:
