@@ -255,7 +255,7 @@ def _episode_named(recording: Recording, word: str) -> EpisodeRef:
         return references(recording, phase, numbers[[-1 if word == BEST else 0]])[0]
     if word == TYPICAL and recording.eval.has_metrics:
         if (evaluation := last_whole_evaluation(recording)) is not None:
-            return ranked_trials(recording, evaluation)[1]
+            return ranked(recording, "eval", evaluation.start, evaluation.stop)[1]
     elif word == TYPICAL and (evaluations := evaluations_of(recording)):
         return EpisodeRef(after=evaluations[-1].after)
     return EpisodeRef(max(0, recording.train.episodes.count() - 1))
@@ -291,11 +291,6 @@ def ranked_episodes(recording: Recording) -> tuple[str, Ints]:
     if not len(records):
         raise RecordingError(f"{recording.path}: found no episode that ended; --episode 0 shows the first.")
     return phase, records["episode"][_by_rank(records)]
-
-
-def ranked_trials(recording: Recording, evaluation: Evaluation) -> list[EpisodeRef]:
-    """Return the worst, the median and the best trial of an evaluation: by success, return and length."""
-    return ranked(recording, "eval", evaluation.start, evaluation.stop)
 
 
 def ranked(recording: Recording, phase: str, start: int, stop: int) -> list[EpisodeRef]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from runner.analysis.axes import EPISODES, Axis
 from runner.analysis.contents import shortcomings, why_no_steps
-from runner.analysis.episodes import EpisodeRef, last_whole_evaluation, ranked, ranked_trials
+from runner.analysis.episodes import EpisodeRef, last_whole_evaluation, ranked
 from runner.analysis.evaluations import (
     EvaluationRecord,
     evaluations_section,
@@ -199,7 +199,7 @@ def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[Episod
     ended = recording.train.episodes.count()
     reasons = [(at.resolved(recording), "chosen") for at in chosen]
     if last is not None:
-        worst, typical, best = ranked_trials(recording, last)
+        worst, typical, best = ranked(recording, "eval", last.start, last.stop)
         reasons += [(typical, "typical trial"), (best, "best trial"), (worst, "worst trial")]
     elif ended:
         worst, typical, best = ranked(recording, "train", ended - max(1, ended // 10), ended)

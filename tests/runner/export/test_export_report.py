@@ -15,7 +15,7 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.select import Select
 
 import runner
-from runner.analysis.episodes import last_whole_evaluation, ranked_trials
+from runner.analysis.episodes import last_whole_evaluation, ranked
 from runner.cli import cli
 from runner.drawing.svg import SvgDrawing, trail_points, transform
 from runner.environments.naming import agent_actions_in_words, states_in_words
@@ -45,7 +45,8 @@ def test_replays_are_the_recorded_episodes_best_and_worst_among_them(recording, 
     page = page_of(recording.run["name"])
     episodes = data_of(page)
     titles = [episode["title"] for episode in episodes]
-    worst, _, best = ranked_trials(recording, last_whole_evaluation(recording))
+    last = last_whole_evaluation(recording)
+    worst, _, best = ranked(recording, "eval", last.start, last.stop)
     assert titles[0] == "Chosen: training episode 7"
     assert any(
         title.startswith(("Best trial", "Typical trial and best")) and best.title in title for title in titles
@@ -172,7 +173,8 @@ def test_the_slider_is_moved_by_keys_and_shows_the_recorded_frames(opened, pictu
     driver = opened(world)
     with open_recording(pictured(world).recording) as recording:
         mdp, words = recording.mdp, states_in_words(recording.mdp)
-        _, typical, _ = ranked_trials(recording, last_whole_evaluation(recording))
+        last = last_whole_evaluation(recording)
+        _, typical, _ = ranked(recording, "eval", last.start, last.stop)
         steps = recording.eval.episode_steps(typical.number_in(recording))
     states = np.append(steps["state"], steps["next_state"][-1])
     places = SvgDrawing(mdp.scene).places(mdp, states)
