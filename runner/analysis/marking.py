@@ -10,7 +10,6 @@ from runner.archive.places import opened
 from runner.errors import NotInRecording, RunnerError
 from runner.recording.labels import check_tags
 from runner.recording.marks import MAX_MARK_TEXT, Mark, Marks, change_marks
-from runner.recording.reader import Recording
 from runner.runs.run import Run
 from runner.util.values import is_utf8
 
@@ -40,7 +39,11 @@ def mark_steps(run: Run, steps: Iterable[StepLike], text: str, *, tags: Iterable
     text = text.strip()
     names = tuple(sorted(set(tags)))
     with opened(run) as recording:
-        existing = [_existing(recording, EpisodeRef.parse(at)) for at in steps]
+        existing = []
+        for at in steps:
+            step = EpisodeRef.parse(at).resolved(recording)  # with its episode in place of a word
+            step.steps_in(recording, with_end=True)
+            existing.append((step, step.number_in(recording)))
     check_tags(names)
     if not (text or names):
         raise RunnerError("mark: found no text, expected a text or tags.")
@@ -73,10 +76,3 @@ def unmark(run: Run, *ids: str) -> None:
         return marks.merged((), ids)
 
     change_marks(run.folder, change)
-
-
-def _existing(recording: Recording, at: EpisodeRef) -> tuple[EpisodeRef, int]:
-    """Return a reference to a step with its episode in place of a word, and the number of the episode."""
-    step = at.resolved(recording)
-    step.steps_in(recording, with_end=True)
-    return step, step.number_in(recording)

@@ -180,7 +180,8 @@ def _batches_of_recording(
 
 def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -> list[Known]:
     """Return what is known of the chunks of a topic."""
-    starts, ends = _times_of(chunks)
+    times = chunks.file.index.chunks.columns[chunks.places]  # of the first and the last message of each
+    starts, ends = (times[name].astype(np.int64) for name in ("start_time", "end_time"))
     ranges = {"position": (starts // STEP_NANOSECONDS, ends // STEP_NANOSECONDS)}
     topic = chunks.topic
     same = {"run": (recording.run_id, recording.run_id)}
@@ -195,12 +196,6 @@ def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -
         same | {name: (int(low[k]), int(high[k])) for name, (low, high) in ranges.items()}
         for k in range(len(starts))
     ]
-
-
-def _times_of(chunks: TopicChunks) -> tuple[Ints, Ints]:
-    """Return the times of the first and the last message of each chunk."""
-    spans = chunks.file.index.chunks.columns[chunks.places]
-    return spans["start_time"].astype(np.int64), spans["end_time"].astype(np.int64)
 
 
 def _episodes_of_steps(phase: Phase, starts: Ints, ends: Ints) -> dict[str, tuple[Ints, Ints]]:

@@ -153,16 +153,17 @@ class EpisodeIndex:
         if shape.mdp is not None and shape.mdp.success_events:
             plain.append("success")
         environment, own = ("environment", _COUNTED) if "environment" in columns.names else ("0", "episode")
+        aggregates = _aggregates(shape, steps)
+        facts = json.dumps(asdict(Facts([*plain, *aggregates], actions)))
+        path = self.folder / f"{stem}{_hash(facts)}.parquet"
         named = cleaned(map(columns.field, plain))
         rows = (
-            f"SELECT {_number(stem)} AS file, row_number() OVER (ORDER BY phase DESC, episode) AS row, "
+            f"SELECT {number_of(path)} AS file, row_number() OVER (ORDER BY phase DESC, episode) AS row, "
             f"{named}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
             "ASOF LEFT JOIN evaluations ON episode >= start"
         )
-        if aggregates := _aggregates(shape, steps):
+        if aggregates:
             rows = with_steps(rows, aggregates, {})
-        facts = json.dumps(asdict(Facts([*plain, *aggregates], actions)))
-        path = self.folder / f"{stem}{_hash(facts)}.parquet"
         options = f"KV_METADATA {{facts: {literal(facts)}}}"
         self._write(path, f"FROM ({rows}) ORDER BY row", options, partial(_check, row, runs))
         return path
@@ -176,11 +177,7 @@ def _check(row: IndexRow, runs: SelectedRuns) -> None:
 
 def number_of(path: Path) -> int:
     """Return the number of an index in its rows."""
-    return _number(path.stem[:-_HEX])
-
-
-def _number(stem: str) -> int:
-    return int(_hash(stem), 16) >> 1
+    return int(_hash(path.stem[:-_HEX]), 16) >> 1
 
 
 def kind_of(path: Path) -> str:
