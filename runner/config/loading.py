@@ -162,7 +162,7 @@ def experiment_in(
             (), f"found {found(document.value)}, expected keys and values, such as episodes: 1000"
         )
         raise refuse([*document.problems, problem], document)
-    override(document, overrides)
+    put(document, [_parse(text) for text in overrides])
     file = None
     problems = document.problems
     try:
@@ -228,17 +228,12 @@ def _learners(file: ExperimentFile) -> tuple[Tables, Rewards]:
 # --- overrides ----------------------------------------------------------------------------------------
 
 
-def override(document: Document, overrides: Sequence[str]) -> None:
-    """Apply every `KEY=VALUE` of `overrides` to `document`, whose value must be a mapping.
-
-    A key on the way to KEY that holds something else than a mapping becomes one. A section that the
-    document does not mention starts from its default, so that only the value named is changed.
-    """
-    put(document, [_parse(text) for text in overrides])
-
-
 def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) -> None:
-    """Put values at paths of `document`, as `override` does; each brings its own places."""
+    """Put values at paths of `document`, whose value must be a mapping; each brings its own places.
+
+    A key on the way that holds something else than a mapping becomes one. A section that the document does
+    not mention starts from its default, so that only the value named is changed.
+    """
     assigned: set[str] = set()
     for path, read in values:
         assigned.add(path[0])
