@@ -71,12 +71,17 @@ def check(text: str, source: str, recordings: Path) -> CheckedJob:
     `source` is the file's name, for messages and as the default name of the job.
 
     Raises:
-        ConfigError: it cannot be used; a line for each problem, with line, column and key.
+        ConfigError: it cannot be used; a line for each problem, with line, column and key. Its own cause may
+            be any error; it stays in the process of the check.
     """
-    document = read_yaml(text, source)
-    is_sweep = isinstance(document.value, Mapping) and not document.value.keys().isdisjoint(SWEEP_KEYS)
-    check = _check_sweep if is_sweep else _check_config
-    checked = check(text, source, document, recordings)
+    try:
+        document = read_yaml(text, source)
+        is_sweep = isinstance(document.value, Mapping) and not document.value.keys().isdisjoint(SWEEP_KEYS)
+        checked = (_check_sweep if is_sweep else _check_config)(text, source, document, recordings)
+    except ConfigError as error:
+        raise ConfigError(str(error), error.problems) from error
+    except RunnerError as error:
+        raise ConfigError(f"{source}: {error}") from error
     if checked.runs > MAX_RUNS:
         raise ConfigError(f"{source}: makes {checked.runs:,} runs, expected at most {MAX_RUNS:,} in a job.")
     return checked
@@ -149,7 +154,7 @@ class JobChecker:
             raise ConfigError(
                 f"{source}: larger than {size(MAX_BYTES)}, expected a configuration of a few kilobytes"
             )
-        return await self.call(source, _check_as_config_errors, text, source, self._recordings)
+        return await self.call(source, check, text, source, self._recordings)
 
     async def call(self, source: str, function: Callable[[*Args], CheckedJob], *args: *Args) -> CheckedJob:
         """Return the job that a function returns in a child process; `source` begins the messages."""
@@ -167,16 +172,6 @@ class JobChecker:
         except ProcessDied:
             message = "its environment ended the process that was checking it."
         raise ConfigError(f"{source}: {message}")
-
-
-def _check_as_config_errors(text: str, source: str, recordings: Path) -> CheckedJob:
-    """Return the meaning of a text; every other error becomes a `ConfigError`, whose cause stays behind."""
-    try:
-        return check(text, source, recordings)
-    except ConfigError as error:
-        raise ConfigError(str(error), error.problems) from error
-    except RunnerError as error:
-        raise ConfigError(f"{source}: {error}") from error
 
 
 Action = StrictStr | StrictInt | StrictFloat | list[StrictInt | StrictFloat]

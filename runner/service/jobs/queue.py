@@ -254,7 +254,9 @@ class JobQueue:
         with self.store.lock:
             if checked.kind == "sweep":
                 self._refuse_running_sweep(checked.name)
-            given = min(workers or self.pool.size, self._usable_workers(checked))
+            # A cluster has workers of its own for the runs of a job.
+            usable = 1 if checked.seeds or self.pool.ray is not None else min(checked.runs, self.pool.size)
+            given = min(workers or self.pool.size, usable)
             job = self.store.add(checked, text, given)
             if workers is not None and workers > given:
                 line = f"{workers} workers were requested; it gets {given}, the most that it can use here"
@@ -308,12 +310,6 @@ class JobQueue:
             free_bytes(self.recordings),
             self.pool.waiting_for(),
         )
-
-    def _usable_workers(self, checked: CheckedJob) -> int:
-        """Return the most workers that a job can use; a cluster has its own for the runs of a job."""
-        if checked.seeds or self.pool.ray is not None:
-            return 1
-        return min(checked.runs, self.pool.size)
 
     def _refuse_running_sweep(self, name: str) -> None:
         for job in self.store.jobs():
