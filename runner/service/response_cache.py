@@ -9,8 +9,6 @@ from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from starlette.concurrency import run_in_threadpool
-
 MAX_SECONDS: Final = 5.0
 """The default age limit: a response may depend on the time of day."""
 ALWAYS: Final = float("inf")
@@ -47,10 +45,6 @@ class ResponseCache:
             return None
         self._responses.move_to_end(key)
         return response.body
-
-    async def get_or_make(self, key: Hashable, make: Callable[[], bytes]) -> bytes:
-        """Return the response of a key, made in a thread if necessary; see `get_or_await`."""
-        return await self.get_or_await(key, lambda: run_in_threadpool(make))
 
     async def get_or_await(
         self, key: Hashable, make: Callable[[], Awaitable[bytes]], max_seconds: float = MAX_SECONDS

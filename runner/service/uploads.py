@@ -184,7 +184,12 @@ class Uploads:
             if (owner, upload_id) not in self._uploads:
                 upload = fresh
                 self._drop_old()
-                self._require_place(owner)
+                owners = [other.owner for other in self.all() if not other.is_over]
+                if (own := owners.count(owner)) >= self._limits.uploads_each:
+                    message = f"{own:,} of your uploads are open, the maximum; complete or delete some."
+                    raise LimitReached(message)
+                if len(owners) >= self._limits.uploads:
+                    raise LimitReached(f"{len(owners):,} uploads are open; try again when some are done.")
             if upload.run_id != source.run_id:
                 remove_preview(self._recordings, upload.id, upload.run_id)
             upload = replace(upload, source=source, **announced)
@@ -244,14 +249,6 @@ class Uploads:
         if (source.digest, source.size) not in checkpoints:
             raise StateConflict(f"run {run.run_id} has no checkpoint of this digest and size.")
         return run if Store(self._recordings).has(source.digest or "", source.size or 0) else None
-
-    def _require_place(self, owner: str) -> None:
-        """Refuse a new upload if too many are open."""
-        owners = [upload.owner for upload in self.all() if not upload.is_over]
-        if (own := owners.count(owner)) >= self._limits.uploads_each:
-            raise LimitReached(f"{own:,} of your uploads are open, the maximum; complete or delete some.")
-        if len(owners) >= self._limits.uploads:
-            raise LimitReached(f"{len(owners):,} uploads are open; try again when some are done.")
 
     def _require_room(self, upload: Upload, more: int) -> None:
         """Refuse an upload if there is no room for more of its bytes."""

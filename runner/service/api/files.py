@@ -79,10 +79,6 @@ class CheckpointsResponse(BaseModel):
     checkpoints: list[CheckpointResponse]
 
 
-class _File(FileResponse):
-    chunk_size = BLOCK
-
-
 @router.get(
     "/recording",
     response_class=Response,
@@ -242,7 +238,9 @@ def _file(path: pathlib.Path, name: str, tag: str, if_none_match: str | None) ->
     headers = {"etag": f'"{tag}"', "accept-ranges": "bytes"}
     if is_known(tag, if_none_match):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    return _File(path, media_type=MEDIA, filename=name, headers=headers)
+    response = FileResponse(path, media_type=MEDIA, filename=name, headers=headers)
+    response.chunk_size = BLOCK
+    return response
 
 
 def _ranges(text: str) -> Ranges:

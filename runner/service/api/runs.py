@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi import Path as InPath
 from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.marking import mark, unmark
 from runner.analysis.summary import describe_run
@@ -32,7 +34,6 @@ from runner.service.dependencies import (
     json_response,
     require_written,
 )
-from runner.service.settings import ServiceSettings
 from runner.util.values import Json
 
 router = APIRouter(tags=["runs"])
@@ -83,7 +84,9 @@ async def list_runs(
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()
 
     key = ("runs", catalogue.state(), request.url.query)
-    return Response(await cache.get_or_make(key, make), media_type="application/json")
+    return Response(
+        await cache.get_or_await(key, partial(run_in_threadpool, make)), media_type="application/json"
+    )
 
 
 class LabelChanges(BaseModel, extra="forbid"):
@@ -128,17 +131,13 @@ class RunResponse(BaseModel, extra="allow"):
 )
 def one_run(run: FoundRun, settings: SettingsOf) -> Response:
     """Return what `dualtaxi show --json` prints, with the last evaluation instead of all series."""
-    return Response(as_json(summary_of(run, settings)), media_type="application/json")
-
-
-def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
-    """Return everything about a run except its series; only `run.json` if its recording cannot be read."""
+    # If the recording cannot be read, the facts are those of `run.json` alone.
     problems: list[str] = []
     error = run.summary.error
     details = describe_run(run, problems.append)
     facts = details.facts()
     del facts["path"]
-    return facts | {
+    facts |= {
         "tags": list(run.tags),
         "note": run.note,
         "removed_marks": [] if run.stands_alone else sorted(read_marks(run.folder).removed),
@@ -148,6 +147,7 @@ def summary_of(run: Run, settings: ServiceSettings) -> dict[str, object]:
         "problems": [settings.without_folders(problem) for problem in problems],
         **({"damage": settings.without_folders(details.damage)} if details.damage else {}),
     }
+    return json_response(as_json(facts))
 
 
 @router.patch(

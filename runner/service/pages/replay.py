@@ -65,9 +65,7 @@ class ReplayPanel:
     number: int | None
     """Number of its colour, if it has one."""
     source: str
-    """Address of the episode's data."""
-    pictures: str
-    """Address of its pictures."""
+    """Address of the episode's data; that of its pictures is below it."""
     scene: str
     """The grid, as SVG, whose things the script moves; empty without a scene."""
     has_pictures: bool = False
@@ -356,7 +354,7 @@ def panel_of(
     drawing = svg.drawing_of(recording.mdp) if recording.tabular else None
     has_pictures, note = picture_note(recording, phase)
     scene = "" if drawing is None else drawing.frame(None, f"The grid of {label}", style="")
-    return ReplayPanel(label, number, source, f"{source}/pictures", scene, has_pictures, note, **more)
+    return ReplayPanel(label, number, source, scene, has_pictures, note, **more)
 
 
 MAX_PANELS: Final = 8

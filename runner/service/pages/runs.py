@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Final, Literal, NamedTuple
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import RedirectResponse
+from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Paging
 from runner.analysis.summary import usage_sections
@@ -119,7 +121,7 @@ async def runs(
 
     try:
         key = ("runs page", catalogue.state(), request.url.query, viewer)
-        body = await cache.get_or_make(key, make)
+        body = await cache.get_or_await(key, partial(run_in_threadpool, make))
     except RunnerError as error:
         status = HTTPStatus.BAD_REQUEST
         values = _search(filter, "", USUAL, "", None, message_of(error, request))
