@@ -29,7 +29,6 @@ from runner.cli.parameter_types import (
     ConfigName,
     Number,
     RunName,
-    RunOrFilter,
 )
 from runner.errors import ExitCode
 from runner.runs.run import Run, recordings_folder
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 
 run_argument: Final = argument(metavar="RUN", type=RunName())
 runs_argument: Final = argument(metavar="RUN...", nargs=-1, required=True, type=RunName())
-compared_argument: Final = argument(metavar="RUN...", nargs=-1, required=True, type=RunOrFilter())
+compared_argument: Final = argument(metavar="RUN...", nargs=-1, required=True, type=RunName(or_filter=True))
 config_argument: Final = argument(metavar="CONFIG", type=ConfigName())
 filter_argument: Final = argument(metavar="[FILTER]...", nargs=-1, type=FILTER_WORD)
 

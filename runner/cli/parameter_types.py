@@ -88,33 +88,24 @@ class Number(click.FloatRange):
 
 
 class RunName(Completed):
-    """The name of a run; completes ids and names, and paths after a slash."""
+    """The name of a run, or of runs by a filter; completes ids and names, and paths after a slash."""
 
-    def __init__(self) -> None:
+    def __init__(self, or_filter: bool = False) -> None:
         super().__init__("run", _runs)
+        self.or_filter = or_filter
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """Return ids and names, newest first."""
+        """Return ids and names, newest first; without any, the fields of a filter."""
         if "/" in incomplete or "\\" in incomplete:
             return [CompletionItem(incomplete, type="file")]
-        return super().shell_complete(ctx, param, incomplete)
+        names = super().shell_complete(ctx, param, incomplete)
+        return names if names or not self.or_filter else FILTER_WORD.shell_complete(ctx, param, incomplete)
 
     def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002
         """Return where names of runs are found."""
         return "`dualtaxi ls` lists the runs; @latest is the newest."
-
-
-class RunOrFilter(RunName):
-    """The name of runs, or a filter of runs; completes names, else the fields of a filter."""
-
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
-        """Return ids and names, newest first; without any, the fields."""
-        names = super().shell_complete(ctx, param, incomplete)
-        return names or FILTER_WORD.shell_complete(ctx, param, incomplete)
 
 
 def _runs(ctx: click.Context, incomplete: str) -> Mapping[str, str]:
