@@ -12,14 +12,14 @@ import click
 
 from runner.archive.places import default_target
 from runner.cli.command import Command, CommandGroup, argument, option
-from runner.cli.options import force_option, output_option, recordings_option, runs_argument
+from runner.cli.options import force_option, output_option, runs_argument
 from runner.cli.output import Remark, Reply, path_and_size, say, written
 from runner.cli.parameter_types import PATH, RunName
 from runner.cli.progress import stage_line, steps_line
-from runner.cli.runs import compilation_notice, find, received, recorded_run, run_reply
+from runner.cli.runs import compilation_notice, find, received, recorded_run, run_reply, runs_folder
 from runner.errors import RunnerError
 from runner.export.places import new_file
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import Run
 from runner.util.humanize import size
 from runner.util.row_text import json_lines
 
@@ -41,7 +41,7 @@ def archive_command(
         help="Remove each recording once its archive has been read back and compared.",
     ),
     dry_run: bool = option("--dry-run", is_flag=True, help="Report the sizes, but write and change nothing."),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Iterator[Reply]:
     """Archive runs losslessly as Parquet, which DuckDB, pandas and Polars read (docs/archive.md).
 
@@ -56,8 +56,8 @@ def archive_command(
     """
     from runner.archive.runs import archive_run
 
-    target = to or default_target(recordings_folder(recordings))
-    runs = [find(name, recordings) for name in dict.fromkeys(run_names)]
+    target = to or default_target(folder)
+    runs = [find(name, folder) for name in dict.fromkeys(run_names)]
     left = [run for run in runs if run.status != "archived"]
     for run in runs:
         if left and run not in left:
@@ -87,7 +87,7 @@ def _reply(archived: Archived, dry_run: bool) -> Reply:
 @click.command("restore", cls=Command)
 def restore_command(
     run_name: str = argument(metavar="RUN|ARCHIVE", type=RunName()),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Restore the recording of an archived run, with the same content digest.
 
@@ -107,9 +107,9 @@ def restore_command(
     with compilation_notice(), steps_line("restoring") as report:
         if is_url or (Path(run_name) / MANIFEST).is_file():
             place = run_name if is_url else str(Path(run_name).absolute())
-            run = restore_place(place, recordings_folder(recordings), report)
+            run = restore_place(place, folder, report)
         else:
-            run = restore_run(find(run_name, recordings), report)
+            run = restore_run(find(run_name, folder), report)
     return run_reply(run, {})
 
 
@@ -117,7 +117,7 @@ def restore_command(
 def import_command(
     file: Path = argument(metavar="FILE", type=PATH),
     as_new: bool = option("--as-new", is_flag=True, help="Give the run a new id."),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Import FILE, a recording from elsewhere, into the folder of runs.
 
@@ -133,7 +133,7 @@ def import_command(
 
     try:
         with stage_line(f"importing {file}"):
-            imported = import_recording(file, recordings_folder(recordings), as_new=as_new)
+            imported = import_recording(file, folder, as_new=as_new)
     except Occupied as error:
         raise RunnerError(f"{error} --as-new imports it under a new id.") from error
     run, digest = imported.run, imported.content_digest

@@ -17,16 +17,15 @@ from runner.cli.command import Command, CommandGroup, argument, option
 from runner.cli.options import (
     filter_argument,
     folders_option,
-    recordings_option,
     runs_argument,
     tags_option,
 )
 from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import INDEX
-from runner.cli.runs import find, found_run
+from runner.cli.runs import find, found_run, runs_folder
 from runner.errors import ExitCode, RunnerError
 from runner.runs.catalogue.columns import STATUSES, with_same_as
-from runner.runs.run import Run, label, recordings_folder
+from runner.runs.run import Run, label
 from runner.util.humanize import UNKNOWN, ago, counted, duration, number, size
 from runner.util.values import Json
 
@@ -192,7 +191,7 @@ _dry_run_option = option(
 @click.command("rm", cls=Command)
 def rm_command(
     run_names: tuple[str, ...] = runs_argument,
-    recordings: Path | None = recordings_option,
+    root: Path = runs_folder,
     yes: bool = _yes_option,
     dry_run: bool = _dry_run_option,
     foreign: bool = _foreign_option,
@@ -209,8 +208,7 @@ def rm_command(
     """
     from runner.runs.catalogue.removal import plan
 
-    root = recordings_folder(recordings)
-    runs = {run.folder.resolve(): run for run in (find(name, recordings) for name in run_names)}
+    runs = {run.folder.resolve(): run for run in (find(name, root) for name in run_names)}
     removals = [plan(run, root, foreign) for run in runs.values()]
     refused = [f"run {each.run_id} stays: {each.refusal}." for each in removals if each.refusal]
     if refused:

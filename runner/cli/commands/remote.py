@@ -11,13 +11,12 @@ import click
 from runner.analysis.sections import Grid
 from runner.cli import Failure
 from runner.cli.command import CommandGroup, argument, option, record
-from runner.cli.options import limit_option, recordings_option, workers_option
+from runner.cli.options import limit_option, workers_option
 from runner.cli.output import Remark, Reply, say
 from runner.cli.parameter_types import COUNT, FILE, ConfigName, RunName
 from runner.cli.progress import bytes_line
-from runner.cli.runs import find_recorded, received
+from runner.cli.runs import find_recorded, received, runs_folder
 from runner.errors import ExitCode, RunnerError
-from runner.runs.run import recordings_folder
 from runner.util.humanize import UNKNOWN, counted, size
 from runner.util.values import Json
 
@@ -99,7 +98,7 @@ def push(
         help="Upload the runs that could not be sent while they were recorded, each to its server.",
     ),
     server: Server = server_options,
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Upload runs to a server, which lists them once it has verified every byte.
 
@@ -125,7 +124,7 @@ def push(
         run, url = kept.get(name, (None, None))
         try:
             with server.client(url) as client, bytes_line(f"pushing {name}") as report:
-                run = run or find_recorded(name, recordings)
+                run = run or find_recorded(name, folder)
                 run_bytes = run.recording.stat().st_size  # a run leaves the outbox when it is delivered
                 status = deliver(run, client, report) if outbox else client.push(run, report)
         except RunnerError as error:
@@ -145,7 +144,7 @@ def push(
 def pull(
     run_name: str = argument(metavar="RUN"),
     server: Server = server_options,
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Download RUN from a server into the folder of runs, with its tags and note.
 
@@ -157,7 +156,7 @@ def pull(
       dualtaxi remote pull k3v9m2xq --server https://runs.example.org --token-file ~/.dualtaxi-token
     """
     with server.client() as client, bytes_line(f"pulling {run_name}") as report:
-        pulled = client.pull(run_name, recordings_folder(recordings), report)
+        pulled = client.pull(run_name, folder, report)
     already = "this content" if pulled.already else ""
     return received(pulled.run, pulled.content_digest, already)
 

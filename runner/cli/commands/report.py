@@ -13,16 +13,14 @@ from runner.cli.options import (
     Writing,
     compared_argument,
     curve_options,
-    recordings_option,
     writing_options,
 )
 from runner.cli.output import Reply, require_page, say, written
 from runner.cli.parameter_types import EPISODE, TRIAL
 from runner.cli.progress import count_line, stage_line
-from runner.cli.runs import find_all_recorded
+from runner.cli.runs import find_all_recorded, runs_folder
 from runner.cli.views import option_of
 from runner.export.places import new_file, write_text_new
-from runner.runs.run import recordings_folder
 from runner.sweep import is_sweep
 from runner.util.humanize import counted, sentence, size
 from runner.views.compare import AXIS, NORMALISE
@@ -40,7 +38,7 @@ def plot_command(
     style: CurveStyle = curve_options,
     normalise: Path | None = option_of(NORMALISE),
     to: Writing = writing_options("exports/plot.png", "FILE.png|svg|pdf"),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Draw every metric of one or several runs over an axis, in one figure; or a sweep.
 
@@ -70,7 +68,7 @@ def plot_command(
     from runner.export.plots.curves import CurveStyle, curves_sheet
     from runner.recording.reader import open_recording
 
-    output, folder = to.path(), recordings_folder(recordings)
+    output = to.path()
     check_suffix(output)
     if normalise is not None and style != CurveStyle():
         raise click.UsageError(
@@ -166,7 +164,7 @@ def report_command(
     axis: str = option_of(AXIS),
     style: CurveStyle = curve_options,
     to: Writing = writing_options("exports/report.html", "FILE.html"),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Write one self-contained page about one or several runs, or about a sweep.
 
@@ -186,7 +184,7 @@ def report_command(
     from runner.analysis.axes import axis_of
     from runner.export.reports.report import render_report
 
-    output, folder = to.path(), recordings_folder(recordings)
+    output = to.path()
     require_page(output, to.force)
     if is_sweep(run_names, folder):
         if episodes or trials:

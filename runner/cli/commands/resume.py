@@ -14,7 +14,6 @@ from runner.cli.options import (
     checkpoint_option,
     job_option,
     policy_option,
-    recordings_option,
     trust_option,
 )
 from runner.cli.output import Reply, say
@@ -29,10 +28,11 @@ from runner.cli.runs import (
     run_as_json,
     run_facts,
     run_reply,
+    runs_folder,
 )
 from runner.errors import ExitCode, RecordingError
 from runner.runs.listing import locked
-from runner.runs.run import Run, command_for, recordings_folder, require_over
+from runner.runs.run import Run, command_for, require_over
 from runner.runs.shards import shards_of
 from runner.util.humanize import counted, number, size
 
@@ -152,7 +152,7 @@ def evaluate_command(
     checkpoint: str | None = checkpoint_option,
     policy: str | None = policy_option,
     trust: bool = trust_option,
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Evaluate the trained Q-table of RUN greedily in new episodes.
 
@@ -185,13 +185,10 @@ def evaluate_command(
             )
         if step is not None or start != "random":
             raise click.UsageError("--step and --start are for runs that were trained here, not for loops.")
-        return _evaluate_checkpoint(
-            source, recordings, checkpoint, policy, trials or LOOP_TRIALS, seed, trust
-        )
+        return _evaluate_checkpoint(source, folder, checkpoint, policy, trials or LOOP_TRIALS, seed, trust)
     to_play = None if start == "each" else trials or TRIALS
     start_state: Start = int(start) if start.isdecimal() else "random"
     with job_progress("", 0) as (report, interrupt):
-        folder = recordings_folder(recordings)
         run = evaluate(source, folder, step, to_play, start_state, seed, report, interrupt, trust)
     origin = run.file.config["initial_q"]
     values = run_as_json(run) | {"origin": origin}
@@ -208,7 +205,7 @@ def evaluate_command(
 
 def _evaluate_checkpoint(
     source: Run,
-    recordings: Path | None,
+    folder: Path,
     reference: str,
     policy: str,
     trials: int,
@@ -222,7 +219,6 @@ def _evaluate_checkpoint(
     from runner.runs.checkpoints import find_checkpoint
 
     checkpoint = find_checkpoint(source.checkpoints(), reference, f"run {source.run_id}")
-    folder = recordings_folder(recordings)
     with count_line("episodes", trials) as report:
         run = play_checkpoint(source, checkpoint, policy, folder, trials, seed, trust, report)
     origin = run.file.config["config"]["origin"]

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 import click
 
 from runner.cli.command import Command, option
-from runner.cli.options import config_argument, job_option, recordings_option, set_option, workers_option
+from runner.cli.options import config_argument, job_option, set_option, workers_option
 from runner.cli.output import Reply, say
 from runner.cli.parameter_types import INDEX
 from runner.cli.progress import count_line, progress_line
-from runner.cli.runs import compilation_notice, run_as_json, run_facts
+from runner.cli.runs import compilation_notice, run_as_json, run_facts, runs_folder
 from runner.errors import ExitCode
-from runner.runs.run import Run, command_for, create_run, recordings_folder, unless_empty
+from runner.runs.run import Run, command_for, create_run, unless_empty
 from runner.util.humanize import amount, size
 from runner.util.row_text import json_lines
 from runner.util.values import checked_name
@@ -36,7 +36,7 @@ def run_command(
     overrides: tuple[str, ...] = set_option,
     name: str | None = option("--name", help="Name of the run.  [default: the configuration's name]"),
     workers: int = workers_option(1),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Iterator[Reply]:
     """Train, evaluate and record the experiment CONFIG: a file, or a shipped one (`dualtaxi config ls`).
 
@@ -59,7 +59,7 @@ def run_command(
     from runner.api import experiment_of, jobs_in
 
     experiment = experiment_of(config, overrides, seed)
-    run_name, folder = checked_name(name), recordings_folder(recordings)
+    run_name = checked_name(name)
     if workers > 1:
         yield from _run_parallel(experiment, folder, run_name, workers)
         return

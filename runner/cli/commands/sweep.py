@@ -18,14 +18,14 @@ from runner.cli.options import (
     accept_changes_option,
     job_option,
     ray_option,
-    recordings_option,
     workers_option,
 )
 from runner.cli.output import Reply, console, facts, say
 from runner.cli.parameter_types import ConfigName
 from runner.cli.progress import seldom
+from runner.cli.runs import runs_folder
 from runner.errors import ExitCode
-from runner.runs.run import command_in, recordings_folder
+from runner.runs.run import command_in
 from runner.util.humanize import UNKNOWN, amount, duration, size
 from runner.util.values import checked_name
 
@@ -72,7 +72,7 @@ def run(
     name: str | None = option(
         "--name", help="Name of the sweep.  [default: the name in the file, or of the file]"
     ),
-    recordings: Path | None = recordings_option,
+    folder: Path = runs_folder,
 ) -> Reply:
     """Run the sweep FILE: many runs of one experiment with other values.
 
@@ -98,7 +98,6 @@ def run(
     from runner.sweep.trials import require_optuna
 
     require_optuna()
-    folder = recordings_folder(recordings)
     checks = {"initial_q": lambda config: resolve_initial_q(config, folder)}
     sweep = with_resolved_tables(load_sweep(file, checked_name(name), checks), folder)
     if dry_run:
