@@ -153,11 +153,6 @@ def console(stderr: bool = False) -> Console:
     return drawn
 
 
-def _may_be_terminal() -> bool:
-    """Return whether stdout is a terminal, or a variable makes Rich take it for one; Rich is not loaded."""
-    return sys.stdout.isatty() or not _FORCING.isdisjoint(os.environ)
-
-
 def draw(part: Part, is_first: bool = False) -> None:
     """Print a part of a text on stdout, a remark on stderr; facts that come first need no title."""
     if isinstance(part, Remark):
@@ -175,8 +170,10 @@ def draw(part: Part, is_first: bool = False) -> None:
             echo(sentence)
         else:
             _render(sentence)
+    # Without a terminal, and a variable that makes Rich take stdout for one, Rich is not loaded.
+    may_be_terminal = sys.stdout.isatty() or not _FORCING.isdisjoint(os.environ)
     for grid in section.tables:
-        if _may_be_terminal() and len(grid.rows) <= MAX_DRAWN and (terminal := console()).is_terminal:
+        if may_be_terminal and len(grid.rows) <= MAX_DRAWN and (terminal := console()).is_terminal:
             _render(grid_table(grid, terminal.width))
         else:
             echo("\n".join(aligned(grid)))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import ConfigError, ExitCode
 from runner.util.humanize import counted
-from runner.views.view import NO_PROGRESS, PAGE, ReadyAnswer, ShownProgress, View, view_input
+from runner.views.view import EVERYTHING, NO_PROGRESS, PAGE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.runs.run import Run
@@ -149,9 +149,7 @@ def diff(
         multiple=True,
         max_length=100,
     ),
-    everything: bool = view_input(
-        "all", "Include everything, not only a selection.", kind=bool, default=False
-    ),
+    everything: bool = EVERYTHING,
     first: bool = view_input(
         "first",
         "Compare only settings and where training first diverges, not the tables.",

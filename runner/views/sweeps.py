@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.analysis.sections import Section
 from runner.sweep import sweeps_in
-from runner.views.view import NO_PROGRESS, ReadyAnswer, ShownProgress, View, view_input
+from runner.views.view import EVERYTHING, NO_PROGRESS, ReadyAnswer, ShownProgress, View
 
 if TYPE_CHECKING:
     from runner.sweep.results import Results
@@ -34,9 +34,7 @@ SWEEP_LS: Final = View("sweep ls", "Sweeps", sweep_ls, subject="folder")
 
 def sweep_show(
     sweep: tuple[str, Path],
-    everything: bool = view_input(
-        "all", "Include everything, not only a selection.", kind=bool, default=False
-    ),
+    everything: bool = EVERYTHING,
     progress: ShownProgress = NO_PROGRESS,
 ) -> Results:
     """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.

@@ -129,6 +129,7 @@ STOP: Final = Input(
 )
 
 
+EVERYTHING: Final = view_input("all", "Include everything, not only a selection.", kind=bool, default=False)
 ONLY_HERE: Final = view_input("", "")
 """An input of a command alone, the option that commands share by its name: code, trust in it, or a filter."""
 
