@@ -52,17 +52,17 @@ class Values:
 
     def numbers_in(self, value: object) -> Floats:
         """Return the numbers of a value, float64 [names]."""
-        parts = [np.asarray(_part(value, leaf), np.float64).ravel() for leaf in self._leaves]
+        parts = [np.asarray(part_of(value, leaf), np.float64).ravel() for leaf in self._leaves]
         return np.concatenate([np.empty(0), *parts])
 
     def texts_in(self, value: object) -> str:
         """Return the texts of a value on one line."""
-        return ", ".join(f"{'.'.join(leaf.path)} {_part(value, leaf)!r}".strip() for leaf in self._texts)
+        return ", ".join(f"{'.'.join(leaf.path)} {part_of(value, leaf)!r}".strip() for leaf in self._texts)
 
     def pixels_in(self, value: object) -> Pixels:
         """Return the image of a value as red, green and blue; of stacked ones the last."""
         assert self.image is not None
-        pixels = np.asarray(_part(value, self.image))
+        pixels = np.asarray(part_of(value, self.image))
         while pixels.ndim > 3:
             pixels = pixels[-1]
         if pixels.ndim == 3 and pixels.shape[0] < _LEAST_SIDE:  # channels, or stacked pictures, first
@@ -198,7 +198,8 @@ def plain_value(value: object) -> object:
     return tuple(parts.values()) if list(parts) == [str(i) for i in range(len(parts))] else parts
 
 
-def _part(value: Value, leaf: Leaf) -> Value:
+def part_of(value: Value, leaf: Leaf) -> Value:
+    """Return the part of a value, or of records of values, that a leaf describes."""
     for key in leaf.path:
         value = value[int(key) if isinstance(value, tuple) else key]
     return value

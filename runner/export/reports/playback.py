@@ -44,12 +44,19 @@ from runner.export.reports.player_data import (
     short_rows,
     words,
 )
-from runner.export.values import is_image, names_in, number_names, observed, step_actions_in_words
+from runner.export.values import (
+    is_image,
+    names_in,
+    number_names,
+    observed,
+    part_of,
+    step_actions_in_words,
+)
 from runner.recording import schema
 from runner.recording.environment import observation_names
 from runner.recording.extras import filled
 from runner.recording.reader import Recording
-from runner.recording.spaces import leaves_of
+from runner.recording.spaces import Leaf, leaves_of
 from runner.replay.recorded import reset_of
 from runner.replay.steps import steps_of, whole_steps
 from runner.replay.tables import TableReplay, tables_at
@@ -207,21 +214,17 @@ class _ShownPart:
     """The agent that it is of; empty where there is only one."""
     names: tuple[str, ...]
     """The names of its numbers, or of its text."""
-    path: tuple[str, ...]
-    is_text: bool
+    leaf: Leaf
 
     def column(self, values: Values) -> Column:
         """Return this part of T values."""
-        if not isinstance(values, list):
-            part = values
-            for name in self.path:
-                part = part[name]
-            return part.reshape(len(part), -1)[:, : len(self.names)].copy()
-        for name in self.path:
-            values = [value[int(name) if isinstance(value, tuple) else name] for value in values]
-        if self.is_text:
-            return [shortened(value, _MAX_LETTERS) for value in values]
-        return np.array(values).reshape(len(values), -1)[:, : len(self.names)]
+        if isinstance(values, list):
+            parts = [part_of(value, self.leaf) for value in values]
+            if self.leaf.dtype is None:
+                return [shortened(text, _MAX_LETTERS) for text in parts]
+        else:
+            parts = part_of(values, self.leaf)
+        return np.asarray(parts).reshape(len(parts), -1)[:, : len(self.names)].copy()
 
 
 def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
@@ -348,7 +351,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         skip = 1 if agent else 0
         name = ".".join(leaf.path[skip:])
         if leaf.dtype is None:
-            shown.append(_ShownPart(agent, (name,), leaf.path, is_text=True))
+            shown.append(_ShownPart(agent, (name,), leaf))
             continue
         shape = leaf.dtype.shape
         count = math.prod(leaf.dtype.shape)
@@ -361,7 +364,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         unseen += count - taken
         names = tuple(islice(number_names(leaf, "", skip, known), taken))
         if names:
-            shown.append(_ShownPart(agent, names, leaf.path, is_text=False))
+            shown.append(_ShownPart(agent, names, leaf))
     if unseen:
         notes.append(f"{unseen:,} more numbers of each observation are in the recording")
     return shown, notes
@@ -381,7 +384,7 @@ def _frames(
     texts, series = [], []
     for i, part in enumerate(parts):
         columns = [observation[i] for observation in observations]
-        if part.is_text:
+        if part.leaf.dtype is None:
             shown = [text for column in columns for text in column]
             unknown = [""] * (frames - len(shown))
             texts.append(words(part.agent, part.names[0] or "observation", unknown + shown))
