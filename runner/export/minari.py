@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -335,30 +335,22 @@ def _episode(recording: Recording, steps: Records, first: Value, seed: int | Non
     after, actions = observed(recording, steps), acted(recording, steps)
     seen, done = (recording.spaces[name] for name in ("observation", "action"))
     if isinstance(after, list):
-        observations = _collected(seen, [first, *after])
+        after = [first, *after]
     else:
-        observations = _split(seen, np.concatenate([np.array([first], after.dtype), after]))
-    taken = _collected(done, actions) if isinstance(actions, list) else _split(done, actions)
+        after = np.concatenate([np.array([first], after.dtype), after])
     fields = {"rewards", "terminated", "truncated", "acted"} & {*(steps.dtype.names or ())}
     outcomes: dict[str, Any] = {name: steps[name].copy() for name in fields}
-    return MinariEpisode(observations, taken, seed=seed, **outcomes)
+    return MinariEpisode(_nested(seen, after), _nested(done, actions), seed=seed, **outcomes)
 
 
-def _split(description: Description, values: NDArray[Any]) -> Value:
-    """Return records as dictionaries and tuples of arrays."""
+def _nested(description: Description, values: NDArray[Any] | list[Value]) -> Value:
+    """Return records, or single values, as dictionaries and tuples of arrays and lists of texts."""
+
+    def part(key: str | int) -> NDArray[Any] | list[Value]:
+        return [value[key] for value in values] if isinstance(values, list) else values[str(key)]
+
     if description["type"] == "Dict":
-        return {name: _split(part, values[name]) for name, part in description["spaces"].items()}
+        return {name: _nested(space, part(name)) for name, space in description["spaces"].items()}
     if description["type"] == "Tuple":
-        return tuple(_split(part, values[str(i)]) for i, part in enumerate(description["spaces"]))
-    return np.ascontiguousarray(values)
-
-
-def _collected(description: Description, values: Sequence[Value]) -> Value:
-    """Return single values as dictionaries and tuples of arrays and lists of texts."""
-    if description["type"] == "Dict":
-        parts = description["spaces"].items()
-        return {name: _collected(part, [value[name] for value in values]) for name, part in parts}
-    if description["type"] == "Tuple":
-        parts = enumerate(description["spaces"])
-        return tuple(_collected(part, [value[i] for value in values]) for i, part in parts)
-    return list(values) if description["type"] == "Text" else np.array(values)
+        return tuple(_nested(space, part(i)) for i, space in enumerate(description["spaces"]))
+    return values if description["type"] == "Text" else np.ascontiguousarray(values)
