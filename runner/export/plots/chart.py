@@ -68,7 +68,8 @@ class Scale:
 
     @classmethod
     def around(cls, values: Values, start: float, end: float, log: bool = False) -> Scale:
-        """Return a scale on which values have a margin on both sides."""
+        """Return a scale on which the finite ones of values have a margin on both sides."""
+        values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
         if log:
             factor = (high / low) ** 0.05 if high > low else 2.0

@@ -31,6 +31,7 @@ from runner.export.plots.chart import (
     series_marker,
 )
 from runner.export.plots.curves import HEIGHT, WIDTH, draw_legend
+from runner.util.arrays import Floats
 
 _SPREAD: Final = 0.22
 """Largest distance of the points of single seeds from their group's line, in rows."""
@@ -57,13 +58,8 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
     The labels are those of all groups, in the order of their colours.
     """
     bottom = 12.0 + max(100.0, 30.0 * len(metric.groups))
-    drawn = [
-        value
-        for group in metric.groups
-        for value in (*group.values, group.median, group.iqm.low, group.iqm.high)
-        if math.isfinite(value)
-    ]
-    x = Scale.around(np.array(drawn), 40.0, WIDTH - 10)
+    drawn = [(*group.values, group.median, group.iqm.low, group.iqm.high) for group in metric.groups]
+    x = Scale.around(np.concatenate(drawn), 40.0, WIDTH - 10)
     y = Scale(len(metric.groups) - 0.4, -0.6, bottom, 12.0)
     chart = Chart(x, y, WIDTH, bottom + 34, f"{metric.title}: values of the groups")
     chart.x_ticks()
@@ -204,22 +200,12 @@ def _aggregates(comparison: TaskComparison) -> Canvas:
     canvas.text(78.0, 25, "Aggregates, with 95 % intervals", size=9.5, bold=True)
     for k, (name, estimate_of) in enumerate(AGGREGATES):
         top = 32 + row * k
-        ends = [
-            end
-            for result in comparison.algorithms
-            for end in (estimate_of(result).low, estimate_of(result).value, estimate_of(result).high)
-            if math.isfinite(end)
-        ]
-        chart = Chart(
-            Scale.around(np.array(ends), 78.0, WIDTH - 10),
-            Scale(count - 0.4, -0.6, top + row - 16, top),
-            0,
-            0,
-            "",
-        )
+        estimates = [estimate_of(result) for result in comparison.algorithms]
+        x = Scale.around(_ends(estimates), 78.0, WIDTH - 10)
+        chart = Chart(x, Scale(count - 0.4, -0.6, top + row - 16, top), 0, 0, "")
         chart.x_ticks()
-        for i, result in enumerate(comparison.algorithms):
-            draw_estimate(chart, estimate_of(result), i, i, 2.6)
+        for i, estimate in enumerate(estimates):
+            draw_estimate(chart, estimate, i, i, 2.6)
         chart.text(70.0, top + (row - 16) / 2 + 3, name, "end")
         canvas.place(chart, 0, 0)
     return canvas
@@ -231,7 +217,7 @@ def _curves(comparison: TaskComparison) -> Chart:
     ends = [result.curve for result in comparison.algorithms]
     ends += [part for r in comparison.algorithms for part in (r.curve_low, r.curve_high)]
     values = np.array(ends)
-    y = Scale.around(values[np.isfinite(values)], 146.0, 32.0)
+    y = Scale.around(values, 146.0, 32.0)
     chart = Chart(Scale(places[0], places[-1], 50.0, WIDTH - 10), y, WIDTH, HEIGHT, "Sample efficiency")
     chart.x_ticks(labelled(chart.x.ticks, short=places[-1] >= 10_000))
     chart.y_ticks()
@@ -255,9 +241,8 @@ class BarColumn(NamedTuple):
 
 def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
     """Return a bar from 0 for each named estimate, with its interval; pale if that includes 0."""
-    ends = [end for _, each in rows for end in (each.value, each.low, each.high) if math.isfinite(end)]
     bottom = 24.0 + _ROW * len(rows)
-    x = Scale.around(np.array([0.0, *ends]), _NAMES, _WIDTH - 10)
+    x = Scale.around(np.append(_ends([estimate for _, estimate in rows]), 0.0), _NAMES, _WIDTH - 10)
     chart = Chart(x, Scale(len(rows) - 0.5, -0.5, bottom, 24.0), _WIDTH, bottom + 18, title)
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.x_ticks()
@@ -298,6 +283,11 @@ def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn
     for row, name in enumerate(names):
         chart.text(_NAMES - 8, bottom + 19 + 16 * row, _short(name), "end")
     return chart
+
+
+def _ends(estimates: Sequence[Estimate]) -> Floats:
+    """Return the values of estimates, and the ends of their intervals."""
+    return np.array([(estimate.low, estimate.value, estimate.high) for estimate in estimates])
 
 
 def _short(name: str) -> str:
