@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,19 +71,6 @@ class _Chosen:
     success: Flags
     penalty: Flags | Floats
     """Whether a step is a penalty; of merged outcomes its probability."""
-
-
-class _AtStarts(NamedTuple):
-    """What episodes from each of N start states come to."""
-
-    success_percent: float
-    """Mean over the start states."""
-    timeout_percent: float
-    totals: Floats
-    """[N, 2 + L]: length, penalties, and the return of each learner."""
-    values: Floats
-    """[N, L]: discounted; nan for a discount of 1."""
-    cycles: tuple[Cycle, ...] = ()
 
 
 def evaluate_policy(mdp: Mdp, policy: Ints32, learners: int, discount: float) -> PolicyOutcome:
@@ -159,18 +146,36 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> PolicyOutcome:
         )
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
-    measure = _deterministic if _is_certain(chosen) else _stochastic
-    paths = measure(chosen, starts, weights, mdp.step_limit, discount)
-    length, penalties, *returns = _means(paths.totals, weights)
+    cycles: tuple[Cycle, ...] = ()
+    if _is_certain(chosen):
+        chain = _chain(chosen)
+        paths = kernel.find_paths(chain)
+        lengths, sums, counts = kernel.play_all(chain, paths, starts, mdp.step_limit)
+        timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > mdp.step_limit)
+        success_percent = _mean(100.0 * (counts[:, 0] > 0), weights)
+        timeout_percent = _mean(100.0 * timed_out, weights)
+        totals = np.column_stack([lengths, counts[:, 1], sums])
+        values = _chain_values(chain, paths, discount)
+        cycles = _cycles(paths, starts, weights)
+    else:
+        p, penalty = chosen.probability, chosen.penalty
+        gains = np.column_stack([np.ones(len(p)), (p * penalty).sum(axis=1), _expected_rewards(chosen)])
+        after, ends, success = chosen.next_state, chosen.terminated, chosen.success
+        chances, expected = kernel.expect(after, p, ends, success, gains, mdp.step_limit)
+        succeeded, ended = _means(chances[starts], weights)
+        success_percent, timeout_percent = 100 * succeeded, 100 * (1 - ended)
+        totals = expected[starts]
+        values = _stochastic_values(chosen, discount)
+    length, penalties, *returns = _means(totals, weights)
     return PolicyOutcome(
         starts=len(starts),
-        success_percent=paths.success_percent if mdp.success_mask else math.nan,
-        timeout_percent=paths.timeout_percent,
+        success_percent=success_percent if mdp.success_mask else math.nan,
+        timeout_percent=timeout_percent,
         mean_length=length,
         mean_penalties=penalties,
         mean_returns=tuple(returns),
-        values=_means(paths.values, weights),
-        cycles=paths.cycles,
+        values=_means(values[starts], weights),
+        cycles=cycles,
     )
 
 
@@ -232,29 +237,6 @@ def _merged(mdp: Mdp, probability: Floats, learners: int) -> _Chosen:
         padded(success[first]),
         padded(np.bincount(group, chance * penalty) / total),
     )
-
-
-def _deterministic(chosen: _Chosen, starts: Ints, weights: Floats, limit: int, discount: float) -> _AtStarts:
-    chain = _chain(chosen)
-    paths = kernel.find_paths(chain)
-    lengths, returns, counts = kernel.play_all(chain, paths, starts, limit)
-    timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > limit)
-    return _AtStarts(
-        success_percent=_mean(100.0 * (counts[:, 0] > 0), weights),
-        timeout_percent=_mean(100.0 * timed_out, weights),
-        totals=np.column_stack([lengths, counts[:, 1], returns]),
-        values=_chain_values(chain, paths, discount)[starts],
-        cycles=_cycles(paths, starts, weights),
-    )
-
-
-def _stochastic(chosen: _Chosen, starts: Ints, weights: Floats, limit: int, discount: float) -> _AtStarts:
-    p = chosen.probability
-    gains = np.column_stack([np.ones(len(p)), (p * chosen.penalty).sum(axis=1), _expected_rewards(chosen)])
-    chances, totals = kernel.expect(chosen.next_state, p, chosen.terminated, chosen.success, gains, limit)
-    succeeded, ended = _means(chances[starts], weights)
-    values = _stochastic_values(chosen, discount)
-    return _AtStarts(100 * succeeded, 100 * (1 - ended), totals[starts], values[starts])
 
 
 def _chain(chosen: _Chosen) -> Chain:
