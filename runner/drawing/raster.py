@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import importlib.util
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -208,47 +208,41 @@ def _fonts() -> tuple[Path, Path]:
     return folder / "DejaVuSans.ttf", folder / "DejaVuSans-Bold.ttf"
 
 
-class BarRaster:
-    """Draws values as horizontal bars from zero, between the lowest and the highest that each value gets.
+def draw_bars(names: Sequence[str], low: Floats, high: Floats, rows: Iterable[Floats]) -> Iterator[Pixels]:
+    """Draw the values of each row as horizontal bars from zero; one that is not finite has no bar.
 
-    Those after the first `MAX_BARS` are counted in a line, and not drawn.
+    A bar lies between the lowest and the highest that its value gets. Values after the first `MAX_BARS` are
+    counted in a line, and not drawn.
     """
+    from PIL import Image, ImageDraw
 
-    def __init__(self, names: Sequence[str], low: Floats, high: Floats) -> None:
-        from PIL import Image, ImageDraw
-
-        self._shown = min(len(names), MAX_BARS)
-        low, high = np.minimum(low[: self._shown], 0), np.maximum(high[: self._shown], 0)
-        left, right = _BARS
-        self._scale = (right - left) / np.where(high > low, high - low, 1)
-        """Pixels of a unit."""
-        self._zero = left - low * self._scale
-        rows = self._shown + (len(names) > MAX_BARS)
-        self._ground = Image.new("RGB", (BARS_WIDTH, rows * _LINE + 2 * _MARGIN), palette.WHITE)
-        pen = ImageDraw.Draw(self._ground)
-        for k, name in enumerate(names[: self._shown]):
-            text = shortened(name, left - 2 * _MARGIN, _TEXT)
-            pen.text((_MARGIN, _middle(k)), text, palette.INK, font(_TEXT), anchor="lm")
-            zero = round(float(self._zero[k]))
-            pen.line((zero, _middle(k) - _LINE // 2, zero, _middle(k) + _LINE // 2), palette.GREY)
-        if rows > self._shown:
-            text = f"and {len(names) - self._shown:,} more values"
-            pen.text((_MARGIN, _middle(self._shown)), text, palette.GREY, font(_TEXT), anchor="lm")
-
-    def draw(self, values: Floats) -> Pixels:
-        """Return the picture of values, float64 [values]; one that is not finite has no bar."""
-        from PIL import ImageDraw
-
-        picture = self._ground.copy()
+    shown = min(len(names), MAX_BARS)
+    low, high = np.minimum(low[:shown], 0), np.maximum(high[:shown], 0)
+    left, right = _BARS
+    scale = (right - left) / np.where(high > low, high - low, 1)  # pixels of a unit
+    zeros = (left - low * scale).tolist()
+    lines = shown + (len(names) > MAX_BARS)
+    ground = Image.new("RGB", (BARS_WIDTH, lines * _LINE + 2 * _MARGIN), palette.WHITE)
+    pen = ImageDraw.Draw(ground)
+    for k, name in enumerate(names[:shown]):
+        text = shortened(name, left - 2 * _MARGIN, _TEXT)
+        pen.text((_MARGIN, _middle(k)), text, palette.INK, font(_TEXT), anchor="lm")
+        zero = round(zeros[k])
+        pen.line((zero, _middle(k) - _LINE // 2, zero, _middle(k) + _LINE // 2), palette.GREY)
+    if lines > shown:
+        text = f"and {len(names) - shown:,} more values"
+        pen.text((_MARGIN, _middle(shown)), text, palette.GREY, font(_TEXT), anchor="lm")
+    for values in rows:
+        picture = ground.copy()
         pen = ImageDraw.Draw(picture)
-        for k, value in enumerate(values[: self._shown].tolist()):
+        for k, value in enumerate(values[:shown].tolist()):
             if np.isfinite(value):
-                ends = sorted((float(self._zero[k]), float(self._zero[k] + value * self._scale[k])))
+                start, end = sorted((zeros[k], zeros[k] + value * float(scale[k])))
                 colour = palette.BLUE if value > 0 else palette.ORANGE
-                pen.rectangle((ends[0], _middle(k) - 6, ends[1], _middle(k) + 6), colour)
+                pen.rectangle((start, _middle(k) - 6, end, _middle(k) + 6), colour)
             text = UNKNOWN if np.isnan(value) else f"{value:.4g}"
-            pen.text((_BARS[1] + _MARGIN, _middle(k)), text, palette.INK, font(_TEXT), anchor="lm")
-        return np.asarray(picture)
+            pen.text((right + _MARGIN, _middle(k)), text, palette.INK, font(_TEXT), anchor="lm")
+        yield np.asarray(picture)
 
 
 def _middle(row: int) -> int:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from runner.analysis.contents import ENDINGS, Step, ending_of, require_steps
 from runner.drawing import svg
-from runner.drawing.raster import BarRaster, Pixels, SceneRaster, require_packages
+from runner.drawing.raster import Pixels, SceneRaster, draw_bars, require_packages
 from runner.environments.mdp import events_of
 from runner.environments.naming import agent_actions_in_words, events_in_words, exploration_in_words, spoken
 from runner.errors import CannotRedo, RecordingError
@@ -193,9 +193,7 @@ def paint_values(recording: Recording, phase: str, episode: int, seen: Iterator[
     for now in numbers(observations_of(recording, phase, episode)):
         finite = np.where(np.isfinite(now), now, np.nan)
         low, high = np.fmin(low, finite), np.fmax(high, finite)
-    raster = BarRaster(names, low, high)
-    for now in numbers(seen):
-        yield raster.draw(now)
+    yield from draw_bars(names, low, high, numbers(seen))
 
 
 class PictureSource(StrEnum):
