@@ -303,9 +303,9 @@ def _show(
             viewer.screenshot(path, location.time, screenshot, picture_size)
         echo(screenshot)
     elif web:
-        with viewer.web_viewer(viewer.check_port(port), path) as (started, address):
+        with viewer.web_viewer(viewer.free_port(port), path) as (started, address):
             echo(address)
             say(f"The step is {location.time:,}: enter it at the lower right. Ctrl-C ends the viewer.")
             started.process.wait()
     else:
-        viewer.open_window(path, location.time, viewer.check_port(port))
+        viewer.open_window(path, location.time, viewer.free_port(port))

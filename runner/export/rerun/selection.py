@@ -350,7 +350,10 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
     """
     with open_recording(run.recording) as recording:
         if step is None:
-            return Location(_default_time(recording, request), request)
+            shown = select(recording, request).by_phase
+            phase = next((phase for phase in ("eval", "train") if shown[phase]), "")
+            time = time_of(recording.phase(phase).steps.one(shown[phase][-1].start)) if phase else 0
+            return Location(time, request)
         require_steps(recording, "look at")
         step = step.resolved(recording)
         number = step.episode
@@ -393,11 +396,3 @@ def locate_divergence(runs: Sequence[Run]) -> tuple[EpisodeRef | None, str]:
         row = a.phase(both[0].phase).steps.one(both[0].step)
         number = ended_episode(a, both[0].phase, int(row["environment"]), both[0].step)
     return None if number is None or both[0].after is not None else EpisodeRef(number, both[0].t), words
-
-
-def _default_time(recording: Recording, request: Request) -> int:
-    selected = select(recording, request).by_phase
-    for phase in ("eval", "train"):
-        if selected[phase]:
-            return time_of(recording.phase(phase).steps.one(selected[phase][-1].start))
-    return 0

@@ -68,12 +68,7 @@ def viewer_program() -> Path:
     raise ViewerError(f"found no Rerun viewer in {folder}; install rerun-sdk again.")
 
 
-def free_port() -> int:
-    """Return a port that nothing listens on now."""
-    return check_port(0)
-
-
-def check_port(port: int) -> int:
+def free_port(port: int = 0) -> int:
     """Return the port if it is free, or any free port for 0.
 
     Raises:

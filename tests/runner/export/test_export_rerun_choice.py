@@ -16,7 +16,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.cli import cli
 from runner.errors import MissingExtra, RecordingError
 from runner.export.rerun.selection import Request, episodes_of, locate, locate_divergence, select
-from runner.export.rerun.viewer import ViewerError, check_port, require_rerun
+from runner.export.rerun.viewer import ViewerError, free_port, require_rerun
 from runner.recording import schema
 from runner.recording.reader import open_recording
 
@@ -171,7 +171,7 @@ class TestCommand:
             taken.listen()
             port = taken.getsockname()[1]
             with pytest.raises(ViewerError, match=f"port {port} cannot be used .* --port"):
-                check_port(port)
+                free_port(port)
 
     def test_more_than_two_runs(self):
         result = invoke("view", "a", "b", "c")
