@@ -123,7 +123,9 @@ class Golden:
             if difference is None:
                 return
             if not self._is_update:
-                page = self._write_page(file, difference.page)
+                self._pages.mkdir(parents=True, exist_ok=True)
+                page = self._pages / f"{file.parent.name}--{file.stem}.html"
+                page.write_text(difference.page, encoding="utf-8")
                 pytest.fail(
                     f"differs from the golden run {file.name}.\n{difference.text}\npage: {page}\n{_UPDATE}",
                     pytrace=False,
@@ -220,12 +222,6 @@ class Golden:
             pytest.fail(
                 f"there is no golden run {file}; record it by `pytest --golden-update`.", pytrace=False
             )
-
-    def _write_page(self, file: Path, page: str) -> Path:
-        self._pages.mkdir(parents=True, exist_ok=True)
-        path = self._pages / f"{file.parent.name}--{file.stem}.html"
-        path.write_text(page, encoding="utf-8")
-        return path
 
 
 _UPDATE = "If the change is intended, keep the new one by `pytest --golden-update` and commit it."
