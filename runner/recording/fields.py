@@ -20,8 +20,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
 from typing import Any, Final
 
 import numpy as np
@@ -242,32 +242,31 @@ def _is_utf8(text: bytes) -> bool:
     return True
 
 
-def space_field(number: int, name: str, description: Description) -> Field:
-    """Return the field of a message with the values of a space, whose description was checked."""
-    return replace(_field(number, name, name, description), is_value=True)
+def space_field(
+    number: int, name: str, description: Description, stored_as: str = "", is_value: bool = True
+) -> Field:
+    """Return the field of a message with the values of a space, whose description was checked.
 
-
-def _field(number: int, name: str, stored_name: str, description: Description) -> Field:
-    stored_as = stored_name if stored_name != name else ""
-    parts = parts_of(description)
-    if parts is not None:
+    Args:
+        stored_as: its name in the file's schema, if that is another one.
+        is_value: False for a part of a space.
+    """
+    field = partial(Field, number, name, stored_as=stored_as, is_value=is_value)
+    if (parts := parts_of(description)) is not None:
         names = _identifiers([key for key, _ in parts])
         fields = tuple(
-            _field(k, key, stored, part)
+            space_field(k, key, part, stored if stored != key else "", is_value=False)
             for k, ((key, part), stored) in enumerate(zip(parts, names, strict=True), start=1)
         )
-        return Field(number, name, Pb.TYPE_MESSAGE, stored_as=stored_as, parts=fields)
+        return field(Pb.TYPE_MESSAGE, parts=fields)
     dtype = leaf_dtype(description)
-    if dtype is None and (item := item_dtype(description)) is not None:
-        kind = _KINDS.get(item.base.str, Pb.TYPE_BYTES)
-        return Field(number, name, kind, kind != Pb.TYPE_BYTES, stored_as)
-    if dtype is None:
-        return Field(number, name, Pb.TYPE_STRING, stored_as=stored_as)
-    code = dtype.base.str
-    code = code if dtype.shape else _WIDER.get(code, code)
-    kind = _KINDS.get(code, Pb.TYPE_BYTES)
-    is_repeated = bool(dtype.shape) and code in _KINDS
-    return Field(number, name, kind, is_repeated, stored_as, dtype)
+    number_type = item_dtype(description) if dtype is None else dtype
+    if number_type is None:
+        return field(Pb.TYPE_STRING)
+    is_array = dtype is None or bool(dtype.shape)
+    code = number_type.base.str
+    code = code if is_array else _WIDER.get(code, code)
+    return field(_KINDS.get(code, Pb.TYPE_BYTES), is_array and code in _KINDS, dtype=dtype)
 
 
 def _identifiers(keys: list[str]) -> list[str]:

@@ -67,13 +67,14 @@ class Reference:
         return not any(self._remaining.values())
 
     def compare_block(self, topic: Topic, records: Records) -> None:
-        """Compare records with the next recorded ones, as many as there are.
+        """Compare records with the next recorded ones, as many as there are; the others are new.
 
         Raises:
-            Diverged: they differ; the first record and field that do are named.
+            Diverged: they differ, the first record and field that do are named; or the recording should be
+                complete and is not.
         """
         done = 0
-        while done < len(records) and self._remaining[topic]:
+        while done < len(records) and self.remaining(topic):
             block = self._block.get(topic)
             if block is None or not len(block):
                 block = next(self._blocks[topic])
@@ -90,6 +91,9 @@ class Reference:
             self._block[topic] = block[n:]
             self._remaining[topic] -= n
             done += n
+        is_left_out = topic.message is schema.STEP and not self._has_steps
+        if self.complete and done < len(records) and not is_left_out:
+            raise Diverged(topic.name, "message", "none", "one more", **_position(records[done]))
 
     def compare_message(self, topic: Topic, log_time: int, payload: bytes) -> bool:
         """Compare a message with the next recorded one; return False if there is none.
@@ -107,15 +111,6 @@ class Reference:
         if recorded != (log_time, payload):
             raise _message_difference(topic, recorded, (log_time, payload))
         return True
-
-    def check_new(self, topic: Topic, records: Records) -> None:
-        """Check that records which the recording does not hold may be new.
-
-        Raises:
-            Diverged: the recording should be complete.
-        """
-        if self.complete and len(records) and (self._has_steps or topic.message is not schema.STEP):
-            raise Diverged(topic.name, "message", "none", "one more", **_position(records[0]))
 
     def check_exhausted(self) -> None:
         """Check, after the run, that the recording holds no more than the run gave.
