@@ -171,21 +171,15 @@ class ArchiveStore:
 
     def _download(self, run_id: str, name: str, entry: Entry, path: Path) -> None:
         """Copy a file of an archive to a local one: never more bytes than the manifest says."""
-        where = f"{self.place(run_id)}/{name}"
-        with self._reaching(where):
-            info = self._files.get_file_info(self._path(run_id, name))
-            if info.type != self._file_type:
-                raise RecordingError(f"{where}: is missing; the archive is damaged.")
-            if info.size != entry.size:
+        with self.opened(run_id, name) as source:
+            if (size := source.size()) != entry.size:
                 raise RecordingError(
-                    f"{where}: found {info.size:,} bytes, expected {entry.size:,}: the archive is damaged."
+                    f"{self.place(run_id)}/{name}: found {size:,} bytes, expected {entry.size:,}: "
+                    "the archive is damaged."
                 )
             path.parent.mkdir(parents=True, exist_ok=True)
-            source = self._files.open_input_stream(info.path, compression=None)  # not even of *.zst
-            with source, path.open("xb") as target:
-                left = entry.size
-                while left and (data := source.read(min(_PIECE, left))):
-                    left -= target.write(data)
+            with path.open("xb") as target:
+                shutil.copyfileobj(source, target, _PIECE)
 
     def _path(self, *parts: str) -> str:
         """Return the path of a file in the store's file system.

@@ -70,7 +70,8 @@ class Learner:
         self._tally = _tally(self.model, log.window if log else 1, log.episodes if log else 50)
         self._eval_tally = _tally(self.model, 1, 1)
         self._eval_cursor = np.zeros(1, kernel.CURSOR)
-        self._policy = np.zeros(mdp.states, np.int32)
+        self.trial_actions = np.zeros(mdp.states, np.int32)
+        """The joint action of each state in the present evaluation, [S], or how it is drawn: see `kernel`."""
         self._start = _trial_start(config, mdp)
         self._success = np.array([name in mdp.success_events for name in mdp.event_names], dtype=np.bool_)
 
@@ -152,14 +153,9 @@ class Learner:
         if trial is not None:
             self._eval_cursor["episode"] = trial
         if not self.rules.learns or self.algorithm.draws_actions:
-            self._policy.fill(kernel.DRAWN if self.rules.learns else -1)
+            self.trial_actions.fill(kernel.DRAWN if self.rules.learns else -1)
             return
-        self._policy[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
-
-    @property
-    def trial_actions(self) -> Ints32:
-        """The joint action of each state in the present evaluation, [S], or how it is drawn: see `kernel`."""
-        return self._policy
+        self.trial_actions[:] = (self.tables.greedy.T * np.array(self.model.stride)).sum(axis=1)
 
     @property
     def policy(self) -> Ints32 | list[Floats]:
@@ -173,7 +169,7 @@ class Learner:
         if self.algorithm.draws_actions:
             policies = [self.named_tables(i)["policy"] for i in range(len(self.agents))]
             return [policy / policy.sum(axis=1, keepdims=True) for policy in policies]
-        return self._policy
+        return self.trial_actions
 
     def evaluate(self, steps: Records, episodes: Records, until_episode: int) -> tuple[int, int]:
         """Play trials until a block is full or trial `until_episode` (counted over the run) is reached."""
@@ -183,7 +179,7 @@ class Learner:
             self.seed,
             self.model,
             self.tables,
-            self._policy,
+            self.trial_actions,
             self._eval_tally,
             steps,
             ends,
@@ -195,8 +191,15 @@ class Learner:
         return filled, ended
 
     def training_metrics(self) -> dict[str, object]:
-        """Return the measures of training at this moment, named as in the recording's metrics."""
-        rewards, counts = self._reward_distribution()
+        """Return the measures of training at this moment, named as in the recording's metrics.
+
+        They have the summed rewards of the last steps, ascending, and how often each came.
+        """
+        window = self._tally.recent_outcomes[: min(self.step, len(self._tally.recent_outcomes))]
+        by_class = np.bincount(window, minlength=len(self.model.rewards))
+        rewards, where = self._distinct_rewards
+        counts = np.bincount(where, weights=by_class, minlength=len(rewards)).astype(np.int64)
+        seen = counts > 0
         lengths = self._tally.recent_lengths[: min(self.episode, len(self._tally.recent_lengths))]
         tables = [self.table(i) for i in range(len(self.agents))]
         zero_cells = [int(table.size - np.count_nonzero(table)) for table in tables]
@@ -205,8 +208,8 @@ class Learner:
             "step": self.step,
             "episode": self.episode,
             "mean_length": float(lengths.mean()) if len(lengths) else float("nan"),
-            "rewards": rewards,
-            "reward_counts": counts,
+            "rewards": rewards[seen].tolist(),
+            "reward_counts": counts[seen].tolist(),
             "zero_cells": zero_cells,
             "percent_filled": [
                 100.0 * (table.size - zero) / table.size
@@ -216,15 +219,6 @@ class Learner:
             "step_size": float(schedule_value(self.rules.step_size, self.episode, self.step)),
             "discount": float(schedule_value(self.rules.discount, self.episode, self.step)),
         }
-
-    def _reward_distribution(self) -> tuple[list[float], list[int]]:
-        """Return the summed rewards of the last steps, ascending, and how often each came."""
-        window = self._tally.recent_outcomes[: min(self.step, len(self._tally.recent_outcomes))]
-        by_class = np.bincount(window, minlength=len(self.model.rewards))
-        rewards, where = self._distinct_rewards
-        counts = np.bincount(where, weights=by_class, minlength=len(rewards)).astype(np.int64)
-        seen = counts > 0
-        return rewards[seen].tolist(), counts[seen].tolist()
 
     @cached_property
     def _distinct_rewards(self) -> tuple[Floats, Ints]:

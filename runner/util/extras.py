@@ -79,7 +79,8 @@ def install_command(extra: str) -> str:
     try:
         distribution = metadata.distribution(_PROJECT)
     except metadata.PackageNotFoundError:
-        return _command("pip", _clone(code, extra))  # a clone on the path, not installed
+        return _command("pip", extra, clone=code)  # a clone on the path, not installed
+    installer = _installer(distribution)
     origin: Json = json.loads(distribution.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
     if origin.get("dir_info", {}).get("editable"):
@@ -87,9 +88,9 @@ def install_command(extra: str) -> str:
         from urllib.request import url2pathname
 
         clone = Path(url2pathname(urlsplit(url).path))
-        return _command(_installer(distribution), _clone(clone, extra))
+        return _command(installer, extra, clone)
     if not url and (code / "pyproject.toml").is_file():
-        return _command(_installer(distribution), _clone(code, extra))
+        return _command(installer, extra, clone=code)
     wanted = f"{_PROJECT}[{extra}]"
     if "vcs_info" in origin:
         vcs = origin["vcs_info"]
@@ -98,7 +99,7 @@ def install_command(extra: str) -> str:
         wanted += f" @ {url}"
     else:
         wanted += f"=={distribution.version}"
-    return _command(_installer(distribution), [wanted])
+    return _command(installer, wanted)
 
 
 def _installer(distribution: Distribution) -> str:
@@ -111,8 +112,8 @@ def _installer(distribution: Distribution) -> str:
     return "uv" if (distribution.read_text("INSTALLER") or "").strip() == "uv" else "pip"
 
 
-def _command(installer: str, requirement: list[str]) -> str:
-    """Return the command line that installs a requirement into this environment."""
+def _command(installer: str, requirement: str, clone: Path | None = None) -> str:
+    """Return the command line that installs a requirement, or an extra of a clone, into this environment."""
     python = _short(Path(sys.executable))
     words = {
         "pip": [python, "-m", "pip", "install"],
@@ -120,16 +121,12 @@ def _command(installer: str, requirement: list[str]) -> str:
         "pipx": ["pipx", "install", "--force"],
         "uv tool": ["uv", "tool", "install", "--force"],
     }[installer]
-    if installer in ("pip", "uv") and requirement[0] == "--editable":
-        clone = Path(requirement[1].partition("[")[0])
-        if (clone / "constraints.txt").is_file():  # the versions it is tested with
-            words += ["--constraint", os.fspath(clone / "constraints.txt")]
-    return shlex.join([*words, *requirement])
-
-
-def _clone(clone: Path, extra: str) -> list[str]:
-    """Return the arguments that install an extra of a clone."""
-    return ["--editable", f"{_short(clone)}[{extra}]"]
+    if clone is None:
+        return shlex.join([*words, requirement])
+    constraints = clone / "constraints.txt"  # the versions it is tested with
+    if installer in ("pip", "uv") and constraints.is_file():
+        words += ["--constraint", _short(constraints)]
+    return shlex.join([*words, "--editable", f"{_short(clone)}[{requirement}]"])
 
 
 def _short(path: Path) -> str:
