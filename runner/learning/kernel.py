@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from runner.learning import draws
 from runner.learning.algorithms import (
@@ -67,6 +68,24 @@ class Ends(NamedTuple):
             episodes[name] = counts[:, column]
         episodes["events"] = counts[:, len(ENDS) :]
         episodes["returns"] = self.returns[:ended]
+
+
+class StateProbe(NamedTuple):
+    """Values and greedy actions of some states, read before some of the steps of a block."""
+
+    before: Ints
+    """[k]: rows of the block, ascending."""
+    states: Ints32
+    """[k, n]: the states that are read before each of these rows; -1 for none."""
+    value: NDArray[np.float32]
+    """[k, L, n]: filled with the highest value of each state; nan for none."""
+    greedy: Ints32
+    """[k, L, n]: filled with the greedy action in each state; -1 for none."""
+
+    def between(self, start: int, stop: int) -> StateProbe:
+        """Return the part of the probe for rows `start` to `stop` of the block, as a block of their own."""
+        part = slice(*np.searchsorted(self.before, (start, stop)))
+        return StateProbe(self.before[part] - start, self.states[part], self.value[part], self.greedy[part])
 
 
 START_RANDOM, START_EACH = -1, -2
@@ -408,33 +427,6 @@ def _read_rows(model: Model, tables: Tables, rows: Floats, k: int, state: int) -
 
 
 @loop
-def replay(
-    seed: np.uint64,
-    model: Model,
-    tables: Tables,
-    rules: Rules,
-    steps: Records,
-    rows: Floats,
-    updates: Records,
-    traced: int,
-) -> None:
-    """Apply the updates of recorded training steps, in order, to the tables.
-
-    As far as `rows` ([steps, L, widest], or empty) goes, row k gets each learner's values of the state before
-    step k's update: those it chose by. Item k of `updates` ([steps] of `ledger.UPDATE`, or empty) gets what
-    decides the weights of learner `traced`'s update.
-    """
-    for k in range(len(steps)):
-        record = steps[k]
-        _read_rows(model, tables, rows, k, record.state)
-        bootstrapped, second = relearn(seed, model, tables, rules, record, traced)
-        if k < len(updates) and rules.learns:
-            update = updates[k]
-            update.outcome, update.episode = outcome_of(model, record, traced), record.episode
-            update.bootstrapped, update.second = bootstrapped, second
-
-
-@loop
 def read_states(tables: Tables, states: Ints32, value: Floats, greedy: Ints32) -> None:
     """Read the highest value and the greedy action of states, [n], into [L, n]; nan and -1 for state -1."""
     for i in range(value.shape[0]):
@@ -449,26 +441,35 @@ def read_states(tables: Tables, states: Ints32, value: Floats, greedy: Ints32) -
 
 
 @loop
-def replay_probed(
+def replay(
     seed: np.uint64,
     model: Model,
     tables: Tables,
     rules: Rules,
     steps: Records,
     rows: Floats,
-    before: Ints,
-    states: Ints32,
-    value: Floats,
-    greedy: Ints32,
+    updates: Records,
+    traced: int,
+    probe: StateProbe,
 ) -> None:
-    """Replay steps, and read the states of row k of `states` before step `before[k]`; they ascend."""
+    """Apply the updates of recorded training steps, in order, to the tables, and fill a probe.
+
+    As far as `rows` ([steps, L, widest], or empty) goes, row k gets each learner's values of the state before
+    step k's update: those it chose by. Item k of `updates` ([steps] of `ledger.UPDATE`, or empty) gets what
+    decides the weights of learner `traced`'s update.
+    """
     at = 0
     for k in range(len(steps)):
-        while at < len(before) and before[at] == k:
-            read_states(tables, states[at], value[at], greedy[at])
+        while at < len(probe.before) and probe.before[at] == k:
+            read_states(tables, probe.states[at], probe.value[at], probe.greedy[at])
             at += 1
-        _read_rows(model, tables, rows, k, steps[k].state)
-        relearn(seed, model, tables, rules, steps[k], np.int64(-1))
+        record = steps[k]
+        _read_rows(model, tables, rows, k, record.state)
+        bootstrapped, second = relearn(seed, model, tables, rules, record, traced)
+        if k < len(updates) and rules.learns:
+            update = updates[k]
+            update.outcome, update.episode = outcome_of(model, record, traced), record.episode
+            update.bootstrapped, update.second = bootstrapped, second
 
 
 @numba.njit(cache=True)

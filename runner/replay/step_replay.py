@@ -11,38 +11,25 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runner.config import from_mapping
 from runner.environments.mdp import Mdp
 from runner.errors import RecordingError
 from runner.learning import kernel
+from runner.learning.kernel import StateProbe
 from runner.learning.learner import Learner, NamedTables, name_tables
 from runner.learning.ledger import UPDATE
 from runner.learning.watching import Watch, WatchedValues, begin, empty_changes, joined, replay_watched
-from runner.util.arrays import Array, Floats, Ints, Ints32, Records
+from runner.util.arrays import Array, Floats, Records
 from runner.util.values import JsonView
 
 NO_ROWS: Final = np.empty((0, 0, 0))
-NO_UPDATES: Final = np.empty(0, UPDATE)
-
-
-class StateProbe(NamedTuple):
-    """Values and greedy actions of some states, read before some of the steps of a block."""
-
-    before: Ints
-    """[k]: rows of the block, ascending."""
-    states: Ints32
-    """[k, n]: the states that are read before each of these rows; -1 for none."""
-    value: NDArray[np.float32]
-    """[k, learners, n]: filled with the highest value of each state; nan for none."""
-    greedy: Ints32
-    """[k, learners, n]: filled with the greedy action in each state; -1 for none."""
-
-    def between(self, start: int, stop: int) -> StateProbe:
-        """Return the part of the probe for rows `start` to `stop` of the block, as a block of their own."""
-        part = slice(*np.searchsorted(self.before, (start, stop)))
-        return StateProbe(self.before[part] - start, self.states[part], self.value[part], self.greedy[part])
+NO_PROBE: Final = StateProbe(
+    np.empty(0, np.int64),
+    np.empty((0, 0), np.int32),
+    np.empty((0, 0, 0), np.float32),
+    np.empty((0, 0, 0), np.int32),
+)
 
 
 class Trace(NamedTuple):
@@ -51,6 +38,9 @@ class Trace(NamedTuple):
     updates: Records
     """[steps] of `UPDATE`: filled."""
     learner: int
+
+
+NO_TRACE: Final = Trace(np.empty(0, UPDATE), 0)
 
 
 class StepReplay:
@@ -104,8 +94,8 @@ class StepReplay:
         self,
         steps: Records,
         rows: Floats = NO_ROWS,
-        probe: StateProbe | None = None,
-        trace: Trace | None = None,
+        probe: StateProbe = NO_PROBE,
+        trace: Trace = NO_TRACE,
     ) -> None:
         """Apply the updates of the training steps that follow.
 
@@ -114,18 +104,12 @@ class StepReplay:
             rows: filled with each learner's values of a step's state before its update, [steps, learners,
                 most actions]; empty if they are not needed.
             probe: states to look at on the way.
-            trace: filled with what decides the weights of the updates; not together with `probe`.
+            trace: filled with what decides the weights of the updates.
         """
-        if probe is not None:
-            _check_probe(probe, self._mdp)
+        _check_probe(probe, self._mdp)
         for segment, part in self._segments(steps):
-            what = (*segment, rows[part])
-            if trace is not None:
-                kernel.replay(*what, trace.updates[part], trace.learner)
-            elif probe is None:
-                kernel.replay(*what, NO_UPDATES, 0)
-            else:
-                kernel.replay_probed(*what, *probe.between(part.start, part.stop))
+            probed = probe.between(part.start, part.stop)
+            kernel.replay(*segment, rows[part], trace.updates[part], trace.learner, probed)
 
     def begin_watch(self, watch: Watch) -> WatchedValues:
         """Follow the greedy paths of `watch`, and return the watched values as they are now, as one row."""

@@ -32,7 +32,7 @@ from runner.learning.ledger import UNKNOWN_OUTCOME, UPDATE
 from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
-from runner.replay.step_replay import NO_ROWS, StepReplay, Trace
+from runner.replay.step_replay import NO_ROWS, NO_TRACE, StepReplay, Trace
 from runner.util.arrays import Flags, Floats, Ints, Records
 from runner.util.files import TABLES, cache_folder, replacing
 
@@ -225,7 +225,7 @@ class TableReplay(StepReplay):
         at, tables = self._checkpoints.nearest(step, [table.shape for table in self.learner.snapshot()])
         return (at, name_tables(tables, self.learner.kinds)) if at > nearest[0] else nearest
 
-    def advance(self, stop: int, rows: Floats = NO_ROWS, trace: Trace | None = None) -> None:
+    def advance(self, stop: int, rows: Floats = NO_ROWS, trace: Trace = NO_TRACE) -> None:
         """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them.
 
         Raises:
@@ -234,8 +234,7 @@ class TableReplay(StepReplay):
         first = self.step
         for part in self.blocks(stop):
             filled = slice(self.step - first, self.step - first + len(part))
-            traced = None if trace is None else Trace(trace.updates[filled], trace.learner)
-            self.apply(part, rows[filled], trace=traced)
+            self.apply(part, rows[filled], trace=Trace(trace.updates[filled], trace.learner))
 
     def blocks(self, stop: int) -> Iterator[Records]:
         """Yield the recorded steps from here to a later one; each block must be applied before the next.

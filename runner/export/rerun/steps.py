@@ -39,8 +39,8 @@ from runner.export.rerun.tracks import (
     scalars,
     text_track,
 )
+from runner.learning.kernel import StateProbe
 from runner.recording.reader import Recording
-from runner.replay.step_replay import StateProbe
 from runner.replay.tables import TableReplay, are_within, known_steps
 from runner.util.arrays import Flags, Ints, Ints32, Records
 

@@ -15,7 +15,7 @@ from runner.learning import kernel
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
-from runner.replay.step_replay import NO_ROWS, NO_UPDATES
+from runner.replay.step_replay import NO_PROBE, NO_ROWS, NO_TRACE
 from tests.runner.learning.twin import Twin
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
@@ -184,13 +184,13 @@ def train(learner: Learner, until_episode: int, until_step: int, block: int) -> 
 
 
 def replay(
-    learner: Learner, steps: NDArray[np.void], updates: NDArray[np.void] = NO_UPDATES, i: int = 0
+    learner: Learner, steps: NDArray[np.void], updates: NDArray[np.void] = NO_TRACE.updates, i: int = 0
 ) -> None:
     """Apply the updates of recorded steps to a learner's tables; fill what decides learner i's weights."""
     records = steps.view(np.recarray)
     records.flags.writeable = False  # as `StepReplay` passes them: the kernel is compiled once
     state = learner.seed, learner.model, learner.tables, learner.rules
-    kernel.replay(*state, records, NO_ROWS, updates, i)
+    kernel.replay(*state, records, NO_ROWS, updates, i, NO_PROBE)
 
 
 def recall(learner: Learner, steps: NDArray[np.void]) -> None:
