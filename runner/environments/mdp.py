@@ -239,11 +239,13 @@ class Mdp:
         joint = np.arange(self.joint_actions)
         return np.stack(np.unravel_index(joint, self.action_counts), axis=1).astype(np.int64)
 
-    @property
+    @cached_property
     def carriers(self) -> NDArray[np.int8]:
-        """The carriers of an environment that has a scene."""
-        assert self.scene_carriers is not None
-        return self.scene_carriers
+        """[S, things]: the thing that carries each thing of the scene, -1 for none."""
+        if self.scene_carriers is not None:
+            return self.scene_carriers
+        assert self.scene_cells is not None
+        return np.full(self.scene_cells.shape, -1, np.int8)
 
     @property
     def success_mask(self) -> int:
