@@ -29,9 +29,10 @@ from runner.loops.env import record_alone
 from runner.loops.policies import Policy, from_policy, policy_named
 from runner.recording.reader import Recording, open_recording
 from runner.recording.spaces import Value
-from runner.replay.engine import BLOCK_SECONDS, Replay, Stepper
+from runner.replay.engine import BLOCK_SECONDS, Replay
 from runner.replay.environment import episode_at
 from runner.replay.makers import stream_from_child, why_not_rerun
+from runner.replay.steppers import Stepper
 from runner.replay.steps import transitions_of
 from runner.replay.trust import trusting
 from runner.runs.branches import BranchOrigin

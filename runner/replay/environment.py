@@ -27,9 +27,10 @@ from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
-from runner.replay.engine import Replay, RerunSteps, Stepper
+from runner.replay.engine import Replay, RerunSteps
 from runner.replay.makers import ALL, environments_of, silence, stream_from_child, why_not_rerun
 from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
+from runner.replay.steppers import Stepper
 from runner.util.processes import Report, report_progress
 
 
