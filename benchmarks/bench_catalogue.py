@@ -17,8 +17,7 @@ from pathlib import Path
 from benchmarks.bench_cold_start import command
 from benchmarks.figures import Figure, figure
 from benchmarks.processes import run, run_command
-from runner.runs.listing import list_runs
-from runner.runs.run import RUN_FILE
+from runner.runs.run import RUN_FILE, list_runs
 from runner.util.files import CACHE_VARIABLE
 
 LISTED, RECORDED = 10_000, 1_000

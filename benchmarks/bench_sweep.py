@@ -9,7 +9,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.figures import Figure, figure, seconds
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep

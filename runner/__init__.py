@@ -41,9 +41,8 @@ if TYPE_CHECKING:
     from runner.query.sql import sql
     from runner.recording.gym_spaces import register_space
     from runner.recording.reader import Recording, open_recording
-    from runner.runs.listing import list_runs
     from runner.runs.resolve import find_run
-    from runner.runs.run import Run, label
+    from runner.runs.run import Run, label, list_runs
 
 __all__ = [
     "ExperimentConfig",
@@ -93,7 +92,7 @@ _HOME = {
     "find": "runner.query.find",
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",
-    "list_runs": "runner.runs.listing",
+    "list_runs": "runner.runs.run",
     "mark": "runner.analysis.marking",
     "open_recording": "runner.recording.reader",
     "plot": "runner.export.notebook",

@@ -13,8 +13,7 @@ from runner.recording.messages import Message
 from runner.recording.metadata import RECORDING_STOPPED
 from runner.recording.reader import Recording
 from runner.recording.run_file import has_environment
-from runner.runs.listing import run_at
-from runner.runs.run import Run
+from runner.runs.run import Run, run_at
 from runner.util.values import is_whole
 
 ENDINGS: Final = {

@@ -32,8 +32,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 from runner.recording.steps import taken
 from runner.replay.steps import steps_of
-from runner.runs.listing import run_at
-from runner.runs.run import Run
+from runner.runs.run import Run, run_at
 from runner.util.arrays import Array, Records, leaves
 from runner.util.extras import require
 from runner.util.values import flatten

@@ -24,9 +24,8 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
 from runner.runs.checkpoints import Store
 from runner.runs.importing import merge_marks
-from runner.runs.listing import locked
 from runner.runs.resolve import run_of_id
-from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, locked
 from runner.util.processes import Report
 from runner.util.values import Json
 

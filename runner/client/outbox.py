@@ -23,8 +23,7 @@ from runner.client.connection import Report, ServerUnavailable, find_token
 from runner.client.transfer import UploadStatus, append_upload, put_upload
 from runner.errors import RunnerError
 from runner.runs.checkpoints import Store
-from runner.runs.listing import list_runs, locked
-from runner.runs.run import SHARDS_FOLDER, Run
+from runner.runs.run import SHARDS_FOLDER, Run, list_runs, locked
 from runner.util.files import read_object, write_object
 
 OUTBOX_VARIABLE: Final = "DUALTAXI_OUTBOX"

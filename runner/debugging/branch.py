@@ -36,8 +36,7 @@ from runner.replay.steppers import Stepper
 from runner.replay.steps import transitions_of
 from runner.replay.trust import trusting
 from runner.runs.branches import BranchOrigin
-from runner.runs.listing import run_at
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import Run, recordings_folder, run_at
 from runner.runs.trust_marks import marking_nothing
 from runner.util.files import storage_errors
 from runner.util.humanize import counted, number

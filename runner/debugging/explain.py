@@ -41,9 +41,8 @@ from runner.execution.session import resolve_initial_q, run_job
 from runner.recording.labels import Labels
 from runner.replay.trust import require_may_train
 from runner.runs.catalogue.removal import plan, remove
-from runner.runs.listing import acquired, list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import UNLISTED, Run, new_run, recordings_folder, require_trained
+from runner.runs.run import UNLISTED, Run, acquired, list_runs, new_run, recordings_folder, require_trained
 from runner.sweep.workers import Workers, worker_pool
 from runner.util.processes import Stop
 from runner.util.values import JsonView

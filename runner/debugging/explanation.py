@@ -21,8 +21,7 @@ from runner.analysis.statistics import Estimate, bootstrap_ratio
 from runner.errors import RunnerError, nearest
 from runner.export.plots.comparisons import BarColumn, bars_chart, mixtures_chart
 from runner.runs.catalogue.removal import Removal, plan, remove
-from runner.runs.listing import acquired, list_runs
-from runner.runs.run import UNLISTED
+from runner.runs.run import UNLISTED, acquired, list_runs
 from runner.util.files import open_regular, replacing, storage_errors
 from runner.util.humanize import counted, duration, size
 from runner.util.values import Json

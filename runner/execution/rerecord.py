@@ -35,9 +35,8 @@ from runner.replay.steps import blank_steps, first_of, last_step, put_states, wh
 from runner.replay.tables import tables_at
 from runner.replay.trust import require_may_train
 from runner.runs import run as runs
-from runner.runs.listing import locked
 from runner.runs.provenance import provenance
-from runner.runs.run import Run, unless_empty
+from runner.runs.run import Run, locked, unless_empty
 from runner.util.arrays import Ints, Records
 from runner.util.files import storage_errors
 from runner.util.humanize import counted

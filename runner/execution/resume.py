@@ -48,9 +48,8 @@ from runner.recording.run_file import owner
 from runner.recording.writer import RecordingFile, writing
 from runner.replay.trust import require_may_train
 from runner.runs.code import CodeCollector
-from runner.runs.listing import locked, run_at
 from runner.runs.provenance import Differences, differing_provenance, provenance
-from runner.runs.run import RECORDING_FILE, Run
+from runner.runs.run import RECORDING_FILE, Run, locked, run_at
 from runner.util.files import storage_errors
 from runner.util.processes import Stop
 from runner.util.values import Json

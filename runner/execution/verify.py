@@ -53,8 +53,8 @@ from runner.recording.run_file import has_environment
 from runner.replay.makers import stream_from_child, why_not_rerun, why_uncertain
 from runner.replay.trust import require_may_train
 from runner.runs.checkpoints import read_checkpoints
-from runner.runs.listing import run_at
 from runner.runs.provenance import Differences, differing_provenance
+from runner.runs.run import run_at
 from runner.util.humanize import counted
 from runner.util.processes import Report as StepsReport
 from runner.util.processes import report_progress

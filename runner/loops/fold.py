@@ -62,8 +62,7 @@ from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.spaces import Description, leaf_dtype, parts_of
 from runner.recording.writer import create_recording
-from runner.runs.listing import run_at
-from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run
+from runner.runs.run import RECORDING_FILE, SHARDS_FOLDER, UNFOLDED_FOLDER, Run, run_at
 from runner.runs.shards import ENDS_AS, are_over, handed_over, shard_folders, shards_locked, shards_of
 from runner.runs.trust_marks import merge_marks
 from runner.util.arrays import Array, Ints, Records

@@ -32,10 +32,9 @@ from runner.recording.steps import ACTION_TOPICS
 from runner.recording.syncing import SYNCER
 from runner.recording.writer import create_recording
 from runner.runs.code import CodeCollector
-from runner.runs.listing import run_at
 from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor
-from runner.runs.run import RECORDING_FILE, Run, made_by, new_run, recordings_folder, unless_empty
+from runner.runs.run import RECORDING_FILE, Run, made_by, new_run, recordings_folder, run_at, unless_empty
 from runner.runs.shards import RUN_VARIABLE, new_shard
 from runner.runs.trust_marks import mark
 from runner.util.values import Json, JsonView

@@ -23,8 +23,7 @@ from runner.recording.repair import can_be_repaired
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import is_of_environment, is_taken
 from runner.recording.topic_chunks import FOREVER, TopicChunks
-from runner.runs.listing import run_in
-from runner.runs.run import RECORDING_FILE, RUN_FILE, Run
+from runner.runs.run import RECORDING_FILE, RUN_FILE, Run, run_in
 from runner.runs.shards import shard_folders
 from runner.util.arrays import Ints, Records
 from runner.util.files import open_regular

@@ -35,8 +35,7 @@ from runner.query.sql import Database
 from runner.query.views import SelectedRuns
 from runner.recording.reader import Recording, open_recording
 from runner.runs.catalogue.columns import IndexRow
-from runner.runs.listing import listed_run
-from runner.runs.run import RECORDING_FILE, RUN_FILE
+from runner.runs.run import RECORDING_FILE, RUN_FILE, listed_run
 from runner.util.files import EPISODES, cache_folder, remove_oldest, replacing, storage_errors
 
 if TYPE_CHECKING:

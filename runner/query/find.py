@@ -41,7 +41,7 @@ from runner.query.views import Recordings, SelectedRuns
 from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
-from runner.runs.listing import listed_run
+from runner.runs.run import listed_run
 from runner.util.expressions import NUMBER
 from runner.util.humanize import UNKNOWN, counted
 from runner.util.processes import Tell

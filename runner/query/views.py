@@ -31,8 +31,7 @@ from runner.recording.marks import read_marks
 from runner.runs.catalogue.columns import COLUMNS, IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import look
-from runner.runs.listing import listed_run
-from runner.runs.run import Run, recordings_folder
+from runner.runs.run import Run, listed_run, recordings_folder
 from runner.util.humanize import counted, listed
 from runner.util.processes import Tell
 from runner.util.values import flatten

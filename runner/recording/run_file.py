@@ -335,7 +335,7 @@ _RUN: Final = {
     "recording": _TEXT,
 }
 
-_MAX_RUN_FILE_BYTES: Final = 8 << 20
+MAX_RUN_FILE_BYTES: Final = 8 << 20
 HEARTBEAT_SECONDS: Final = 15.0
 """On another host, a run without a heartbeat for this long counts as interrupted."""
 
@@ -368,7 +368,7 @@ def is_alive(owner: JsonView, heartbeat: Path) -> bool:
 def is_owned(folder: Path) -> bool:
     """Return whether a living process owns the run in a folder, according to its `run.json`."""
     try:
-        facts = read_object(folder / "run.json", _MAX_RUN_FILE_BYTES)
+        facts = read_object(folder / "run.json", MAX_RUN_FILE_BYTES)
     except (OSError, ValueError):
         return False
     process = facts.get("owner")

@@ -24,9 +24,8 @@ from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
 from runner.recording.run_file import parse_run_file
 from runner.runs.checkpoints import Store, read_checkpoints
-from runner.runs.listing import locked, run_at
 from runner.runs.resolve import run_with_id
-from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, made_by, new_run_id
+from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, locked, made_by, new_run_id, run_at
 from runner.util.files import require_room, storage_errors, sync, write_object
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, RUN_NAME_PATTERN, Json, JsonView, is_number
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunNotFound, nearest
 from runner.recording.run_file import RUN_ID, run_title
-from runner.runs.listing import run_at, run_in
-from runner.runs.run import UNLISTED, Run, recordings_folder
+from runner.runs.run import UNLISTED, Run, recordings_folder, run_at, run_in
 from runner.util.humanize import counted
 from runner.util.values import RUN_NAME_PATTERN
 

@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.errors import ConfigError, RunnerError, RunNotFound
-from runner.runs.listing import run_at, run_entries, run_in
 from runner.runs.resolve import find_run
-from runner.runs.run import SHARDS_FOLDER, Run, new_run, require_trained
+from runner.runs.run import SHARDS_FOLDER, Run, new_run, require_trained, run_at, run_entries, run_in
 from runner.util.files import storage_errors
 from runner.util.humanize import counted, size
 from runner.util.values import JsonView

@@ -43,9 +43,8 @@ from runner.recording.marks import marks_from
 from runner.recording.reader import open_recording
 from runner.runs.checkpoints import Store
 from runner.runs.importing import checked_facts, import_recording, merge_marks
-from runner.runs.listing import run_in
 from runner.runs.resolve import run_of_id
-from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run
+from runner.runs.run import PREVIEW, RECORDING_FILE, RUN_FILE, Run, run_in
 from runner.service.errors import Busy, LimitReached, StateConflict, UploadTooLarge, expecting
 from runner.service.jobs.store import lock_folder, now
 from runner.service.logs import LOG

@@ -24,8 +24,7 @@ from runner.execution.estimate import estimate, free_bytes
 from runner.execution.session import run_job
 from runner.recording.labels import Labels
 from runner.recording.reader import open_recording
-from runner.runs.listing import run_in
-from runner.runs.run import create_run, new_run
+from runner.runs.run import create_run, new_run, run_in
 from runner.runs.trust_marks import environment_of_job, mark
 from runner.sweep import state, tag_of
 from runner.sweep.model import Sweep, SweepLimits

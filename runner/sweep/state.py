@@ -19,8 +19,7 @@ from runner.config.model import identity_of
 from runner.errors import ConfigError, RunnerError, nearest
 from runner.execution.resume import require_same_makers
 from runner.execution.session import resolve_initial_q
-from runner.runs.listing import acquired, list_runs
-from runner.runs.run import Run
+from runner.runs.run import Run, acquired, list_runs
 from runner.sweep import FILE, folder_of, sweeps_in, tag_of
 from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep

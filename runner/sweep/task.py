@@ -26,9 +26,8 @@ from runner.recording.labels import LABELS_FILE, Labels, change_labels
 from runner.recording.marks import MARKS_FILE
 from runner.recording.reader import open_recording
 from runner.recording.run_file import owner
-from runner.runs.listing import locked
 from runner.runs.resolve import find_run
-from runner.runs.run import RUN_FILE, Run, unless_empty
+from runner.runs.run import RUN_FILE, Run, locked, unless_empty
 from runner.sweep.model import Objective
 from runner.sweep.objective import Curve, curve_of, readings, should_prune
 from runner.sweep.state import PRUNED, is_over

@@ -15,8 +15,7 @@ import pytest
 from selenium.webdriver.remote.webdriver import WebDriver
 
 from runner.debugging.explanation import explanations_in
-from runner.runs.listing import list_runs
-from runner.runs.run import UNLISTED
+from runner.runs.run import UNLISTED, list_runs
 from runner.service.app import create_app
 from runner.service.settings import ServiceSettings
 from tests.inventory.fixture import make_runs, same_everywhere

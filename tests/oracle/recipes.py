@@ -23,8 +23,7 @@ from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.recording import schema
 from runner.recording.integrity import survey
-from runner.runs.listing import run_at
-from runner.runs.run import Run, create_run
+from runner.runs.run import Run, create_run, run_at
 from tests.oracle import reading
 from tests.oracle.reading import Content
 from tests.runner.altering import without_chunk

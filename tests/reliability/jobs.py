@@ -30,7 +30,7 @@ import httpx2
 import psutil
 
 import runner
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from tests.runner.service.served import Served
 from tests.waiting import until
 

@@ -44,7 +44,7 @@ from runner.recording.records import MetadataRecord, ReadChunk
 from runner.recording.repair import DamagedFile
 from runner.recording.run_file import owner
 from runner.recording.steps import taken
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from runner.runs.shards import shards_of
 from runner.util.files import open_regular
 from tests.runner.loops.making import Rooms

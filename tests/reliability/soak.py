@@ -45,9 +45,8 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
 from runner.recording.repair import repair
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import Run, create_run
+from runner.runs.run import Run, create_run, list_runs
 from tests.runner.recording.making import SMALL_MAP, experiment
 
 COMMON: dict[str, Any] = {

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from tests.runner.recording.making import SMALL_MAP
 
 REPOSITORY = Path(__file__).parents[2]

@@ -31,8 +31,7 @@ from runner.cli.runs import (
     runs_folder,
 )
 from runner.errors import ExitCode, RecordingError
-from runner.runs.listing import locked
-from runner.runs.run import Run, command_for, require_over
+from runner.runs.run import Run, command_for, locked, require_over
 from runner.runs.shards import shards_of
 from runner.util.humanize import counted, number, size
 

@@ -34,7 +34,7 @@ from runner.export.reports.playback import MAX_VALUES, playback_of, titled
 from runner.export.reports.rendering import embedded, render, templates
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import has_environment
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from runner.util.humanize import UNKNOWN, capitalised, number
 from runner.util.processes import Tell
 

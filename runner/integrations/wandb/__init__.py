@@ -38,8 +38,8 @@ from runner.integrations.tensorboard import end_forwarding, forward
 from runner.loops.media import Histogram as Histogram
 from runner.loops.media import Image, Media, array_of
 from runner.loops.options import settings_in
-from runner.runs.listing import list_runs
 from runner.runs.redaction import redacted_settings
+from runner.runs.run import list_runs
 from runner.util.jsonable import as_json
 from runner.util.values import Json, flatten
 

@@ -24,8 +24,7 @@ from runner.recording.metrics import METRICS
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.branches import origin_in
 from runner.runs.catalogue.columns import COLUMNS
-from runner.runs.listing import listed_run
-from runner.runs.run import Run
+from runner.runs.run import Run, listed_run
 from runner.util.files import cache_folder, replacing
 from runner.util.values import JsonView, is_number
 

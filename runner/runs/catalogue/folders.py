@@ -16,8 +16,7 @@ from typing import Final, NamedTuple
 
 from runner.recording.labels import LABELS_FILE
 from runner.runs.catalogue.database import STORED, row_of, transaction, write_rows
-from runner.runs.listing import run_entries, run_in
-from runner.runs.run import RECORDING_FILE, RUN_FILE
+from runner.runs.run import RECORDING_FILE, RUN_FILE, run_entries, run_in
 
 _STABLE_NS: Final = 2 * 10**9
 """Files that changed this recently may change again with the same time: they are read again next time."""

@@ -28,8 +28,7 @@ from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.checkpoints import Store
-from runner.runs.listing import listed_run, locked
-from runner.runs.run import Run
+from runner.runs.run import Run, listed_run, locked
 from runner.util.files import EPISODES, cache_folder
 from runner.util.humanize import listed
 

@@ -19,8 +19,7 @@ from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.checkpoints import Store
-from runner.runs.listing import RUN_LOCK
-from runner.runs.run import RECORDING_FILE, RUN_FILE, UNLISTED
+from runner.runs.run import RECORDING_FILE, RUN_FILE, RUN_LOCK, UNLISTED
 from runner.runs.trust_marks import MARK_FILE
 from runner.util.files import EPISODES, EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
 

@@ -35,8 +35,7 @@ from runner.client.jobs import (
 )
 from runner.config.document import read_yaml
 from runner.errors import RunnerError, StorageError
-from runner.runs.listing import acquired
-from runner.runs.run import new_run_id
+from runner.runs.run import acquired, new_run_id
 from runner.service.errors import JobNotFound, LimitReached
 from runner.util.files import replacing, storage_errors
 from runner.util.yaml_text import write_yaml

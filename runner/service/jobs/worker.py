@@ -44,9 +44,8 @@ from runner.execution.branching import train_branch
 from runner.execution.resume import resume
 from runner.execution.session import Progress, Report, evaluation_brief, run_job
 from runner.recording.reader import open_recording
-from runner.runs.listing import locked, run_at
 from runner.runs.resolve import run_of_id
-from runner.runs.run import Run, create_run
+from runner.runs.run import Run, create_run, locked, run_at
 from runner.service.jobs.checking import BranchQuestion, ExplainQuestion
 from runner.service.jobs.store import QueuedJob, read_values
 from runner.service.processes import lower_priority

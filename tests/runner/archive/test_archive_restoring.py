@@ -25,7 +25,7 @@ from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from tests.runner.altering import altered
 from tests.runner.archive.whole import archived, contents
 from tests.runner.recording.making import LAKE, TAXIS, make_run
@@ -269,7 +269,7 @@ def test_a_pipe_in_place_of_a_file_is_refused_and_does_not_block(taxis, tmp_path
 from pathlib import Path
 from runner.archive.runs import restore_run
 from runner.errors import RunnerError
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 try:
     restore_run(run_at(Path({str(recordings / taxis.run_id)!r})))
 except RunnerError as error:

@@ -16,9 +16,8 @@ from runner.archive.store import ArchiveStore
 from runner.cli import cli
 from runner.recording.reader import open_recording
 from runner.recording.run_file import owner as this_process
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run
+from runner.runs.run import create_run, list_runs
 from tests.runner.recording.making import TAXIS, experiment, make_run
 
 

@@ -12,8 +12,7 @@ import pytest
 
 import runner
 from runner.api import interruptible
-from runner.runs.listing import list_runs
-from runner.runs.run import create_run, unless_empty
+from runner.runs.run import create_run, list_runs, unless_empty
 
 LONG = ("--set", "episodes=100000000", "--set", "evaluation=null")
 

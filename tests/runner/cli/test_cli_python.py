@@ -13,7 +13,7 @@ import runner
 from runner.api import experiment_of
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.execution.rerecord import rerecord
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 
 
 def test_the_public_names():

@@ -20,8 +20,7 @@ from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
 from runner.recording.run_file import owner
 from runner.replay.tables import tables_at
-from runner.runs.listing import list_runs
-from runner.runs.run import Run
+from runner.runs.run import Run, list_runs
 from tests.runner.altering import altered
 
 COMMANDS = ("resume", "rerecord", "evaluate", "verify", "repair", "qtable")

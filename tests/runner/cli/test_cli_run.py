@@ -10,7 +10,7 @@ import pytest
 from runner.cli import progress
 from runner.cli.commands import run as run_command
 from runner.execution import estimate
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 
 BESIDES = {"name", "seed", "status", "episodes"}
 PROMISED = {

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 
 LATIN = os.fsdecode(b"caf\xe9")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="file names are bytes there alone")

@@ -18,8 +18,7 @@ import pytest
 from runner.cli.commands import catalogue
 from runner.config import from_mapping
 from runner.recording.labels import LABELS_FILE
-from runner.runs.listing import list_runs, locked
-from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
+from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs, locked
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 

@@ -30,8 +30,7 @@ from runner.debugging.explanation import (
 )
 from runner.debugging.factors import mix
 from runner.errors import RunnerError
-from runner.runs.listing import list_runs
-from runner.runs.run import UNLISTED, label
+from runner.runs.run import UNLISTED, label, list_runs
 
 LAKE = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},

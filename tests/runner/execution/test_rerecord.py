@@ -14,9 +14,8 @@ from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import RUN_FILE, create_run
+from runner.runs.run import RUN_FILE, create_run, list_runs
 from runner.util.files import write_object
 from tests.runner.recording.making import TAXIS, experiment, make_run
 

@@ -23,9 +23,8 @@ from runner.recording.schema import TRAIN_STEP
 from runner.recording.writer import RecordingFile
 from runner.runs import provenance
 from runner.runs import run as runs
-from runner.runs.listing import list_runs, locked
 from runner.runs.resolve import find_run
-from runner.runs.run import Run, create_run
+from runner.runs.run import Run, create_run, list_runs, locked
 from tests.runner.recording.making import SAMPLED, TAXIS, copy_of, make_run, stopping_after
 
 # --- every state that a file can be in ----------------------------------------------------------------

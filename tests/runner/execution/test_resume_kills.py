@@ -16,9 +16,8 @@ from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.recording.reader import open_recording
 from runner.recording.schema import BLOCK_TOPICS
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run
+from runner.runs.run import create_run, list_runs
 from tests.runner.killing import LONG, kill_when, posix, start
 from tests.runner.recording.making import make_run, stopping_after
 

@@ -22,9 +22,8 @@ from runner.recording.description import recorded_facts
 from runner.recording.integrity import check_integrity
 from runner.recording.messages import message_class
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run
+from runner.runs.run import create_run, list_runs
 from tests.runner.learning.twin import Twin
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run, stopping_after
 

@@ -12,7 +12,7 @@ import pytest
 
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from tests.runner.killing import posix
 from tests.runner.loops.making import dualtaxi
 

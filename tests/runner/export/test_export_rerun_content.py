@@ -20,8 +20,8 @@ from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, tables_at
-from runner.runs.listing import run_at
 from runner.runs.resolve import find_run
+from runner.runs.run import run_at
 from tests.runner.altering import without_chunk
 from tests.runner.export.rerun_views import views_of
 from tests.runner.recording.making import TAXIS, make_run

@@ -25,7 +25,7 @@ from runner.recording import schema
 from runner.recording.environment import NAMES
 from runner.recording.reader import open_recording
 from runner.recording.steps import taken
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from tests.runner.export.making import made_otherwise
 from tests.runner.export.rerun_views import shown_ranges
 from tests.runner.loops.making import Leaving, Rooms, parallel, play, record_counting

@@ -11,7 +11,7 @@ import pytest
 
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 
 FORKED = """
 import os, sys, warnings

@@ -19,7 +19,7 @@ from runner.errors import ConfigError, RunnerError, StorageError
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from tests.runner.loops.making import Rooms, make
 
 

@@ -18,7 +18,7 @@ import runner
 from runner.analysis.contents import shortcomings
 from runner.errors import RunnerError
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 
 
 class Odd(gymnasium.Env):

@@ -24,8 +24,8 @@ from runner.loops.media import Histogram, Image
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
+from runner.runs.run import list_runs
 from tests.runner.loops.making import NAMES, Rooms, make, play, recorded
 
 STEPS = 700

@@ -19,7 +19,7 @@ import runner
 from runner.execution.verify import verify
 from runner.loops.fold import fold_if_over
 from runner.recording.reader import open_recording
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from runner.runs.shards import shards_of
 from runner.util.processes import start_process
 from tests.runner.loops.making import Rooms, dualtaxi

@@ -13,7 +13,7 @@ import runner
 from runner.errors import ConfigError, RunnerError
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs, run_at
+from runner.runs.run import list_runs, run_at
 from runner.runs.shards import RUN_VARIABLE, shards_of
 from tests.runner.loops.sharing import play, run_all, work
 

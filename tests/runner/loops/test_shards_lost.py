@@ -15,7 +15,7 @@ from runner.execution.verify import verify
 from runner.loops.fold import fold_if_over
 from runner.loops.step_buffer import StepBuffer
 from runner.recording.reader import open_recording
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from runner.runs.shards import shards_of
 from tests.runner.loops.making import dualtaxi
 from tests.runner.loops.sharing import play

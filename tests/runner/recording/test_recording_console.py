@@ -24,7 +24,7 @@ from runner.recording.console import MAX_CONSOLE_BYTES, Screen, read_console
 from runner.recording.machine import Clock, read_clock
 from runner.recording.messages import encode
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from tests.runner.altering import altered
 from tests.runner.loops.making import make
 from tests.runner.recording.making import TAXIS, make_run

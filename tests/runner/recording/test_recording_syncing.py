@@ -13,7 +13,7 @@ import pytest
 
 import runner
 from runner.recording import syncing
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 
 RECORD = """
 import os, signal, sys

@@ -17,7 +17,7 @@ from runner.export.rerun.writing import export
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import TableReplay, known_steps, tables_at
-from runner.runs.listing import run_at
+from runner.runs.run import run_at
 from tests.runner.altering import altered, without_chunk
 from tests.runner.recording.making import TAXIS, make_run
 

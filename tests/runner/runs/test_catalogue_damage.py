@@ -11,8 +11,7 @@ import pytest
 from runner.recording.labels import LABELS_FILE, Labels, read_labels
 from runner.runs.catalogue.database import index_path
 from runner.runs.catalogue.index import look
-from runner.runs.listing import list_runs
-from runner.runs.run import RUN_FILE, create_run
+from runner.runs.run import RUN_FILE, create_run, list_runs
 from tests.runner.runs.listed import CONFIG, ids, rows
 
 

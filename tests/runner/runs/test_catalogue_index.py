@@ -21,9 +21,8 @@ from runner.runs.catalogue import folders
 from runner.runs.catalogue.database import index_path, open_index
 from runner.runs.catalogue.folders import Folders
 from runner.runs.catalogue.index import MAX_TREE, look
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run
+from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 from tests.runner.runs.listed import ALL, CONFIG, aged, ids, rows
 
 

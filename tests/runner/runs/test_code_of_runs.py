@@ -30,9 +30,8 @@ from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.writer import RecordingFile
 from runner.runs import code as code_module
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run
+from runner.runs.run import create_run, list_runs
 from tests.runner.archive.whole import archived
 from tests.runner.recording.making import LAKE, stopping_after
 from tests.runner.runs.repositories import git, new_project

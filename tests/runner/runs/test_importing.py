@@ -28,8 +28,8 @@ from runner.recording.labels import Labels, change_labels, read_labels
 from runner.recording.reader import open_recording
 from runner.recording.rewriting import rewrite
 from runner.runs.importing import Occupied, import_recording
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
+from runner.runs.run import list_runs
 from tests.runner.recording.making import LAKE, make_run
 
 

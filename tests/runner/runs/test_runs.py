@@ -10,9 +10,8 @@ import pytest
 from runner.config import from_mapping
 from runner.errors import RunNotFound, StorageError
 from runner.runs import run as runs
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import RUN_FILE, create_run, recordings_folder
+from runner.runs.run import RUN_FILE, create_run, list_runs, recordings_folder
 
 CONFIG = from_mapping({"name": "some", "episodes": 5})
 

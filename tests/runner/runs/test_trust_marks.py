@@ -18,8 +18,7 @@ from runner.archive.places import at_hand
 from runner.archive.runs import archive_run
 from runner.execution.verify import verify
 from runner.recording.reader import open_recording
-from runner.runs.listing import run_at
-from runner.runs.run import Run
+from runner.runs.run import Run, run_at
 from runner.runs.trust_marks import KEY_FILE, MARK_FILE, TrustMark, _make_key, mark, mark_of, merge_marks
 
 SCRIPT = """\

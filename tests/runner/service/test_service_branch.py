@@ -14,9 +14,8 @@ import pytest
 
 import runner
 from runner.client.jobs import RunProgress
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import Run
+from runner.runs.run import Run, list_runs
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.store import JobStore
 from runner.service.jobs.worker import JobChannel, JobSpec, do_job, run_episode_job

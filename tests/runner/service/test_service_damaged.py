@@ -16,8 +16,7 @@ from runner.recording.integrity import survey
 from runner.recording.reader import open_recording
 from runner.recording.schema import LOG_TOPIC
 from runner.runs.importing import import_recording
-from runner.runs.listing import list_runs
-from runner.runs.run import RUN_FILE
+from runner.runs.run import RUN_FILE, list_runs
 from tests.reliability.reading import TINY
 from tests.runner.altering import altered
 from tests.runner.recording.making import make_run

@@ -13,8 +13,8 @@ import runner
 from runner.debugging.explain import ask
 from runner.debugging.explanation import FOLDER, LOCK
 from runner.errors import RunnerError
-from runner.runs.listing import acquired
 from runner.runs.resolve import find_run
+from runner.runs.run import acquired
 from tests.waiting import until
 
 EXPLAIN = "/api/v1/explanations"

@@ -20,7 +20,7 @@ import runner
 from runner.cli import cli
 from runner.client.jobs import LogEvent
 from runner.config import from_mapping
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.service.api.jobs import POLL_SECONDS
 from runner.service.jobs import queue
 from runner.service.jobs.checking import check

@@ -18,7 +18,7 @@ from served import Served
 from submitted import ENDLESS
 
 import runner
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.service.jobs.store import JobStore
 from runner.sweep import state
 from runner.sweep.loading import from_values

@@ -18,8 +18,7 @@ import runner
 from runner.errors import RunnerError
 from runner.execution.verify import verify
 from runner.recording.labels import change_labels
-from runner.runs.listing import list_runs
-from runner.runs.run import RUN_FILE
+from runner.runs.run import RUN_FILE, list_runs
 from tests.runner.loops.making import make, play
 from tests.runner.service.test_service_upload_routes import PIECE, UPLOADS, begin, message, over, patch, put
 from tests.waiting import until

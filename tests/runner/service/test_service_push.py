@@ -25,9 +25,8 @@ from runner.client.connection import Backoff, ServerError, ServerUnavailable, ch
 from runner.client.transfer import append_upload, put_upload
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import Run
+from runner.runs.run import Run, list_runs
 from tests.runner.recording.making import TAXIS, make_run, with_id
 from tests.waiting import until
 

@@ -20,8 +20,8 @@ import runner
 from runner.cli import cli
 from runner.client.client import Client
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
+from runner.runs.run import list_runs
 
 pytestmark = pytest.mark.usefixtures("outbox")
 

@@ -17,7 +17,7 @@ from submitted import ENDLESS, ICY
 import runner
 from runner.client.jobs import LogEvent
 from runner.recording.reader import open_recording
-from runner.runs.listing import list_runs, run_at
+from runner.runs.run import list_runs, run_at
 from runner.service.jobs import worker as worker_jobs
 from runner.service.jobs.checking import check
 from runner.service.jobs.queue import JobQueue

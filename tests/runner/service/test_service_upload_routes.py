@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from blake3 import blake3
 
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.service.settings import ServiceLimits
 from runner.service.tokens import Tokens
 from tests.waiting import until

@@ -16,9 +16,8 @@ from runner.execution.resume import resume
 from runner.execution.session import run_job
 from runner.export.mcap import export_mcap
 from runner.recording.labels import Labels, change_labels
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run
+from runner.runs.run import create_run, list_runs
 from runner.service.errors import StateConflict, UploadTooLarge
 from runner.service.uploads import FOLDER, UploadSource
 from tests.runner.recording.making import TAXIS, experiment, make_run, stopping_after, with_id

@@ -16,7 +16,7 @@ from runner.client.client import Client
 from runner.client.connection import ServerError
 from runner.client.jobs import BestTrial, JobEvent, LogEvent, SweepProgress, parse_events
 from runner.errors import RunnerError
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 
 pytestmark = pytest.mark.long
 

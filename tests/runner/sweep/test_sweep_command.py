@@ -12,7 +12,7 @@ from sweeping import BASE, Here
 import runner
 from runner.cli import cli
 from runner.config import from_mapping, load
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.sweep import running, workers
 
 

@@ -8,7 +8,7 @@ import dying
 import pytest
 from sweeping import described, digests, swept
 
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.sweep.loading import from_values
 from runner.sweep.workers import LocalWorkers, RayWorkers
 

@@ -15,7 +15,7 @@ from runner.cli import cli
 from runner.config import from_mapping
 from runner.errors import RunnerError
 from runner.export.plots.chart import Markers
-from runner.runs.listing import list_runs
+from runner.runs.run import list_runs
 from runner.sweep import state
 from runner.sweep.charts import learning, panel_of, parameter_chart, picture_of
 from runner.sweep.loading import from_values

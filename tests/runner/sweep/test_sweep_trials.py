@@ -15,9 +15,8 @@ from runner.execution.rerecord import rerecord
 from runner.execution.session import run_job
 from runner.recording.labels import read_labels
 from runner.runs import provenance
-from runner.runs.listing import list_runs
 from runner.runs.resolve import find_run
-from runner.runs.run import create_run
+from runner.runs.run import create_run, list_runs
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.model import Objective, Range
