@@ -125,13 +125,26 @@ def positions(recording: Recording, axis: Axis) -> Positions:
 
 
 def axes_of(recording: Recording) -> list[Axis]:
-    """Return the axes that a recording has, without those of logged values but updates."""
+    """Return the axes that a recording has: first those of `AXES`, then logged values."""
     axes: dict[Axis, None] = {}
     for axis in AXES.values():
         with contextlib.suppress(RecordingError):
             is_logged = positions(recording, axis).axis is LOGGED_STEPS
             axes[LOGGED_STEPS if is_logged else axis] = None
-    return list(axes)
+    return [*axes, *_logged_axes(recording)]
+
+
+def _logged_axes(recording: Recording) -> list[Axis]:
+    """Return an axis for each name of which no value logged in training is below the value before it."""
+    latest: dict[str, tuple[int, float]] = {}
+    for series, rows in recording.scalars():
+        for number, _, step, _, value in rows.tolist():
+            name, phase = series[number]
+            if phase == "train":
+                earlier_step, earlier = latest.get(name, (0, 0.0))
+                ascends = step >= earlier_step and value >= earlier and math.isfinite(value)
+                latest[name] = (step, value if ascends else math.inf)  # which no later value reaches
+    return [axis_of(name) for name, (_, value) in latest.items() if name not in AXES and value < math.inf]
 
 
 def edges_of(axis: Axis, last: float, parts: int) -> Floats:

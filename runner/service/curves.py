@@ -29,8 +29,8 @@ from runner.util.values import finite
 
 MAX_NAMES: Final = 10_000
 """The most names of logged values in a response."""
-MAX_NAMED_AXES: Final = 100
-"""The most logged values among the axes to choose from."""
+MAX_AXES: Final = 200
+"""The most axes to choose from."""
 AxisName = Annotated[
     str,
     Field(
@@ -114,7 +114,7 @@ class ShownCurve:
 
 @dataclass(frozen=True)
 class AxisInfo:
-    """An axis that all of the runs have, or logged values, which are none where they decrease."""
+    """An axis that all of the runs have."""
 
     name: str
     title: str
@@ -162,11 +162,10 @@ def curves_of(
             common = [axis for axis in common if axis in axes] if series else axes
             series.append(read_series(recording, axis_of(options.axis), options.metric))
     over = series[0].axis if series else axis_of(options.axis)
-    if over not in common and options.axis not in AXES:
-        common.append(over)
+    offered = common[:MAX_AXES]
+    if over not in offered:
+        offered.append(over)
     logged = list(dict.fromkeys(name for run in series for name in run.names))[:MAX_NAMES]
-    known = [axis.name for axis in common]
-    common += [axis_of(name) for name in logged if name not in known][:MAX_NAMED_AXES]
     groups = groups_of(series)
     names = {run.run_id: (letter(number), run.name) for number, run in enumerate(series)}
     panels: list[Panel] = []
@@ -190,7 +189,7 @@ def curves_of(
         notes.insert(0, "Every recorded point is drawn.")
     result = Curves(
         over.name,
-        [AxisInfo(axis.name, axis.title, axis.label) for axis in common],
+        [AxisInfo(axis.name, axis.title, axis.label) for axis in offered],
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
         shown,
         averaged,

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import html
 import json
+import math
 import re
 import shutil
 import sys
@@ -488,6 +489,25 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     assert note.startswith(
         "Each line is one run, as reported. On logarithmic axes points at 0 or below are left out"
     )
+
+
+def test_every_axis_that_is_offered_can_be_chosen(client, recordings):
+    for run in range(2):
+        with SummaryWriter(f"runs/axes{run}", recordings=recordings, monitor_gym=False) as writer:
+            for step in range(20):
+                values = {
+                    "epoch": step // 2,
+                    "loss": -step,
+                    "gap": math.nan if step == 9 else step,
+                    f"only{run}": step,
+                }
+                writer.add_scalars("v", values, step)
+    query = "run=axes0&run=axes1&metric=training.logged.v/loss"
+    axes = [axis["name"] for axis in client.get(f"/api/v1/curves?{query}").json()["axes"]]
+    assert axes == ["steps", "time", "v/epoch"]
+    for axis in axes:
+        assert client.get(f"/api/v1/curves?{query}&axis={axis}").status_code == 200
+    assert client.get(f"/api/v1/curves?{query}&axis=v/loss").status_code == 409
 
 
 def test_variations_are_of_jobs(client, recordings):
