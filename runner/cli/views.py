@@ -117,7 +117,8 @@ def command_of(view: View) -> Command:
                 return
             if output == _STDOUT:
                 with tempfile.TemporaryFile() as file:  # NumPy does not write all to a pipe whose reader ends
-                    answer.write(file)
+                    with stage_line("writing"):
+                        answer.write(file)
                     file.seek(0)
                     if not sys.stdout.isatty():
                         shutil.copyfileobj(file, sys.stdout.buffer)

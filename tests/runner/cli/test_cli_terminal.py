@@ -108,6 +108,7 @@ def test_a_cached_kernel_is_not_announced(command, tiny):
         (["compare", "tiny", "tiny2"], ["reading runs", "computing intervals"]),
         (["export", "tensorboard", "tiny", "-o", "{folder}/events"], ["writing events"]),
         (["qtable", "tiny", "--episode", 5], ["replaying recorded steps"]),
+        (["sql", "SELECT run FROM runs", "--parquet", "-"], ["reading", "writing"]),
     ],
     ids=lambda words: words[0],
 )
