@@ -22,6 +22,7 @@ from runner.service.errors import Busy
 from runner.util.processes import (
     CallFailed,
     ChildProcess,
+    NeverBegun,
     OutOfMemory,
     ProcessDied,
     process_context,
@@ -212,7 +213,7 @@ class ProcessPool:
         child: ChildProcess | None = self._thread.__dict__.pop("child", None)
         if child is not None:
             # It may have ended while it was idle, or have too little memory left after earlier calls.
-            with contextlib.suppress(ProcessDied, OutOfMemory):
+            with contextlib.suppress(NeverBegun, OutOfMemory):
                 return self._call_in(child, call)
         return self._call_in(self._start(), call)
 

@@ -22,6 +22,7 @@ import types
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from multiprocessing import process
 from multiprocessing.process import BaseProcess
+from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any, Final, ParamSpec, Self, TypeVar
 
@@ -59,6 +60,10 @@ class OutOfMemory(CallFailed):
 
 class ProcessDied(CallFailed):
     """The process died during a call."""
+
+
+class NeverBegun(ProcessDied):
+    """The process ended before it began a call, which another process can do."""
 
 
 _RESTARTS: Final = 3
@@ -274,6 +279,7 @@ class ChildProcess:
         for_each: bool = False,
     ) -> Generator[object, None, object]:
         """Yield what the function reports, and return its result; the limit is for all, or for each."""
+        failure: type[ProcessDied] = NeverBegun
         try:
             self._pipe.send((function, args, keywords))
             deadline = time.monotonic() + seconds
@@ -281,15 +287,16 @@ class ChildProcess:
                 if not self._pipe.poll(max(deadline - time.monotonic(), 0)):
                     raise TimedOut(f"this took longer than {seconds:g} s and was given up; ask for less.")
                 kind, result = self._pipe.recv()
+                if kind == "begun":
+                    failure = ProcessDied
+                    continue
                 if kind != "progress":
                     break
                 yield result
                 if for_each:
                     deadline = time.monotonic() + seconds
         except (EOFError, OSError):
-            raise ProcessDied(
-                "the process that worked on this died; it may have run out of memory."
-            ) from None
+            raise failure("the process that worked on this died; it may have run out of memory.") from None
         if kind == "memory":
             limit = size(self._memory_bytes)
             raise OutOfMemory(f"this needs more than {limit} of memory, and was given up; ask for less.")
@@ -346,8 +353,9 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str], keep_seco
     before = set(sys.modules)
     with contextlib.suppress(EOFError, BrokenPipeError):
         while pipe.poll(keep_seconds):
+            pipe.send(("begun", None))
             function, args, keywords = pipe.recv()
-            pipe.send(_outcome(function, args, keywords))
+            pipe.send_bytes(_outcome(function, args, keywords))
             if keep_seconds is not None and (
                 _must_end or sys.path != path or _any_of_user(sys.modules.keys() - before)
             ):
@@ -367,18 +375,20 @@ def _any_of_user(modules: Iterable[str]) -> bool:
 
 def _outcome(
     function: Callable[..., Any], args: Sequence[object], keywords: Mapping[str, object]
-) -> tuple[str, object]:
+) -> memoryview:
+    """Return what a function returns or raises, pickled."""
     try:
-        return "done", function(*args, **keywords)
+        return ForkingPickler.dumps(("done", function(*args, **keywords)))
     except Exception as error:
         cause: BaseException | None = error
         while cause is not None:  # others may have wrapped a `MemoryError`
             if isinstance(cause, MemoryError):
-                return "memory", None
+                return ForkingPickler.dumps(("memory", None))
             cause = cause.__cause__ or cause.__context__
         if isinstance(error, RunnerError | OSError):
-            return "error", (type(error), error.args, vars(error))
-        return "unexpected", traceback.format_exc()
+            with contextlib.suppress(Exception):  # an error of a library may hold what cannot be pickled
+                return ForkingPickler.dumps(("error", (type(error), error.args, vars(error))))
+        return ForkingPickler.dumps(("unexpected", traceback.format_exc()))
 
 
 def raise_if_out_of_memory() -> None:

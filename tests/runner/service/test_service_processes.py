@@ -135,6 +135,21 @@ def test_a_call_for_which_a_reused_process_has_no_memory_left_gets_a_new_one():
         pool.submit(60, exec, f"bytearray({MEMORY // 2})").result()
 
 
+def note_and_die(path):
+    with open(path, "a", encoding="utf-8") as file:  # noqa: PTH123
+        file.write("x")
+    os._exit(3)
+
+
+def test_a_call_that_kills_a_reused_process_is_not_tried_once_more(tmp_path):
+    with ProcessPool(1, 30, MEMORY) as pool:
+        pool.submit(60, os.getpid).result()
+        with pytest.raises(ProcessDied):
+            pool.submit(60, note_and_die, tmp_path / "begun").result()
+        assert (tmp_path / "begun").read_text() == "x"
+        assert pool.submit(60, sum, [1, 2]).result() == 3
+
+
 def test_calls_of_a_reused_process_leak_no_threads():
     with ProcessPool(1, 30, MEMORY) as pool:
         pool.submit(60, os.getpid).result()

@@ -53,6 +53,40 @@ def test_a_call_that_exceeds_a_limit_or_ends_the_process_is_an_error_of_its_own(
         child.call(function, 5, argument)
 
 
+def hold_open(path):
+    error = OSError(f"{path} cannot be read")
+    error.file = open(path)  # noqa: PTH123, SIM115
+    raise error
+
+
+def fill_when_pickled():
+    return Unwieldy()
+
+
+class Unwieldy:
+    """Needs more memory than there is when it is pickled."""
+
+    def __reduce__(self):
+        return bytearray, (bytearray(2 * MEMORY),)
+
+
+@pytest.mark.parametrize(
+    ("function", "args", "error", "message"),
+    [
+        (open, [os.devnull], RuntimeError, "cannot pickle"),
+        (hold_open, [os.devnull], RuntimeError, "cannot be read"),
+        (fill_when_pickled, [], OutOfMemory, "more than 268 MB"),
+    ],
+)
+def test_a_result_that_cannot_be_sent_is_an_error_of_its_call_alone(
+    child, capfd, function, args, error, message
+):
+    with pytest.raises(error, match=message):
+        child.call(function, 60, *args)
+    assert child.call(sum, 60, [1, 2]) == 3
+    assert capfd.readouterr().err == ""
+
+
 def test_progress_reaches_the_caller():
     seen = []
     with ChildProcess(MEMORY, on_progress=seen.append) as child:
