@@ -103,7 +103,7 @@ def origin_in(config: JsonView) -> Origin | None:
 
 def parse_origin(found: object) -> Origin | None:
     """Return the origin with these fields, among others; None if one is missing or of another type."""
-    if not isinstance(found, Mapping):
+    if not isinstance(found, Mapping) or "checkpoint" in found:  # an evaluated checkpoint is no branch
         return None
     import msgspec
 

@@ -201,7 +201,7 @@ _SCHEMA: Final = (
     "CREATE INDEX runs_parents ON runs (parent)",
     "CREATE INDEX runs_names ON runs (root, created, id, name, seed)",
 )
-_VERSION: Final = zlib.crc32("10".join(_SCHEMA).encode()) >> 1
+_VERSION: Final = zlib.crc32("11".join(_SCHEMA).encode()) >> 1
 """Identifies the schema, and by the number the contents; an index of another version is replaced."""
 _HEAD_BYTES: Final = 100
 """The header of an SQLite file; at 24 it has the number of changes."""

@@ -94,6 +94,8 @@ def test_a_checkpoint_is_played_in_the_recorded_environment(folder):
     checkpoint = origin.checkpoints()[-1]
     expected = {"run": origin.run_id, "checkpoint": "policy", "step": max(steps), "digest": checkpoint.digest}
     assert found["origin"] == expected
+    assert found["run_id"] not in dualtaxi(folder, "show", origin.run_id).output  # it is no branch
+    assert "branch" not in dualtaxi(folder, "show", found["run_id"]).output
     run = find_run(found["run_id"], folder)
     assert run.name == "pole.evaluated"
     assert verify(run.recording).finding == ""
