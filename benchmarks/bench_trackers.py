@@ -117,7 +117,7 @@ def _times(name: str, runs: int, values: int, repetitions: int, folder: Path) ->
 
 @contextlib.contextmanager
 def _dualtaxi_synced(folder: Path, values: int) -> Iterator[Any]:
-    from runner.recording.syncing import SYNCER
+    from runner.recording.writer import SYNCER
 
     with _dualtaxi(folder, values) as run:
         yield run

@@ -29,8 +29,7 @@ from runner.recording.observer import Observer
 from runner.recording.recorder import ActionRecorder, Recorder
 from runner.recording.rewriting import compacted
 from runner.recording.steps import ACTION_TOPICS
-from runner.recording.syncing import SYNCER
-from runner.recording.writer import create_recording
+from runner.recording.writer import SYNCER, create_recording
 from runner.runs.code import CodeCollector
 from runner.runs.provenance import provenance_entries
 from runner.runs.redaction import LineRedactor

@@ -12,7 +12,7 @@ import gymnasium
 import pytest
 
 import runner
-from runner.recording import syncing
+from runner.recording import writer
 from runner.runs.run import run_at
 
 RECORD = """
@@ -20,7 +20,7 @@ import os, signal, sys
 from pathlib import Path
 import gymnasium
 import runner
-from runner.recording import syncing
+from runner.recording import writer
 
 def record():
     env = runner.record(gymnasium.make("CartPole-v1"), sys.argv[1])
@@ -43,7 +43,7 @@ def test_a_process_killed_after_close_loses_nothing(tmp_path: Path) -> None:
     done = script(
         tmp_path,
         """
-        syncing.GROUP_SECONDS = 3600
+        writer.GROUP_SECONDS = 3600
         for _ in range(3):
             record().close()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -62,8 +62,8 @@ def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
     done = script(
         tmp_path,
         """
-        syncing.GROUP_SECONDS = 3600
-        syncing.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
+        writer.GROUP_SECONDS = 3600
+        writer.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
         closed = [record() for _ in range(20)]
         for env in closed:
             env.close()
@@ -80,8 +80,8 @@ def test_a_forked_worker_ends_when_its_loops_are_on_disk(tmp_path: Path) -> None
         tmp_path,
         """
         import multiprocessing
-        syncing.GROUP_SECONDS = 3600
-        syncing.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
+        writer.GROUP_SECONDS = 3600
+        writer.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
         worker = multiprocessing.get_context("fork").Process(target=lambda: record().close())
         worker.start()
         worker.join()
@@ -97,10 +97,10 @@ def test_a_recording_that_does_not_reach_the_disk_is_failed(
     def fail(path: Path) -> None:
         raise OSError(errno.EIO, os.strerror(errno.EIO), str(path))
 
-    monkeypatch.setattr(syncing, "sync", fail)
+    monkeypatch.setattr(writer, "sync", fail)
     env = runner.record(gymnasium.make("CartPole-v1"), tmp_path)
     env.close()
-    syncing.SYNCER.sync()
+    writer.SYNCER.sync()
     run = run_at(env.run.folder)
     assert run.status == "failed"
     assert "could not be written to disk (Input/output error)" in run.facts["summary"]["error"]
@@ -111,6 +111,6 @@ def test_a_run_that_was_removed_is_no_error(tmp_path: Path, capsys: pytest.Captu
     env = runner.record(gymnasium.make("CartPole-v1"), tmp_path)
     env.close()
     env.run.recording.unlink()
-    syncing.SYNCER.sync()
+    writer.SYNCER.sync()
     assert run_at(env.run.folder).status == "finished"
     assert not capsys.readouterr().err
