@@ -44,6 +44,8 @@ from runner.recording.layout import Layout
 from runner.recording.maker import SHARD_MAKER, EnvironmentMaker, Shard
 from runner.recording.messages import (
     Message,
+    ResetOptions,
+    ResetState,
     decode,
     encode,
     encode_image,
@@ -56,7 +58,6 @@ from runner.recording.metadata import json_object, layout_of_run, write_result
 from runner.recording.observer import Observer
 from runner.recording.reader import open_recording
 from runner.recording.recorder import Recorder
-from runner.recording.resets import ResetOptions, ResetState
 from runner.recording.rewriting import content_of
 from runner.recording.run_file import parse_result
 from runner.recording.schema import STEP_NANOSECONDS, Topic

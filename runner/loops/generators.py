@@ -17,7 +17,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 
 from runner.environments.gym_types import AnyVectorEnv
 from runner.loops.vec_env import mode_of
-from runner.recording.resets import SEED_BYTES, STEPS_BETWEEN, ResetState
+from runner.recording.messages import SEED_BYTES, STEPS_BETWEEN, ResetState
 from runner.util.arrays import Flags
 
 _SPARSE_STEPS_A_BYTE: Final = 2

@@ -34,8 +34,8 @@ from runner.recording.gym_values import (
     only_number,
     step_filler,
 )
+from runner.recording.messages import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions, ResetState
 from runner.recording.recorder import BLOCK_BYTES, Recorder
-from runner.recording.resets import MAX_DIGITS, MAX_LARGE_SEED, ResetOptions, ResetState
 from runner.recording.spaces import Value, least_number
 from runner.util.arrays import Array, Flags, Floats, Ints, Records, zeros
 

@@ -32,17 +32,20 @@ from runner.recording.maker import MAKER_RECORD, SHARD_MAKER, EnvironmentMaker
 from runner.recording.messages import (
     Message,
     QTable,
+    ResetOptions,
+    ResetState,
     Scalars,
     Snapshot,
     decode_array,
     decode_q_table,
+    decode_reset_options,
+    decode_reset_state,
     decode_scalars,
     unknown_measures,
 )
 from runner.recording.metadata import check_file
 from runner.recording.metrics import RECENT_EPISODES, finite_mean
 from runner.recording.record_store import RecordStore
-from runner.recording.resets import ResetOptions, ResetState, decode_reset_options, decode_reset_state
 from runner.recording.run_file import RecentTraining, is_owned, run_title
 from runner.recording.schema import Topic, topics_of
 from runner.recording.spaces import decode as decode_value

@@ -226,11 +226,11 @@ RESET_STATE = MessageType(
         reset=_SFIXED64, environment=_FIXED32, np_random_seed=_BYTES, bit_generator=_BYTES, ale_state=_BYTES
     ),
 )
-"""What a reset without a seed depends on; `resets` describes its fields."""
+"""What a reset without a seed depends on; `messages.ResetState` describes its fields."""
 RESET_OPTIONS = MessageType(
     "ResetOptions", _fields(reset=_SFIXED64, json=_STRING, large_seed=_STRING, resets=_FIXED32)
 )
-"""What a reset was called with, if there is more than a seed; `resets` describes its fields."""
+"""What a reset was called with, if there is more than a seed; see `messages.ResetOptions`."""
 INFO = MessageType("Info", _fields(step=_SFIXED64, reset=_BOOL, json=_STRING))
 SCALAR = MessageType(
     "Scalar",

@@ -13,8 +13,8 @@ import numpy as np
 
 from runner.errors import RecordingError, shortened
 from runner.recording.description import environment_count
+from runner.recording.messages import ResetOptions, ResetState
 from runner.recording.reader import Recording
-from runner.recording.resets import ResetOptions, ResetState
 from runner.recording.schema import PHASES, STEP_NANOSECONDS
 from runner.recording.spaces import Value, decode
 from runner.recording.steps import aligned

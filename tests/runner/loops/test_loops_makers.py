@@ -27,9 +27,9 @@ from runner.errors import ConfigError, RecordingError
 from runner.execution.verify import verify
 from runner.export.pictures import describer
 from runner.recording.maker import EnvironmentMaker, VectorMaker, parse_maker
+from runner.recording.messages import ResetState, decode_reset_state
 from runner.recording.metadata import json_object
 from runner.recording.reader import open_recording
-from runner.recording.resets import ResetState, decode_reset_state
 from runner.replay.environment import rerun
 from tests.runner.loops.making import Leaving
 
