@@ -2,6 +2,10 @@
 
 A query runs in the transaction in which the index was seen to agree with the folders. Where the index file
 cannot be used, the folders are read without it.
+
+A quick check notices runs that are new or gone, files that were created, replaced or removed, as all commands
+do, and runs that are running: a stat of each run's folder takes 3 us. A whole one, with a stat of each run's
+files, takes 10 us, and also notices files that were changed in place. Files are read where something changed.
 """
 
 from __future__ import annotations
@@ -10,15 +14,18 @@ import contextlib
 import json
 import os
 import sqlite3
+import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from runner.errors import RunnerError, nearest
+from runner.recording.labels import LABELS_FILE
 from runner.runs.branches import BranchNode, Origin, parse_origin
 from runner.runs.catalogue.columns import SETTING, ColumnKind, IndexRow, field_of, with_same_as
 from runner.runs.catalogue.database import (
     SEED_SHIFT,
+    STORED,
     Candidate,
     Sql,
     create,
@@ -27,13 +34,14 @@ from runner.runs.catalogue.database import (
     open_index,
     pragma,
     renew,
+    row_of,
     text,
     transaction,
     version,
+    write_rows,
 )
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
-from runner.runs.catalogue.folders import Folders
-from runner.runs.run import check_folder_name
+from runner.runs.run import RECORDING_FILE, RUN_FILE, check_folder_name, run_entries, run_in
 
 if TYPE_CHECKING:
     from runner.util.processes import Tell
@@ -277,7 +285,7 @@ def look(
         work: called once, or once more if the index turns out to be damaged.
         rebuild: read all runs again.
         cached: use the index as it is, without checking the folders.
-        quick: miss files that were changed in place, as `runner.runs.catalogue.folders` explains.
+        quick: miss files that were changed in place.
     """
     paths = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay as they are
     places = list(dict.fromkeys(paths))
@@ -371,3 +379,150 @@ def _begins(column: str, beginning: str) -> Sql:
     """Return the condition that a text begins so, for which SQLite uses an index."""
     first = text(beginning) or ""
     return Sql(f"({column} >= ? AND {column} < ?)", (first, first + chr(0x10FFFF)))
+
+
+# --- the folders ------------------------------------------------------------------------------------------
+
+_STABLE_NS: Final = 2 * 10**9
+"""Files that changed this recently may change again with the same time: they are read again next time."""
+_RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
+_BATCH: Final = 2000
+"""Rows in memory at once, written in one transaction."""
+_EMPTY: Final[dict[str, object]] = dict.fromkeys(STORED)
+
+
+class _FolderChanges(NamedTuple):
+    """How a recordings folder differs from the index; runs are given by the names of their folders."""
+
+    root: str
+    changed: list[str]
+    """Runs that are new, changed, or whose process was killed."""
+    gone: list[str]
+    """Runs that were removed."""
+
+
+class Folders:
+    """Some recordings folders, compared with the index."""
+
+    def __init__(
+        self,
+        database: sqlite3.Connection,
+        roots: Sequence[str],
+        quick: bool = False,
+    ) -> None:
+        self._database = database
+        self._roots = roots
+        self._quick = quick
+        self._tokens: dict[str, dict[str, str]] = {}
+        """By root and entry, the token of each run's folder at the first check, or when it was read."""
+        self._read: dict[str, set[str]] = {root: set() for root in roots}
+
+    def differences(self) -> list[_FolderChanges]:
+        """Return how the folders, as they were at the first call, differ from the index as it is now."""
+        all_differences = [self._difference(root) for root in self._roots]
+        return [difference for difference in all_differences if difference.changed or difference.gone]
+
+    def apply(self, found: Sequence[_FolderChanges]) -> None:
+        """Read what changed and write it to the index, a transaction for each batch."""
+        for root, changed, gone in found:
+            changed.sort()  # in the order of the table, which then grows at its end
+            for start in range(0, len(changed), _BATCH):
+                rows = [self._row(root, entry) for entry in changed[start : start + _BATCH]]
+                with transaction(self._database, "IMMEDIATE"):
+                    write_rows(self._database, rows)
+            with transaction(self._database, "IMMEDIATE"):
+                removed = [(root, entry) for entry in gone]
+                self._database.executemany("DELETE FROM runs WHERE root = ? AND entry = ?", removed)
+
+    def expire(self) -> None:
+        """Have all runs of these folders read again, and delete the rows of folders that no longer exist."""
+        with transaction(self._database, "IMMEDIATE"):
+            for (root,) in self._database.execute("SELECT DISTINCT root FROM runs").fetchall():
+                if not os.path.isdir(root):  # noqa: PTH112
+                    self._database.execute("DELETE FROM runs WHERE root = ?", (root,))
+            expired = "UPDATE runs SET fingerprint = '', mark = '' WHERE root = ?"
+            self._database.executemany(expired, [(root,) for root in self._roots])
+
+    def _difference(self, root: str) -> _FolderChanges:
+        """Return the difference of one folder; entries without files of a run are left out, or gone."""
+        stored = "mark" if self._quick else "fingerprint"
+        indexed: dict[str, str] = dict(
+            self._database.execute(f"SELECT entry, {stored} FROM runs WHERE root = ?", (root,))
+        )
+        if root not in self._tokens:  # as the folders are at the first check
+            entries = [entry for entry in run_entries(Path(root)) if entry.isprintable()]
+            self._tokens[root] = {entry: self._token(root, entry) for entry in entries}
+        tokens = self._tokens[root]
+        changed = [entry for entry, token in tokens.items() if indexed.get(entry) != token]
+        unsteady = (
+            "SELECT entry, status, stable FROM runs WHERE root = ? AND (status = 'running' OR NOT stable)"
+        )
+        for entry, status, stable in self._database.execute(unsteady, (root,)):
+            if indexed.get(entry) != tokens.get(entry) or entry in self._read[root]:
+                continue
+            # The recording of a running one grows in place.
+            if not stable or self._quick or (status == "running" and not _is_running(root, entry)):
+                changed.append(entry)
+        there = [entry for entry in changed if _state_of(root, entry) is not None]
+        missing = {*indexed} - {*tokens} | {*changed} - {*there}
+        gone = [entry for entry in missing if entry in indexed and _state_of(root, entry) is None]
+        return _FolderChanges(root, there, gone)
+
+    def _token(self, root: str, entry: str) -> str:
+        if self._quick:
+            return _mark(root, entry)[0]
+        seen = _state_of(root, entry)
+        return "" if seen is None else seen.fingerprint
+
+    def _row(self, root: str, entry: str) -> dict[str, object]:
+        mark, changed = _mark(root, entry)  # before the files: later changes are found next time
+        seen = _state_of(root, entry) or _FileState("", 0, None)
+        stable = max(changed, seen.changed) + _STABLE_NS < time.time_ns()
+        self._tokens[root][entry] = mark if self._quick else seen.fingerprint
+        self._read[root].add(entry)
+        place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "mark": mark}
+        if run := run_in(Path(root, entry)):
+            return _EMPTY | place | {"stable": stable} | row_of(run, seen.size)
+        problem = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run."
+        return _EMPTY | place | {"stable": stable, "problem": problem}
+
+
+class _FileState(NamedTuple):
+    """The state of a run's files, without reading them."""
+
+    fingerprint: str
+    changed: int
+    """When one of them last changed, in nanoseconds since 1970."""
+    size: int | None
+    """Bytes of its recording."""
+
+
+def _state_of(root: str, entry: str) -> _FileState | None:
+    """Return the state of a run's files; None if there are none."""
+    marks = []
+    changed = 0
+    size = None
+    for name in _RUN_FILES:
+        try:
+            facts = os.stat(f"{root}{os.sep}{entry}{os.sep}{name}")  # noqa: PTH116 - Path takes three times as long
+        except OSError:
+            marks.append("")
+            continue
+        marks.append(f"{facts.st_mtime_ns}.{facts.st_size}.{facts.st_ino}")
+        changed = max(changed, facts.st_mtime_ns)
+        size = facts.st_size if name == RECORDING_FILE else None
+    return _FileState(" ".join(marks), changed, size) if marks[0] or marks[2] else None
+
+
+def _mark(root: str, entry: str) -> tuple[str, int]:
+    """Return a token that changes when a file in a folder is created, replaced or removed, and that time."""
+    try:
+        facts = os.stat(f"{root}{os.sep}{entry}")  # noqa: PTH116
+    except OSError:
+        return "", 0
+    return f"{facts.st_mtime_ns}.{facts.st_ino}", facts.st_mtime_ns
+
+
+def _is_running(root: str, entry: str) -> bool:
+    run = run_in(Path(root, entry))
+    return run is not None and run.status == "running"

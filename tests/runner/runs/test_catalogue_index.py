@@ -17,10 +17,9 @@ import pytest
 import runner
 from runner.errors import RunNotFound
 from runner.recording.labels import Labels, change_labels, read_labels
-from runner.runs.catalogue import folders
+from runner.runs.catalogue import index as index_module
 from runner.runs.catalogue.database import index_path, open_index
-from runner.runs.catalogue.folders import Folders
-from runner.runs.catalogue.index import MAX_TREE, look
+from runner.runs.catalogue.index import MAX_TREE, Folders, look
 from runner.runs.resolve import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 from tests.runner.runs.listed import ALL, CONFIG, aged, ids, rows
@@ -189,7 +188,7 @@ def test_a_run_is_found_by_the_names_that_find_it_in_the_folder(folder):
 WRITER = """
 import sys
 from pathlib import Path
-from runner.runs.catalogue.index import MAX_TREE, look
+from runner.runs.catalogue.index import MAX_TREE, Folders, look
 from runner.runs.catalogue.filters import parse
 from types import SimpleNamespace
 from runner.recording.labels import Labels, change_labels
@@ -257,14 +256,14 @@ def test_rebuilding_the_index_never_empties_it(folder, monkeypatch):
     runs = [create_run(folder, CONFIG, seed) for seed in range(4)]
     ids(folder)
     seen = []
-    row_of = folders.row_of
+    row_of = index_module.row_of
 
     def looking_on(run, size):
         with contextlib.closing(sqlite3.connect(index_path())) as other:
             seen.extend(other.execute("SELECT COUNT(*) FROM runs").fetchone())
         return row_of(run, size)
 
-    monkeypatch.setattr(folders, "row_of", looking_on)
+    monkeypatch.setattr(index_module, "row_of", looking_on)
     assert len(look([folder], lambda index: index.select(ALL), rebuild=True)) == 4
     assert seen == [len(runs)] * 4
 
