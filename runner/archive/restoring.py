@@ -26,7 +26,7 @@ from runner.recording.reader import open_recording
 from runner.recording.recorder import capacity_of
 from runner.recording.schema import STEP_NANOSECONDS, Topic
 from runner.recording.writer import RecordingFile
-from runner.replay.step_replay import DerivedTables, StepReplay
+from runner.replay.tables import DerivedTables, StepReplay
 from runner.util.arrays import Records, Unsigned
 from runner.util.files import storage_errors
 from runner.util.packing import MAX_CHUNK_BYTES

@@ -34,7 +34,7 @@ from runner.recording.marks import MARKS_FILE, Marks, read_marks
 from runner.recording.messages import QTable, decode_q_table, encode_q_table
 from runner.recording.metadata import kind_of
 from runner.recording.reader import Recording
-from runner.replay.step_replay import DerivedTables, StepReplay
+from runner.replay.tables import DerivedTables, StepReplay
 from runner.runs.checkpoints import read_checkpoints
 from runner.util.files import write_object
 from runner.util.processes import Report

@@ -15,7 +15,7 @@ from runner.learning import kernel
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
-from runner.replay.step_replay import NO_PROBE, NO_ROWS, NO_TRACE
+from runner.replay.tables import NO_PROBE, NO_ROWS, NO_TRACE
 from tests.runner.learning.twin import Twin
 
 SMALL_MAP = ["+---+", "|A: |", "| |B|", "+---+"]
