@@ -173,7 +173,7 @@ def option_of(given: Input) -> Declared:
     if given.kind in (int, float):
         kind = Number(given.minimum, given.maximum if given.kind is float else None, given.kind)
     if given.values:
-        kind = click.Choice(given.values)
+        kind = click.Choice(tuple(given.values))
     if (check := given.check) is not None:
         kind = Parsed(given.name, given.metavar, lambda text: (check(text), text)[1])
     return option(

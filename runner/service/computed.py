@@ -65,11 +65,10 @@ from runner.sweep.results import Results, effects_sections, ranking_sections
 from runner.util.extras import require
 from runner.util.humanize import sentence
 from runner.util.values import finite
+from runner.views.queries import MAX_ROWS
 from runner.views.sweeps import sweep_show
 from runner.views.view import Given
 
-MAX_ROWS: Final = 1000
-"""The most rows of a query, and the most episodes of a search."""
 MAX_FILM_STEPS: Final = 5_000
 """The most steps of a film, as one film is made at a time."""
 RecordKind = Literal["training", "optimality"]

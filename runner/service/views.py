@@ -36,7 +36,7 @@ from runner.service.errors import EXPECTED
 from runner.service.pages.rendering import Page, StatusName, installed_names, run_page
 from runner.service.problems import filled, media_docs, status_of
 from runner.views import shipped_views, view_named
-from runner.views.queries import FIND, SQL
+from runner.views.queries import FIND, MAX_QUERY, MAX_ROWS, SQL
 from runner.views.view import Input, View, rows_in
 
 api = APIRouter()
@@ -158,7 +158,7 @@ def _type_of(view: View) -> type[BaseModel]:
     """Return the type of the inputs of a view in the query of a request."""
 
     def declared(given: Input) -> tuple[Any, Any]:
-        kind: Any = Literal[given.values] if given.values else given.kind
+        kind: Any = Literal[tuple(given.values)] if given.values else given.kind
         if given.check is not None:
             kind = Annotated[kind, AfterValidator(partial(_checked, given.check, given.metavar))]
         if not (given.required or given.multiple or given.default is not None):
@@ -214,7 +214,7 @@ for _view in (*shipped_views(), *map(view_named, installed_names())):
 MAX_PICTURES: Final = 24
 """The most hits that a page shows pictures of."""
 
-Sql = Annotated[str, Query(max_length=10_000, description="One SELECT, as for `dualtaxi sql`.")]
+Sql = Annotated[str, Query(max_length=MAX_QUERY, description="One SELECT, as for `dualtaxi sql`.")]
 Runs = Annotated[str, Query(max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")]
 
 
@@ -237,7 +237,10 @@ class EpisodeQuestion(BaseModel):
     phase: Literal["", "train", "eval"] = Field("", description="Training or evaluation; both by default.")
     sort: str = Field("", max_length=1000, description="A number to sort by, such as `-ret`.")
     limit: int = Field(
-        20, ge=0, le=1000, description="Maximum number of episodes; 0 for the most of a server, 1,000."
+        20,
+        ge=0,
+        le=MAX_ROWS,
+        description=f"Maximum number of episodes; 0 for the most of a server, {MAX_ROWS:,}.",
     )
 
 

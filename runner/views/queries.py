@@ -13,11 +13,16 @@ from runner.query.text import cell_of, csv_value, reasons_in_words, without_pand
 from runner.util.extras import require
 from runner.util.humanize import counted, size
 from runner.util.row_text import csv_lines, json_list
-from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
+from runner.views.view import NO_PROGRESS, ONLY_HERE, PHASES, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.query.sql import QueryResult
     from runner.util.values import Json
+
+MAX_ROWS: Final = 1000
+"""The most rows of a printed table of a query, and of an answer of the service."""
+MAX_QUERY: Final = 10_000
+"""The most characters of a query in SQL."""
 
 
 def find(
@@ -33,7 +38,7 @@ def find(
     phase: str | None = view_input(
         "phase",
         "Training or evaluation.  [default: both]",
-        values=("train", "eval"),
+        values=PHASES,
         label="Phase",
         placeholder="both",
     ),
@@ -50,9 +55,9 @@ def find(
         "Maximum number of rows, 0 for all.  [default: 20]",
         kind=int,
         default=20,
-        maximum=1000,
+        maximum=MAX_ROWS,
         label="Show at most",
-        placeholder="0 to 1,000; 0 shows 1,000",
+        placeholder=f"0 to {MAX_ROWS:,}; 0 shows {MAX_ROWS:,}",
     ),
     mark: str | None = view_input(
         "mark", "Mark the first step of the episodes shown, as `dualtaxi mark` does.", metavar="TEXT"
@@ -138,8 +143,6 @@ FIND: Final = View(
 )
 
 
-_SHOWN: Final = 1000
-"""The most rows of a table."""
 _SECONDS: Final = 600
 _MEGABYTES: Final = 500
 
@@ -162,10 +165,10 @@ class Rows(Answer):
 
     def sections(self) -> Iterator[Section]:
         """Yield a table of the first rows."""
-        rows = [tuple(map(cell_of, row)) for row in islice(self._result.rows(), _SHOWN + 1)]
-        yield Section("", grids=[Grid(tuple(self._result.columns.names), rows[:_SHOWN])])
-        if len(rows) > _SHOWN:
-            self._say(f"Shown are the first {_SHOWN:,} rows; --csv and --json print all.")
+        rows = [tuple(map(cell_of, row)) for row in islice(self._result.rows(), MAX_ROWS + 1)]
+        yield Section("", grids=[Grid(tuple(self._result.columns.names), rows[:MAX_ROWS])])
+        if len(rows) > MAX_ROWS:
+            self._say(f"Shown are the first {MAX_ROWS:,} rows; --csv and --json print all.")
 
     def write(self, stream: BinaryIO) -> None:
         """Write the rows as Parquet."""
@@ -179,7 +182,8 @@ def sql(
         "query",
         "One SELECT in the SQL of DuckDB.",
         required=True,
-        max_length=10_000,
+        max_length=MAX_QUERY,
+        lines=4,
         label="Query",
         placeholder="SELECT config, avg(success_percent), avg(mean_return) FROM runs GROUP BY ALL",
     ),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from runner.analysis.sections import Grid, Paging, Section, SourceFile
 from runner.errors import RecordingError
 from runner.util.humanize import counted, duration, number_column, size
-from runner.views.view import START, STOP, ReadyAnswer, View, rows_in, view_input
+from runner.views.view import PHASES, START, STOP, ReadyAnswer, View, rows_in, view_input
 
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
@@ -29,7 +29,7 @@ _PHASE: Final = view_input(
     "Training episodes, or the trials of evaluations.  [default: train]",
     default="train",
     label="Phase",
-    values=("train", "eval"),
+    values=PHASES,
 )
 
 

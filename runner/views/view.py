@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -93,6 +93,8 @@ class Input:
     metavar: str = ""
     max_length: int = 1000
     """The most characters, or the most values if it is `multiple`."""
+    lines: int = 1
+    """Height of the field."""
     multiple: bool = False
     """Whether it may be repeated."""
     is_file: bool = False
@@ -107,8 +109,8 @@ class Input:
     """Hint in an empty field; of one with values, the text for none of them."""
     button: str = ""
     """Text of a button that sends the form with this flag."""
-    values: tuple[str, ...] = ()
-    """The values that it takes; empty if it takes others, too."""
+    values: Collection[str] = ()
+    """The values that it takes, or what the page calls each of them; empty if it takes others, too."""
     choices: Callable[[Recording], Sequence[str]] | None = None
     """Returns the texts that the field of the page offers, if those are not the values."""
 
@@ -129,6 +131,8 @@ STOP: Final = Input(
 )
 
 
+PHASES: Final = {"train": "training", "eval": "evaluation"}
+"""Values of an input, and what pages call them."""
 EVERYTHING: Final = view_input("all", "Include everything, not only a selection.", kind=bool, default=False)
 ONLY_HERE: Final = view_input("", "")
 """An input of a command alone, the option that commands share by its name: code, trust in it, or a filter."""

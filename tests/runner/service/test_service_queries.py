@@ -124,6 +124,13 @@ def test_a_wrong_search_is_refused_in_both_forms(client):
     assert client.get("/find", params={"expression": "length > 0", "limit": 1001}).status_code == 422
 
 
+@pytest.mark.parametrize("address", ["/find", "/runs/first/episodes"])
+def test_a_form_names_the_phases_as_pages_do(client, address):
+    text = client.get(address, params={"phase": "eval"}).text
+    assert '<option value="train">training</option>' in text
+    assert '<option value="eval" selected>evaluation</option>' in text
+
+
 def test_a_limit_of_0_is_the_most_of_a_server(client, recordings):
     every = runner.find("length > 0", recordings, limit=None)
     for path in ("/api/v1/find", "/find"):
