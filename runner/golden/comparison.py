@@ -18,7 +18,7 @@ from runner.analysis.diff.sections import sections
 from runner.environments.gym_types import Env
 from runner.errors import CannotRedo, ConfigError
 from runner.execution.verify import OUTSIDE
-from runner.export.reports.diff import render_diff
+from runner.export.reports.comparisons import render_diff
 from runner.loops.env import record
 from runner.loops.makers import maker_of
 from runner.recording.maker import EnvironmentMaker

@@ -45,8 +45,7 @@ from runner.export.film import FORMATS, Shot, usual_speed, write_film
 from runner.export.pictures import Pictures
 from runner.export.plots.training import EXPLANATION, constants_in, heatmap_plots
 from runner.export.plugin import installed_export
-from runner.export.reports.compare import drawn_task_sections
-from runner.export.reports.diff import difference_sections
+from runner.export.reports.comparisons import difference_sections, drawn_task_sections
 from runner.export.reports.maps import learned_section, situations, start_of
 from runner.export.reports.playback import playback_of
 from runner.export.reports.player_data import Playback

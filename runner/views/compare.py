@@ -115,7 +115,7 @@ def compare(
     from runner.analysis.groups import grouped, metrics_of, require_two
     from runner.analysis.series import parse_target, series_of
     from runner.analysis.statistics import require_scipy
-    from runner.export.reports.compare import render_comparison, render_tasks
+    from runner.export.reports.comparisons import render_comparison, render_tasks
 
     require_scipy()
     over = axis_of(axis)
@@ -178,7 +178,7 @@ def diff(
     from runner.analysis import diff as differences
     from runner.analysis.diff.sections import sections
     from runner.analysis.series import parse_target
-    from runner.export.reports.diff import render_diff
+    from runner.export.reports.comparisons import render_diff
     from runner.recording.reader import open_recording
 
     a, b = runs

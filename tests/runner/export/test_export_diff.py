@@ -15,8 +15,7 @@ from runner.analysis.diff import diff
 from runner.analysis.groups import grouped, metrics_of
 from runner.analysis.series import read_series
 from runner.cli import cli
-from runner.export.reports.compare import render_comparison
-from runner.export.reports.diff import render_diff
+from runner.export.reports.comparisons import render_comparison, render_diff
 from runner.recording.reader import open_recording
 from tests.runner.export.conftest import WORLDS
 from tests.runner.export.outline import check_page

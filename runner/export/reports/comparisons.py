@@ -1,18 +1,21 @@
-"""The difference of two runs as one self-contained page: the text of `dualtaxi diff`, and pictures."""
+"""Comparisons as self-contained pages: of groups of runs, of algorithms over environments, of two runs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from runner.analysis.compare import Comparison, MetricResult
+from runner.analysis.compare import sections as comparison_text
+from runner.analysis.compare.tasks import TaskComparison
 from runner.analysis.diff import RunDiff
+from runner.analysis.diff import sections as diff_text
 from runner.analysis.diff.divergence import Divergence
 from runner.analysis.diff.extent import common_snapshots
-from runner.analysis.diff.sections import sections, summary
 from runner.analysis.groups import Group
-from runner.analysis.sections import Figure, LegendEntry, Section
+from runner.analysis.sections import Figure, Grid, LegendEntry, Section
 from runner.analysis.series import read_series
 from runner.drawing import svg
 from runner.environments.mdp import Mdp
@@ -23,13 +26,95 @@ from runner.environments.naming import (
     spoken,
     states_in_words,
 )
-from runner.export.plots.comparisons import tables_svg
+from runner.export.plots.comparisons import intervals_svg, letter, profile_chart, tables_svg, task_charts
 from runner.export.plots.curves import curves_section
 from runner.export.reports.maps import drawn, on_grid, situation, situation_in_words
 from runner.export.reports.rendering import render
 from runner.recording.reader import Recording
 from runner.recording.run_file import run_title
 from runner.util.arrays import Floats
+from runner.util.humanize import UNKNOWN, counted
+
+_KEY = (
+    "In the plots of values, a dot is a run, the tick the median, the large sign the IQM, and the bar its "
+    "interval. A performance profile shows the share of the runs that reach a level; bands are pointwise "
+    "95 % intervals."
+)
+
+
+def render_comparison(comparison: Comparison, groups: Sequence[Group]) -> str:
+    """Return the page of a comparison, with the learning curves of its groups."""
+    labels = [group.label for group in groups]
+    _, *metrics, how = comparison_text.sections(comparison)
+    rows = [
+        (
+            run.run_id,
+            f"{letter(i)}: {group.label}",
+            run.name,
+            UNKNOWN if run.seed is None else str(run.seed),
+            run.status,
+        )
+        for i, group in enumerate(groups)
+        for run in group.runs
+    ]
+    return render(
+        " against ".join(labels) if len(labels) < 4 else f"{len(labels)} groups of runs compared",
+        comparison_text.summary(comparison),
+        [
+            *(
+                replace(section, figures=list(_figures(metric, labels)), layout="pair")
+                for section, metric in zip(metrics, comparison.metrics, strict=True)
+            ),
+            curves_section(groups),
+            Section("Runs", grids=[Grid(("run", "group", "name", "seed", "status"), rows)]),
+            replace(how, sentences=[*how.sentences, _KEY]),
+        ],
+        f"the recordings of these runs, {comparison.moment}",
+        notes=comparison.notes,
+        legend=[
+            LegendEntry(letter(i), f"{group.label}: {counted(len(group.runs), 'run')}")
+            for i, group in enumerate(groups)
+        ],
+    )
+
+
+def _figures(metric: MetricResult, labels: list[str]) -> Iterator[Figure]:
+    if not metric.groups:
+        return
+    yield Figure(intervals_svg(metric, labels), "Values")
+    if len(metric.thresholds) > 1:
+        title = f"{metric.title}: performance profile"
+        is_lower_better = metric.higher_is_better is False
+        chart = profile_chart(
+            "", title, metric.unit, metric.thresholds, metric.groups, labels, is_lower_better
+        )
+        yield Figure(chart.svg(), "Performance profile")
+
+
+def render_tasks(comparison: TaskComparison) -> str:
+    """Return the page of a comparison over environments."""
+    labels = [result.label for result in comparison.algorithms]
+    return render(
+        f"{' against '.join(labels)} over {len(comparison.tasks)} environments",
+        [],
+        drawn_task_sections(comparison),
+        f"the recordings of these runs, {comparison.moment}",
+    )
+
+
+def drawn_task_sections(comparison: TaskComparison) -> list[Section]:
+    """Return the text of a comparison over environments with its charts."""
+    algorithms, scores, how = comparison_text.task_sections(comparison)
+    legend = [
+        LegendEntry(letter(i), f"{result.label}: {sum(result.seeds.values())} runs")
+        for i, result in enumerate(comparison.algorithms)
+    ]
+    figures = [Figure(chart.svg()) for chart in task_charts(comparison)]
+    sentences = [*scores.sentences, "Bands are pointwise 95 % intervals."]
+    return [replace(scores, sentences=sentences, figures=figures, legend=legend), algorithms, how]
+
+
+# --- two runs -----------------------------------------------------------------------------------------
 
 
 def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
@@ -38,13 +123,13 @@ def render_diff(difference: RunDiff, a: Recording, b: Recording) -> str:
     sides = (difference.a, difference.b)
     return render(
         f"{difference.a['name']} against {difference.b['name']}",
-        [summary(difference)],
+        [diff_text.summary(difference)],
         list(difference_sections(difference, a, b, curves_section(groups).figures).values()),
         "the two recordings",
         notes=difference.notes,
         legend=[
-            LegendEntry(letter, f"{run_title(side['name'], side['seed'])} ({side['run_id']})")
-            for letter, side in zip("AB", sides, strict=True)
+            LegendEntry(name, f"{run_title(side['name'], side['seed'])} ({side['run_id']})")
+            for name, side in zip("AB", sides, strict=True)
         ],
     )
 
@@ -53,10 +138,10 @@ def difference_sections(
     difference: RunDiff, a: Recording, b: Recording, curves: Iterable[Figure] = ()
 ) -> dict[str, Section]:
     """Return the text of a difference with pictures, by title; `curves` are the metrics of both runs."""
-    known = {"Metrics", *(section.title for section in sections(difference))}
+    known = {"Metrics", *(section.title for section in diff_text.sections(difference))}
     if "Q-tables" not in difference.not_compared:
         known.add("Q-tables")
-    others = {section.title: section for section in sections(difference, everything=True)}
+    others = {section.title: section for section in diff_text.sections(difference, everything=True)}
     others["Runs"] = replace(others["Runs"], sentences=[])
     drawn = {}
     for title, figures, layout in (
@@ -81,9 +166,9 @@ def _pictures(divergence: Divergence | None, a: Recording, b: Recording) -> Iter
     if same_scene and not other_starts and steps:
         yield _picture(a if divergence.a_step is not None else b, steps[0], "Before, in both", False)
     when = "at its start" if other_starts else "after its step"
-    for letter, recording, step in (("A", a, divergence.a_step), ("B", b, divergence.b_step)):
+    for name, recording, step in (("A", a, divergence.a_step), ("B", b, divergence.b_step)):
         if step is not None:
-            yield _picture(recording, step, f"{letter}, {when}", not other_starts)
+            yield _picture(recording, step, f"{name}, {when}", not other_starts)
 
 
 def _picture(recording: Recording, step: np.void, title: str, after: bool) -> Figure:
