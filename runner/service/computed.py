@@ -40,9 +40,8 @@ from runner.debugging.what_if import branch_playback, what_if
 from runner.drawing import svg
 from runner.environments.naming import actions_in_words, joint_action, state_of
 from runner.errors import ConfigError, RunnerError, shortened
-from runner.export.encoded import picture_note, thumbnail
 from runner.export.film import FORMATS, Shot, usual_speed, write_film
-from runner.export.pictures import Pictures
+from runner.export.pictures import Pictures, episode_sketch, picture_note
 from runner.export.plots.training import EXPLANATION, constants_in, heatmap_plots
 from runner.export.plugin import installed_export
 from runner.export.reports.comparisons import difference_sections, drawn_task_sections
@@ -342,7 +341,7 @@ def episode_thumbnail(path: Path, at: EpisodeRef) -> bytes:
     """Return an episode as a small SVG picture."""
     with open_recording(path) as recording:
         step = at.resolved(recording)
-        return thumbnail(recording, step.phase, step.number_in(recording), step.heading).encode()
+        return episode_sketch(recording, step.phase, step.number_in(recording), step.heading).encode()
 
 
 def latest_episode(path: Path) -> bytes:

@@ -27,7 +27,7 @@ from runner.analysis.summary import describe_recording, random_policy_sentence
 from runner.drawing import svg
 from runner.environments.naming import spoken
 from runner.errors import RecordingError
-from runner.export.encoded import Thumbnails, picture_note, thumbnails
+from runner.export.pictures import Thumbnails, picture_note, thumbnails
 from runner.export.plots.curves import PLAIN, CurveStyle, curves_section
 from runner.export.reports.maps import learned_section, start_of
 from runner.export.reports.playback import MAX_VALUES, playback_of, titled

@@ -16,8 +16,7 @@ import rerun.blueprint as rrb
 from runner.drawing.raster import image_bytes
 from runner.errors import CannotRedo, RecordingError
 from runner.export import pictures
-from runner.export.encoded import encoded_picture
-from runner.export.pictures import decoded, redrawn
+from runner.export.pictures import decoded, encoded_picture, redrawn
 from runner.export.rerun.metrics import line_colours, phase_colours, series_lines
 from runner.export.rerun.selection import MAX_MEMBERS, time_of
 from runner.export.rerun.steps import Batch

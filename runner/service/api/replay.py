@@ -18,7 +18,7 @@ from runner.analysis.episodes import EXPECTED, EpisodeRef
 from runner.debugging.action_outcomes import WhatIf
 from runner.debugging.what_if import what_if as outcomes_of
 from runner.errors import RunnerError
-from runner.export.encoded import encoded_pictures
+from runner.export.pictures import encoded_pictures
 from runner.export.reports.player_data import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run

@@ -21,7 +21,7 @@ from runner.analysis.marking import mark, unmark
 from runner.analysis.sections import Link
 from runner.drawing import svg
 from runner.errors import RunnerError
-from runner.export.encoded import picture_note
+from runner.export.pictures import picture_note
 from runner.recording.reader import Recording, open_recording
 from runner.recording.steps import EpisodeSteps
 from runner.runs.branches import BranchOrigin, Origin, origin_in

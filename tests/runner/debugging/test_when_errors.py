@@ -12,7 +12,7 @@ import runner
 from runner.cli import cli
 from runner.debugging.when import when
 from runner.errors import RecordingError, RunnerError
-from runner.export.encoded import thumbnail
+from runner.export.pictures import episode_sketch
 from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
@@ -269,7 +269,7 @@ def test_steps_that_the_environment_cannot_have_are_refused(cooperative, tmp_pat
     with open_recording(path) as recording:
         (steps,) = recording.train.steps.blocks(100, 101)
         with pytest.raises(RecordingError, match="found state 1000000"):
-            thumbnail(recording, "train", int(steps["episode"][0]), "an episode")
+            episode_sketch(recording, "train", int(steps["episode"][0]), "an episode")
 
 
 # --- the command --------------------------------------------------------------------------------------------

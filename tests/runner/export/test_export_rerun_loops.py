@@ -15,8 +15,7 @@ from rerun.chunk import RrdReader
 import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.errors import RecordingError
-from runner.export.encoded import encoded_picture
-from runner.export.pictures import Pictures, PictureSource
+from runner.export.pictures import Pictures, PictureSource, encoded_picture
 from runner.export.rerun import selection
 from runner.export.rerun.selection import Request, locate, select
 from runner.export.rerun.writing import export

@@ -15,8 +15,7 @@ from PIL import Image
 import runner
 from runner.archive.restoring import restore
 from runner.errors import CannotRedo, ConfigError
-from runner.export.encoded import encoded_pictures
-from runner.export.pictures import Pictures, PictureSource
+from runner.export.pictures import Pictures, PictureSource, encoded_pictures
 from runner.recording import schema
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
