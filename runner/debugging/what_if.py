@@ -23,8 +23,7 @@ from runner.archive.places import opened
 from runner.debugging.action_outcomes import ActionOutcome, Outcome, WhatIf
 from runner.environments.mdp import Mdp, events_of
 from runner.environments.naming import actions_in_words, agent_of, joint_action, own_action, states_in_words
-from runner.export.reports.playback import tabular_playback
-from runner.export.reports.player_data import Playback
+from runner.export.reports.playback import Playback, tabular_playback
 from runner.learning import kernel
 from runner.learning.algorithms import POLICY, QLearning
 from runner.learning.kernel import Tally

@@ -46,8 +46,7 @@ from runner.export.plots.training import EXPLANATION, constants_in, heatmap_plot
 from runner.export.plugin import installed_export
 from runner.export.reports.comparisons import difference_sections, drawn_task_sections
 from runner.export.reports.maps import learned_section, situations, start_of
-from runner.export.reports.playback import playback_of
-from runner.export.reports.player_data import Playback
+from runner.export.reports.playback import Playback, playback_of
 from runner.export.reports.rendering import partials
 from runner.export.reports.report import render_report
 from runner.export.rerun.selection import Request, locate

@@ -1,17 +1,18 @@
-"""An episode as frames and steps that a page plays.
+"""What a page plays of an episode, in one form for every recording; as JSON can hold it.
 
 Frame k is the state after k steps, with the step that led there and the Q-values of the next choice. So an
-episode of T steps has T + 1 frames. Of a loop's episode, only what the page shows is kept in memory: not the
-other steps, and nothing of observations that are images.
+episode of T steps has T + 1 frames. Texts that repeat are stored once, with the index of each frame's text.
+
+Of a loop's episode only what the page shows is kept in memory: not the other steps, and no images.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from itertools import chain, islice
 from typing import Any, Final
 
 import numpy as np
@@ -26,24 +27,12 @@ from runner.environments.naming import (
     agent_actions,
     agent_actions_in_words,
     event_in_words,
+    exploration_in_words,
     numbered_actions,
     spoken,
     states_in_words,
 )
 from runner.errors import RecordingError, shortened
-from runner.export.reports.player_data import (
-    Playback,
-    PlayerGrid,
-    PlayerSeries,
-    Value,
-    Words,
-    frame_times,
-    logged_near,
-    outcome_in_words,
-    short,
-    short_rows,
-    words,
-)
 from runner.export.values import (
     is_image,
     names_in,
@@ -61,26 +50,151 @@ from runner.replay.recorded import reset_of
 from runner.replay.steps import steps_of, whole_steps
 from runner.replay.tables import TableReplay, tables_at
 from runner.util.arrays import Array, Floats, Ints, Records
-from runner.util.humanize import capitalised
+from runner.util.humanize import capitalised, counted
+from runner.util.values import Json
 
 MAX_STEPS: Final = 1000
 """Steps of an episode that a page shows; the page says so where an episode has more."""
 MAX_VALUES: Final = 6
 """Q-values of a state that a page shows: the highest, and that of the action taken."""
+_MAX_SERIES: Final = 32
+"""The most numbers of an observation that a page shows, shared by all agents."""
+_LEAST_SERIES: Final = 20
+"""The least share of an agent, however many there are."""
+_MAX_LETTERS: Final = 200
+"""Letters of an action, a text or an array."""
+_MAX_LOGGED: Final = 5000
+"""Logged values that a page shows."""
+_NEAR: Final = 1000
+"""Logged values are shown from this many steps of the run before the part to as many after it."""
+_MAX_LOGGED_LETTERS: Final = 300
+"""Letters of a logged name or text."""
 
+Value = float | int | str | None
+"""A number; NaN and infinities as text; None where it is unknown."""
 QValues = tuple[Floats, ...]
 """For each learner the Q-values in the states of T steps, [T, actions]; empty if they are unknown."""
-
-MAX_SERIES: Final = 32
-_LEAST_SERIES: Final = 20
-"""Numbers of an observation that a page shows, of each of several agents at least the second."""
-_MAX_LETTERS: Final = 200
-"""Letters of a text that are shown."""
-
 Values = NDArray[Any] | list[Any]
 """Values of a space, of one size or not."""
 Column = Array | list[str]
 """A part of a value at each of T steps: numbers [T, n], or texts."""
+
+
+@dataclass(frozen=True)
+class Words:
+    """The texts of frames, or of steps."""
+
+    agent: str
+    """The agent; empty for all together."""
+    name: str
+    values: list[str]
+    """The different texts."""
+    at: list[int]
+    """The index of each text."""
+
+
+@dataclass(frozen=True)
+class PlayerSeries:
+    """A number at each frame."""
+
+    agent: str
+    """The agent; empty for all together."""
+    kind: str
+    """The group in which a page shows it, such as `observation`."""
+    name: str
+    values: list[Value]
+
+
+@dataclass(frozen=True)
+class Logged:
+    """The values logged under a name near a part."""
+
+    name: str
+    at: list[int]
+    """The number of steps of the run before each, as in `Playback.time`."""
+    values: list[Value]
+
+
+@dataclass(frozen=True)
+class PlayerGrid:
+    """The places of the things of a scene."""
+
+    places: list[list[int]]
+    """For each state: x, y (hundredths of a cell) and size (percent) of each thing."""
+    at: list[int]
+    """The index of each frame's state."""
+
+
+@dataclass(frozen=True)
+class Playback:
+    """A part of an episode: T steps and T + 1 frames."""
+
+    title: str
+    description: str
+    length: int
+    """Steps of the whole episode."""
+    first: int
+    """The step with which this part begins."""
+    end: str
+    """How the episode ended, as text; empty if it did not."""
+    agents: list[str]
+    """The learners, each with its own reward."""
+    before: list[Value]
+    """The sum of each agent's earlier rewards; empty at the beginning."""
+    reward: list[list[Value]]
+    """For each step the reward of each agent."""
+    actions: list[Words]
+    """The actions of all agents together, or of each; a text for each step."""
+    texts: list[Words]
+    """Parts of states or observations that are texts, for each frame."""
+    time: list[int]
+    """The number of steps of the run before each frame, in training and evaluation together."""
+    series: list[PlayerSeries] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    """What is left out, a sentence each."""
+    logged: list[Logged] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+    """The names of the environment's events."""
+    event: list[int] = field(default_factory=list)
+    """For each step, bit i: the i-th of the events occurred."""
+    explored: list[int] = field(default_factory=list)
+    """For each step, bit i: the i-th agent's part of the action was chosen at random."""
+    choices: list[list[str]] = field(default_factory=list)
+    """The names of the actions of each Q-table."""
+    values: list[Json] = field(default_factory=list)
+    """For each Q-table the highest values before each step, and that of the action taken."""
+    grid: PlayerGrid | None = None
+    trail: int = svg.TRAIL
+    """The number of places that a trail joins."""
+
+    def as_json(self) -> dict[str, object]:
+        """Return its fields, and as `facts` what a page lists for each frame."""
+        return asdict(self) | {"facts": [asdict(fact) for fact in self._facts()]}
+
+    def _facts(self) -> Iterator[Words]:
+        """Yield what is known of frames besides `texts`, of each agent or all together; empty for none."""
+        rewards = np.array([self.before or [0] * len(self.agents), *self.reward], np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            returns = rewards.cumsum(axis=0).round(4)
+        explored = [
+            exploration_in_words(mask, self.agents) for mask in self.explored or [0] * len(self.reward)
+        ]
+        ways = [f" ({text}: chosen at random)" if text else "" for text in explored]
+        for action in self.actions:
+            own = [i for i, agent in enumerate(self.agents) if spoken(action.agent) in ("", agent)]
+            names = [self.agents[i] for i in own]
+            taken = [action.values[i] + way for i, way in zip(action.at, ways, strict=True)]
+            yield _words(
+                action.agent, "last action", ["" if self.first else "none yet: the episode begins", *taken]
+            )
+            yield _words(action.agent, "reward", ["", *(_signed(names, row) for row in rewards[1:, own])])
+            if self.events:
+                events = [
+                    ", ".join(name for i, name in enumerate(self.events) if mask >> i & 1) or "none"
+                    for mask in self.event
+                ]
+                yield _words(action.agent, "events", ["", *events])
+            yield _words(action.agent, "return so far", [_signed(names, row) for row in returns[:, own]])
 
 
 def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, first: int = 0) -> Playback:
@@ -88,7 +202,7 @@ def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, fi
     require_steps(recording, "show", may_redo=True)
     with np.errstate(over="ignore", invalid="ignore"):  # rewards may be infinite
         if not recording.tabular:
-            return loop_playback(recording, at, limit, first)
+            return _loop_playback(recording, at, limit, first)
         number = at.number_in(recording)
         steps = steps_of(recording, at.phase, number)
         shown = steps[first : first + limit]
@@ -114,6 +228,9 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
         title=f"{capitalised(names_text)}: {title[0].lower()}{title[1:]}",
         description=playback.description + part,
     )
+
+
+# --- jobs ---------------------------------------------------------------------------------------------
 
 
 def tabular_playback(
@@ -146,26 +263,26 @@ def tabular_playback(
     taken = [actions] * len(values)
     if len(values) > 1:  # each learner has a table of its own actions
         taken = [list(own) for own in zip(*(agent_actions(mdp, action) for action in actions), strict=True)]
-    time = frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
+    time = _frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
     before = steps["rewards"][:first].sum(axis=0).tolist() if first else []
     return Playback(
         title=at.heading,
-        description=outcome_in_words(len(steps), ended, float(steps["rewards"].sum())),
+        description=_outcome_in_words(len(steps), ended, float(steps["rewards"].sum())),
         length=len(steps),
         first=first,
         end=ENDINGS[ended],
         agents=[spoken(agent) for agent in agents],
-        before=[short(value) for value in before],
-        reward=short_rows(shown["rewards"]),
-        actions=[words("", "action", [named[action] for action in actions])],
+        before=[_short(value) for value in before],
+        reward=_short_rows(shown["rewards"]),
+        actions=[_words("", "action", [named[action] for action in actions])],
         texts=[Words("", "state", states, state_of.tolist())],
         time=time,
-        logged=logged_near(recording, at.phase, time),
+        logged=_logged_near(recording, at.phase, time),
         events=[event_in_words(name) for name in mdp.event_names],
         event=events_of(mdp, shown).tolist(),
         explored=shown["explored"].tolist(),
         choices=[actions_in_words(mdp).tolist()] if len(agents) == 1 else numbered_actions(mdp),
-        values=[_highest(own, which) for own, which in zip(values, taken, strict=True)],
+        values=[_highest(*table) for table in zip(values, taken, strict=True)],
         grid=grid,
     )
 
@@ -190,44 +307,26 @@ def _values(recording: Recording, steps: Records, at: EpisodeRef) -> QValues:
 def _highest(values: Floats, taken: list[int]) -> dict[str, object]:
     """Return the highest Q-values of each step, [action, value] pairs, and the action taken."""
     rows: dict[tuple[tuple[int, Value], ...], int] = {}
-    which: list[int] = []
+    row_of: list[int] = []
     for row, action in zip(values, taken, strict=True):
         best = np.argsort(-row, kind="stable")[:MAX_VALUES].tolist()
         shown = best if action in best else [*best[:-1], action]
         if len(row) <= MAX_VALUES:
             shown = sorted(shown)
-        pairs = tuple((int(choice), short(float(row[choice]))) for choice in shown)
-        which.append(rows.setdefault(pairs, len(rows)))
+        pairs = tuple((int(choice), _short(float(row[choice]))) for choice in shown)
+        row_of.append(rows.setdefault(pairs, len(rows)))
     return {
         "rows": list(rows),
-        "row": which,
+        "row": row_of,
         "taken": [int(action) for action in taken],
         "of": values.shape[1],
     }
 
 
-@dataclass(frozen=True)
-class _ShownPart:
-    """A part of a space, and what is shown of it."""
-
-    agent: str
-    """The agent that it is of; empty where there is only one."""
-    names: tuple[str, ...]
-    """The names of its numbers, or of its text."""
-    leaf: Leaf
-
-    def column(self, values: Values) -> Column:
-        """Return this part of T values."""
-        if isinstance(values, list):
-            parts = [part_of(value, self.leaf) for value in values]
-            if self.leaf.dtype is None:
-                return [shortened(text, _MAX_LETTERS) for text in parts]
-        else:
-            parts = part_of(values, self.leaf)
-        return np.asarray(parts).reshape(len(parts), -1)[:, : len(self.names)].copy()
+# --- loops --------------------------------------------------------------------------------------------
 
 
-def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
+def _loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) -> Playback:
     """Return what a page plays of an episode: at most `limit` steps from step `first` on."""
     phase, number = recording.phase(at.phase), at.number_in(recording)
     length = len(episode := phase.episode(number))
@@ -262,7 +361,7 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     reward = np.concatenate(rewards)
     if len(reward) != min(limit, length - first):
         raise RecordingError(f"{recording.path}: steps of this part of the episode were lost.")
-    frames = frame_times(np.concatenate(log_times) // schema.STEP_NANOSECONDS)
+    frames = _frame_times(np.concatenate(log_times) // schema.STEP_NANOSECONDS)
     ended = ending_of(recording, at.phase, number)
     total = None
     if len(records := phase.episodes.array(number, number + 1)):  # none if the file was cut off
@@ -274,22 +373,22 @@ def loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int) 
     extra_texts, extra_series = _extras(recording, at.phase, np.concatenate(numbers), notes)
     return Playback(
         title=at.heading + (f", in environment {episode.environment}" if recording.environments > 1 else ""),
-        description=outcome_in_words(length, ended, total) + begun,
+        description=_outcome_in_words(length, ended, total) + begun,
         length=length,
         first=first,
         end=ENDINGS[ended],
         agents=[spoken(agent) for agent in recording.agents],
-        before=[short(value) for value in before.tolist()] if first else [],
-        reward=short_rows(reward),
+        before=[_short(value) for value in before.tolist()] if first else [],
+        reward=_short_rows(reward),
         actions=[
-            words(agent, "action", (shortened(own.get(agent, "–"), _MAX_LETTERS) for own in actions))
+            _words(agent, "action", (shortened(own.get(agent, "–"), _MAX_LETTERS) for own in actions))
             for agent in agents
         ],
         texts=[*texts, *extra_texts],
         time=frames,
         series=[*series, *extra_series],
         notes=notes,
-        logged=logged_near(recording, at.phase, frames),
+        logged=_logged_near(recording, at.phase, frames),
     )
 
 
@@ -301,39 +400,25 @@ def _steps(recording: Recording, phase: str, episode: int, stop: int) -> Iterato
     yield whole_steps(recording, phase, episode)[:stop]
 
 
-def _extras(
-    recording: Recording, phase: str, steps: Ints, notes: list[str]
-) -> tuple[list[Words], list[PlayerSeries]]:
-    """Return the values that the loop recorded with these steps, each at the frame before its step.
+@dataclass(frozen=True)
+class _ShownPart:
+    """A part of a space, and what is shown of it."""
 
-    Texts and arrays of varying length are words, all others series of numbers.
-    """
-    texts, series = [], []
-    agents = recording.agents if len(recording.agents) > 1 else ()
-    extras = recording.phase(phase).extras
-    by_name = extras.at(steps) if extras else {}
-    for name, values in by_name.items():
-        agent = next((one for one in agents if name.startswith(f"{one}/")), "")
-        if values.dtype.hasobject:
-            shown = [_shortened(value) for value in filled(values).tolist()]
-            texts.append(words(agent, name.removeprefix(f"{agent}/"), [*shown, ""]))
-            continue
-        shape = values.shape[1:]
-        columns = values.reshape(len(steps), -1)
-        if columns.shape[1] > MAX_SERIES:
-            notes.append(f"{name}: {_sizes(shape)} numbers with each step")
-            continue
-        for own, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
-            numbers = [None if value is None else short(value) for value in column.tolist()]
-            series.append(PlayerSeries(agent, "extras", own, [*numbers, None]))
-    return texts, series
+    agent: str
+    """The agent that it is of; empty where there is only one."""
+    names: tuple[str, ...]
+    """The names of its numbers, or of its text."""
+    leaf: Leaf
 
-
-def _shortened(value: Any) -> str:
-    """Return the beginning of a text or of an array; nothing for None."""
-    if value is None or isinstance(value, str):
-        return shortened(value or "", _MAX_LETTERS)
-    return shortened(str(value[:_MAX_LETTERS].tolist()), _MAX_LETTERS)
+    def column(self, values: Values) -> Column:
+        """Return this part of T values."""
+        if isinstance(values, list):
+            parts = [part_of(value, self.leaf) for value in values]
+            if self.leaf.dtype is None:
+                return [shortened(text, _MAX_LETTERS) for text in parts]
+        else:
+            parts = part_of(values, self.leaf)
+        return np.asarray(parts).reshape(len(parts), -1)[:, : len(self.names)].copy()
 
 
 def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
@@ -344,7 +429,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
     notes = []
     unseen = 0
     known = observation_names(recording)
-    left = max(MAX_SERIES // len(agents), _LEAST_SERIES) if agents else MAX_SERIES
+    left = max(_MAX_SERIES // len(agents), _LEAST_SERIES) if agents else _MAX_SERIES
     budget: defaultdict[str, int] = defaultdict(lambda: left)
     for leaf in leaves:
         agent = leaf.path[0] if leaf.path and leaf.path[0] in agents else ""
@@ -387,10 +472,124 @@ def _frames(
         if part.leaf.dtype is None:
             shown = [text for column in columns for text in column]
             unknown = [""] * (frames - len(shown))
-            texts.append(words(part.agent, part.names[0] or "observation", unknown + shown))
+            texts.append(_words(part.agent, part.names[0] or "observation", unknown + shown))
             continue
         numbers = np.concatenate(columns).astype(np.float64)
         for name, own in zip(part.names, numbers.T.tolist(), strict=True):
-            values: list[Value] = [None] * (frames - len(own)) + [*map(short, own)]
+            values: list[Value] = [None] * (frames - len(own)) + [*map(_short, own)]
             series.append(PlayerSeries(part.agent, "observation", name or "observation", values))
     return texts, series
+
+
+def _extras(
+    recording: Recording, phase: str, steps: Ints, notes: list[str]
+) -> tuple[list[Words], list[PlayerSeries]]:
+    """Return the values that the loop recorded with these steps, each at the frame before its step.
+
+    Texts and arrays of varying length are words, all others series of numbers.
+    """
+    texts, series = [], []
+    agents = recording.agents if len(recording.agents) > 1 else ()
+    extras = recording.phase(phase).extras
+    by_name = extras.at(steps) if extras else {}
+    for name, values in by_name.items():
+        agent = next((one for one in agents if name.startswith(f"{one}/")), "")
+        if values.dtype.hasobject:
+            shown = [_shortened(value) for value in filled(values).tolist()]
+            texts.append(_words(agent, name.removeprefix(f"{agent}/"), [*shown, ""]))
+            continue
+        shape = values.shape[1:]
+        columns = values.reshape(len(steps), -1)
+        if columns.shape[1] > _MAX_SERIES:
+            notes.append(f"{name}: {_sizes(shape)} numbers with each step")
+            continue
+        for own, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
+            numbers = [None if value is None else _short(value) for value in column.tolist()]
+            series.append(PlayerSeries(agent, "extras", own, [*numbers, None]))
+    return texts, series
+
+
+def _shortened(value: Any) -> str:
+    """Return the beginning of a text or of an array; nothing for None."""
+    if value is None or isinstance(value, str):
+        return shortened(value or "", _MAX_LETTERS)
+    return shortened(str(value[:_MAX_LETTERS].tolist()), _MAX_LETTERS)
+
+
+# --- parts of both ------------------------------------------------------------------------------------
+
+
+def _logged_near(recording: Recording, phase: str, time: Sequence[int]) -> list[Logged]:
+    """Return what was logged near frames: a loop's numbers and texts, or a job's reports of training.
+
+    `time` is that of the frames, as `Playback.time`; values logged in another phase than theirs are marked.
+    """
+    tick = schema.STEP_NANOSECONDS
+    times = range(max(0, time[0] - _NEAR) * tick, (time[-1] + _NEAR) * tick + 1)
+    entries: Iterator[tuple[str, int, Value]]
+    if recording.eval.has_metrics:
+        entries = (
+            (name.replace("_", " "), report["log_time"], _short(report[name]))
+            for report in recording.train.metrics.decoded(times=times)
+            for name in ("epsilon", "step_size", "mean_length")
+        )
+    else:
+        scalars = (
+            (
+                scalar["name"] if scalar["phase"] == phase else f"{scalar['name']} ({scalar['phase']})",
+                scalar["log_time"],
+                _short(scalar["value"]),
+            )
+            for scalar in recording.table(schema.SCALAR_TOPIC).decoded(times=times)
+        )
+        texts = (
+            (text["name"], text["log_time"], text["message"][:_MAX_LOGGED_LETTERS])
+            for text in recording.table(schema.LOG_TOPIC).decoded(times=times)
+        )
+        entries = islice(chain(scalars, texts), _MAX_LOGGED)
+    by_name: dict[str, Logged] = {}
+    for name, log_time, value in entries:
+        logged = by_name.setdefault(name[:_MAX_LOGGED_LETTERS], Logged(name[:_MAX_LOGGED_LETTERS], [], []))
+        logged.at.append(log_time // tick)
+        logged.values.append(value)
+    return list(by_name.values())
+
+
+def _frame_times(after: Ints) -> list[int]:
+    """Return the number of steps of the run before each of T + 1 frames, from those after T steps."""
+    return [int(after[0]) - 1, *after.tolist()]
+
+
+def _outcome_in_words(length: int, ended: str, total: float | None) -> str:
+    """Return length, end and return of an episode as text; a return of None is unknown."""
+    rewards = "" if total is None else f" Rewards sum to {total:g}."
+    return f"{counted(length, 'step')}, {ENDINGS[ended]}.{rewards}"
+
+
+def _words(agent: str, name: str, texts: Iterable[str]) -> Words:
+    """Return texts with each different one stored once."""
+    numbers: dict[str, int] = {}
+    at = [numbers.setdefault(text, len(numbers)) for text in texts]
+    return Words(agent, name, list(numbers), at)
+
+
+def _signed(names: Sequence[str], values: Floats) -> str:
+    """Return the rewards of agents as text, without the name where there is one only."""
+    texts = [
+        f"{'+' * (value > 0)}{value:.10g}" if math.isfinite(value) else str(_short(value))
+        for value in values.tolist()
+    ]
+    return ", ".join(map("{} {}".format, names, texts)) if len(names) > 1 else "".join(texts)
+
+
+def _short(value: float) -> Value:
+    """Round a number to five significant digits; NaN and infinities are texts."""
+    if not np.isfinite(value):
+        return "NaN" if np.isnan(value) else "inf" if value > 0 else "-inf"
+    rounded = float(f"{value:.5g}")
+    return int(rounded) if rounded == int(rounded) else rounded
+
+
+def _short_rows(rows: Array) -> list[list[Value]]:
+    """Round the numbers of rows."""
+    return [[_short(value) for value in row] for row in rows.tolist()]

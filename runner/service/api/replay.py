@@ -19,7 +19,7 @@ from runner.debugging.action_outcomes import WhatIf
 from runner.debugging.what_if import what_if as outcomes_of
 from runner.errors import RunnerError
 from runner.export.pictures import encoded_pictures
-from runner.export.reports.player_data import Playback
+from runner.export.reports.playback import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed
