@@ -13,8 +13,8 @@ from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress
 if TYPE_CHECKING:
     from runner.analysis.episodes import EpisodeRef
     from runner.analysis.qtable import QTables
-    from runner.debugging.q_value import Why
     from runner.debugging.when import When
+    from runner.debugging.why import Why
     from runner.environments.mdp import Mdp
     from runner.recording.reader import Recording
     from runner.runs.run import Run

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 import runner
 from runner.cli import cli
 from runner.debugging import why
-from runner.debugging.q_value import EpisodesPart
+from runner.debugging.why import EpisodesPart
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError
 from runner.recording.reader import open_recording
 from runner.replay.tables import tables_at
