@@ -15,7 +15,7 @@ from pydantic import BaseModel, create_model
 from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import EXPECTED, EpisodeRef
-from runner.debugging.action_outcomes import WhatIf
+from runner.debugging.what_if import WhatIf
 from runner.debugging.what_if import what_if as outcomes_of
 from runner.errors import RunnerError
 from runner.export.pictures import encoded_pictures
