@@ -21,7 +21,7 @@ from runner.util import __version__
 if TYPE_CHECKING:
     import runner.analysis.frames as frames  # noqa: PLR0402
     import runner.integrations as integrations  # noqa: PLR0402
-    from runner.analysis.marking import mark, unmark
+    from runner.analysis.episodes import mark, unmark
     from runner.api import run, run_all
     from runner.config import ExperimentConfig
     from runner.debugging.branch import branch
@@ -93,7 +93,7 @@ _HOME = {
     "find_run": "runner.runs.resolve",
     "label": "runner.runs.run",
     "list_runs": "runner.runs.run",
-    "mark": "runner.analysis.marking",
+    "mark": "runner.analysis.episodes",
     "open_recording": "runner.recording.reader",
     "plot": "runner.export.notebook",
     "record": "runner.loops.env",
@@ -108,7 +108,7 @@ _HOME = {
     "run": "runner.api",
     "run_all": "runner.api",
     "sql": "runner.query.sql",
-    "unmark": "runner.analysis.marking",
+    "unmark": "runner.analysis.episodes",
     "verify": "runner.execution.verify",
     "what_if": "runner.debugging.what_if",
     "when": "runner.debugging.when",

@@ -20,8 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.analysis.contents import END_WORDS
-from runner.analysis.episodes import EpisodeRef
-from runner.analysis.marking import mark_steps
+from runner.analysis.episodes import EpisodeRef, mark_steps
 from runner.analysis.sections import Grid
 from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError

@@ -95,7 +95,7 @@ def mark_command(
       dualtaxi mark @latest worst --tag look-again
       dualtaxi mark k3v9m2xq --unmark 3f2a9c01b7de
     """
-    from runner.analysis.marking import mark, unmark
+    from runner.analysis.episodes import mark, unmark
 
     if at is not None:
         mark(run, at, text, tags=tags)

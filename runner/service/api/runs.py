@@ -12,7 +12,7 @@ from fastapi import Path as InPath
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.marking import mark, unmark
+from runner.analysis.episodes import mark, unmark
 from runner.analysis.summary import describe_run
 from runner.errors import ConfigError
 from runner.recording.labels import MAX_NOTE, MAX_TAGS

@@ -15,9 +15,8 @@ from fastapi.responses import RedirectResponse
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from runner.analysis.episodes import TYPICAL, EpisodeRef, reference_to
+from runner.analysis.episodes import TYPICAL, EpisodeRef, mark, reference_to, unmark
 from runner.analysis.evaluations import evaluations_of
-from runner.analysis.marking import mark, unmark
 from runner.analysis.sections import Link
 from runner.drawing import svg
 from runner.errors import RunnerError
