@@ -32,9 +32,17 @@ from runner.config import ExperimentConfig, from_mapping, load
 from runner.config.model import Job, identity_of
 from runner.config.shipped import shipped
 from runner.debugging.explanation import FOLDER, LOCK, TAG, Explanation, FirstStep, Side, write_explanation
-from runner.debugging.factors import MAX_ALL, Mixing, mix
 from runner.debugging.game import Game, SamplingPlan, interactions_of, mixture_bounds, settings_of
-from runner.debugging.mixtures import Measurement, MixtureResult, Mixtures, Readings, measure
+from runner.debugging.mixtures import (
+    MAX_ALL,
+    Measurement,
+    Mixing,
+    MixtureResult,
+    Mixtures,
+    Readings,
+    measure,
+    mix,
+)
 from runner.environments.naming import spoken
 from runner.errors import RunnerError, RunNotFound, nearest
 from runner.execution.session import resolve_initial_q, run_job

@@ -17,8 +17,7 @@ import numpy as np
 
 from runner.analysis.statistics import Estimate, bootstrap_means
 from runner.debugging.explanation import ENOUGH, Interaction, Mixture, Setting
-from runner.debugging.factors import MAX_ALL
-from runner.debugging.mixtures import Mixtures
+from runner.debugging.mixtures import MAX_ALL, Mixtures
 from runner.util.arrays import Floats
 
 T = TypeVar("T")

@@ -1,18 +1,21 @@
-"""Training mixtures of two configurations on the workers of sweeps, without recording them.
+"""Mixtures of two configurations: the settings in which they differ, and mixtures trained without recording.
 
-A run is trained up to its end and evaluated there once, in the trials of the evaluation that a recorded run
-has at that episode: its readings are those of the recorded run. What was measured is kept in a file, by the
-identity of its job, and never measured again.
+Mixtures are trained on the workers of sweeps. A run is trained up to its end and evaluated there once, in the
+trials of the evaluation that a recorded run has at that episode: its readings are those of the recorded run.
+What was measured is kept in a file, by the identity of its job, and never measured again.
 """
 
 from __future__ import annotations
 
 import contextlib
+import copy
+import itertools
+import json
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Final, Self
 
@@ -20,36 +23,260 @@ import numpy as np
 from blake3 import blake3
 from pydantic import FiniteFloat, TypeAdapter, ValidationError
 
-from runner.config import ExperimentConfig, from_mapping
-from runner.config.model import identity_of
-from runner.debugging.factors import Mixing
-from runner.environments.loading import load_once
+from runner.config import ConfigError, ExperimentConfig, from_mapping
+from runner.config.model import LEARNERS, SECTION_OF, identity_of
+from runner.environments.loading import load_mdp, load_once
 from runner.environments.mdp import Mdp
-from runner.errors import RunnerError
+from runner.errors import EnvironmentNotUsable, RunnerError
 from runner.execution.session import configured_tables, evaluation_metrics
 from runner.learning.learner import Learner
 from runner.planning.evaluation import ExactEvaluator
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
+from runner.runs.branches import training_branches
 from runner.sweep.objective import readings
 from runner.sweep.workers import Workers
 from runner.util import __version__
 from runner.util.arrays import Floats
+from runner.util.differences import Change
 from runner.util.files import storage_errors
+from runner.util.humanize import listed, setting
 from runner.util.processes import Stop
-from runner.util.values import Json, finite
+from runner.util.values import Json, JsonView, finite
 
-VALUES: Final = "values.jsonl"
-MAX_LINE: Final = 1 << 20
-MAX_BYTES: Final = 1 << 30
-"""Bytes of a file of values that are read."""
-TASK_SECONDS: Final = 0.4
+MAX_ALL: Final = 8
+"""The most settings of which all mixtures are run."""
+_MAX_SETTINGS: Final = 12
+"""The most settings that are explained."""
+_MEASURING: Final = ("evaluation", "log", "snapshots", "recording")
+"""Sections that change what is measured and recorded, and not what is learned."""
+_MIXED_INSIDE: Final = ("env", "env.kwargs", "quirks", *SECTION_OF)
+"""Sections whose settings can differ one by one; the others are one setting each."""
+_VALUES: Final = "values.jsonl"
+_MAX_LINE: Final = 1 << 20
+_MAX_BYTES: Final = 1 << 30
+"""The most bytes of a file of values that are read."""
+_TASK_SECONDS: Final = 0.4
 """The time that a task should take: seeds are trained in batches, so that handing them over costs little."""
 _BLOCK_STEPS: Final = 4096
 _WAIT_SECONDS: Final = 0.2
-
 Readings = Mapping[str, float | None]
 """The metrics of an evaluation by name; None for one that is not finite."""
+
+
+# --- settings that differ -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Factor:
+    """One setting that differs, or several that only make sense together."""
+
+    name: str
+    changes: tuple[Change, ...]
+    """The values in A and B by path; None for a section that one of them does not have."""
+
+    @property
+    def a(self) -> str:
+        """Its value in A as text."""
+        return self._values("a")
+
+    @property
+    def b(self) -> str:
+        """Its value in B as text."""
+        return self._values("b")
+
+    def _values(self, side: str) -> str:
+        values = {change.path: getattr(change, side) for change in self.changes}
+        learners = (values.get("tables"), values.get("rewards"))
+        modes = [mode for mode, means in LEARNERS.items() if means == learners]
+        if modes:
+            del values["tables"], values["rewards"]
+        texts = (_branches(value) if path == "branches" else setting(value) for path, value in values.items())
+        return ", ".join([*modes, *texts])
+
+
+@dataclass(frozen=True)
+class Mixing:
+    """Two configurations, and the settings in which they differ."""
+
+    a: ExperimentConfig
+    b: ExperimentConfig
+    """The second, with the sections of A that only measure and record."""
+    factors: tuple[Factor, ...]
+    notes: tuple[str, ...]
+    """What is not mixed, and what is mixed only together."""
+
+    @property
+    def everything(self) -> int:
+        """The number of the mixture that is B."""
+        return (1 << len(self.factors)) - 1
+
+    def config(self, mixture: int) -> ExperimentConfig:
+        """Return the configuration of a mixture: the values of B where its bits are 1, else those of A."""
+        paths = [change.path for factor in self.chosen(mixture) for change in factor.changes]
+        return from_mapping(_mixed(self.a.to_mapping(), self.b.to_mapping(), paths))
+
+    def chosen(self, mixture: int) -> list[Factor]:
+        """Return the settings that have the values of B in a mixture."""
+        return [factor for i, factor in enumerate(self.factors) if mixture >> i & 1]
+
+    def in_words(self, mixture: int) -> str:
+        """Return what a mixture is, for errors."""
+        names = ", ".join(factor.name for factor in self.chosen(mixture)) or "none"
+        return f"the mixture with these settings of B: {names}"
+
+
+def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: bool = False) -> Mixing:
+    """Return the settings in which two experiments differ, grouped so that they can be mixed.
+
+    They are compared after `at` training episodes, by default each at its own end; `exact` is whether
+    evaluations need exact measures.
+
+    Raises:
+        RunnerError: they differ in no setting, in too many, or in settings that cannot be mixed; or one of
+            them trains fewer episodes than `at`.
+    """
+    for name, config in (("A", a), ("B", b)):
+        if at is not None and at > config.episodes:
+            raise RunnerError(
+                f"at: found {at:,}, but {name} trains {config.episodes:,} episodes: choose an episode that "
+                "both reach."
+            )
+    ours, theirs = a.to_mapping(), b.to_mapping()
+    notes: list[str] = []
+    measuring = [key for key in _MEASURING if ours[key] != theirs[key]]
+    if measuring:
+        notes.append(f"{listed(measuring)} only measure and record: those of A are used in all mixtures")
+    if ours["evaluation"] is None:
+        ours["evaluation"] = theirs["evaluation"] or {"every": 1000, "trials": 200}
+        notes.append("A has no evaluation: that of B is used, or else one of 200 trials")
+    ours["evaluation"] |= {"exact": True} if exact else {}
+    shared = {key: ours[key] for key in (*_MEASURING, "name", "seeds")}
+    shared |= {"episodes": at} if at is not None else {}
+    a, b = (from_mapping(values | shared) for values in (ours, theirs))
+    factors = [Factor(change.path, (change,)) for change in _changes(a.to_mapping(), b.to_mapping())]
+    if not factors:
+        same = f" ({'; '.join(notes)})" if notes else ""
+        raise RunnerError(
+            f"A and B differ in no setting that changes what is learned{same}: there is nothing to explain. "
+            "`dualtaxi diff` compares two runs in everything else."
+        )
+    mixing = _grouped(Mixing(a, b, tuple(factors), tuple(notes)))
+    if len(mixing.factors) > _MAX_SETTINGS:
+        names = ", ".join(factor.name for factor in mixing.factors)
+        raise RunnerError(
+            f"A and B differ in {len(mixing.factors)} settings, expected at most {_MAX_SETTINGS}: {names}. "
+            "Explain in two steps, by a configuration that has some of the settings of each."
+        )
+    return mixing
+
+
+def _changes(a: JsonView, b: JsonView, prefix: str = "") -> Iterator[Change]:
+    """Yield the settings that differ; sections in which values can be mixed one by one are entered."""
+    for key in dict.fromkeys([*a, *b]):
+        path = f"{prefix}{key}"
+        left = a.get(key)
+        right = b.get(key)
+        if left == right:
+            continue
+        if (
+            path in _MIXED_INSIDE
+            and isinstance(left, Mapping)
+            and isinstance(right, Mapping)
+            and not (path == "env" and left["id"] != right["id"])
+        ):
+            yield from _changes(left, right, f"{path}.")
+        else:
+            yield Change(path, left, right)
+
+
+def _mixed(a: Json, b: JsonView, paths: Sequence[str]) -> Json:
+    """Return the values of A with those of B at some paths; a key that B does not have is removed."""
+    mixed = copy.deepcopy(a)
+    for path in paths:
+        *sections, key = path.split(".") if path.count(".") < 2 else path.split(".", 2)
+        here, there = mixed, b
+        for section in sections:
+            here, there = here[section], there[section]
+        if key in there:
+            here[key] = there[key]
+        else:
+            here.pop(key, None)
+    return mixed
+
+
+def _grouped(mixing: Mixing) -> Mixing:
+    """Return the mixing with settings merged until each of its mixtures is valid."""
+    notes = list(mixing.notes)
+    for mixture in (0, mixing.everything):
+        if problem := _problem(mixing, mixture):
+            raise problem
+    while len(mixing.factors) > 1:
+        count = len(mixing.factors)
+        checked = range(2**count) if count <= _MAX_SETTINGS else _outer(count)
+        wrong = next((mixture for mixture in checked if _problem(mixing, mixture)), None)
+        if wrong is None:
+            break
+        i, j = _conflict(mixing, wrong)
+        one, other = (mixing.factors[k] for k in sorted((i, j)))
+        changes = one.changes + other.changes
+        name = f"{one.name} + {other.name}"
+        merged = Factor("mode" if name == "tables + rewards" else name, changes)
+        reason = str(_problem(mixing, wrong)).splitlines()[-1]
+        notes.append(f"{one.name} and {other.name} only go together, and count as one setting ({reason})")
+        rest = [factor for factor in mixing.factors if factor not in (one, other)]
+        mixing = Mixing(mixing.a, mixing.b, (merged, *rest), tuple(notes))
+    return mixing
+
+
+def _conflict(mixing: Mixing, wrong: int) -> tuple[int, int]:
+    """Return two settings to merge: one of B and one of A, without either of which a mixture is valid."""
+    numbers = range(len(mixing.factors))
+    pairs = [(i, j) for i in numbers for j in numbers if wrong >> i & 1 and not wrong >> j & 1]
+
+    def mended(pair: tuple[int, int]) -> int:
+        tried = wrong | 1 << pair[1], wrong & ~(1 << pair[0])
+        return sum(_problem(mixing, mixture) is None for mixture in tried)
+
+    return max(pairs, key=mended)
+
+
+def _outer(count: int) -> Iterator[int]:
+    """Yield the mixtures in which at most two settings differ from the others."""
+    for chosen in itertools.chain(*(itertools.combinations(range(count), size) for size in (1, 2))):
+        mixture = sum(1 << i for i in chosen)
+        yield from (mixture, 2**count - 1 - mixture)
+
+
+def _problem(mixing: Mixing, mixture: int) -> RunnerError | None:
+    """Return why a mixture cannot be run; None if it can."""
+    try:
+        config = mixing.config(mixture)
+    except ConfigError as error:
+        return error
+    kwargs = json.dumps(config.to_mapping()["env"]["kwargs"], sort_keys=True)
+    try:
+        _require_environment(config.env.id, kwargs, config.rewards)
+    except (ConfigError, EnvironmentNotUsable) as error:
+        return error
+    return None
+
+
+@cache
+def _require_environment(env_id: str, kwargs: str, rewards: str) -> None:
+    load_mdp(env_id, json.loads(kwargs), rewards)
+
+
+def _branches(value: object) -> str:
+    """Return branches of training in a few words: `epsilon 0.5 from step 100,000`."""
+    texts = (
+        f"{branch.changes} {'from' if branch.settings else 'at'} step {branch.step:,}"
+        for branch in training_branches({"branches": value})
+    )
+    return "; ".join(texts) or "none"
+
+
+# --- training -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -134,15 +361,6 @@ def measure(
     return read
 
 
-@lru_cache(maxsize=16)
-def _environment_digest(mdp: Mdp) -> str:
-    """Return the digest of an environment's arrays, which its code determines."""
-    digest = blake3()
-    for name, array in sorted(mdp.arrays().items()):
-        digest.update(name.encode() + array.tobytes())
-    return digest.hexdigest()[:16]
-
-
 class Mixtures:
     """The readings of mixtures, measured by workers when they are needed, and kept in a folder.
 
@@ -162,13 +380,13 @@ class Mixtures:
         self.seeds = tuple(seeds)
         self.workers = workers
         self._recordings = recordings
-        self._path = folder / VALUES
+        self._path = folder / _VALUES
         self._report = report
-        self._kept = {known.job: known for known in _kept(self._path)}
-        self.in_file = sum(earlier.seed in self.seeds for earlier in self._kept.values())
-        """Runs in the file that have one of the seeds, of whatever mixtures."""
+        self._kept = {run.job: run for run in _read_kept(self._path)}
+        self.in_file = sum(run.seed in self.seeds for run in self._kept.values())
+        """Runs in the file with one of the seeds, of any mixture."""
         self._jobs: dict[int, list[str]] = {}
-        """Mixture to the identities of its runs, by the order of the seeds."""
+        """Mixture to the identities of its runs, in the order of the seeds."""
         self.trained = 0
         """Runs that were trained now, not read from the file."""
 
@@ -188,7 +406,7 @@ class Mixtures:
         return sum(len(self.readings(mixture)) for mixture in mixtures)
 
     def readings(self, mixture: int) -> list[Readings]:
-        """Return the readings of a mixture that were measured, by the order of the seeds."""
+        """Return the readings of a mixture that were measured, in the order of the seeds."""
         return [self._kept[job].readings for job in self._jobs_of(mixture) if job in self._kept]
 
     def _jobs_of(self, mixture: int) -> list[str]:
@@ -246,7 +464,7 @@ class Mixtures:
 
     def _tasks(self, mixtures: Sequence[int], seeds: Sequence[int]) -> Iterator[Measurement]:
         """Yield tasks for what is not known."""
-        batch = max(1, round(TASK_SECONDS / self.seconds)) if self.seconds else len(seeds)
+        batch = max(1, round(_TASK_SECONDS / self.seconds)) if self.seconds else len(seeds)
         for mixture in mixtures:
             missing = [
                 seed
@@ -263,15 +481,24 @@ class Mixtures:
         jobs = dict(zip(self.seeds, self._jobs_of(task.mixture), strict=True))
         lines = []
         for seed, read in measured.readings.items():
-            known = self._kept[jobs[seed]] = _Known(jobs[seed], dict(read), measured.seconds, seed)
-            lines.append(_LINES.dump_json(known).decode() + "\n")
+            known = self._kept[jobs[seed]] = _KeptRun(jobs[seed], dict(read), measured.seconds, seed)
+            lines.append(_LINE.dump_json(known).decode() + "\n")
         with storage_errors(self._path), self._path.open("a", encoding="utf-8") as file:
             file.writelines(lines)
 
 
+@lru_cache(maxsize=16)
+def _environment_digest(mdp: Mdp) -> str:
+    """Return the digest of an environment's arrays, which its code determines."""
+    digest = blake3()
+    for name, array in sorted(mdp.arrays().items()):
+        digest.update(name.encode() + array.tobytes())
+    return digest.hexdigest()[:16]
+
+
 @dataclass(frozen=True)
-class _Known:
-    """A run in the file of values."""
+class _KeptRun:
+    """A line of the file of values: what a run measured."""
 
     job: str
     readings: dict[str, FiniteFloat | None]
@@ -279,15 +506,15 @@ class _Known:
     seed: object = None
 
 
-_LINES: Final = TypeAdapter(_Known)
+_LINE: Final = TypeAdapter(_KeptRun)
 
 
-def _kept(path: Path) -> Iterator[_Known]:
-    """Yield what a file has of each run, without damaged lines."""
+def _read_kept(path: Path) -> Iterator[_KeptRun]:
+    """Yield the runs in a file of values, without damaged lines."""
     try:
         with path.open("rb") as file:
-            while file.tell() < MAX_BYTES and (line := file.readline(MAX_LINE)):
+            while file.tell() < _MAX_BYTES and (line := file.readline(_MAX_LINE)):
                 with contextlib.suppress(ValidationError):
-                    yield _LINES.validate_json(line)
+                    yield _LINE.validate_json(line)
     except OSError:
         return

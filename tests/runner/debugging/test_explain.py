@@ -28,7 +28,7 @@ from runner.debugging.explanation import (
     signed,
     summary,
 )
-from runner.debugging.factors import mix
+from runner.debugging.mixtures import mix
 from runner.errors import RunnerError
 from runner.runs.run import UNLISTED, label, list_runs
 
