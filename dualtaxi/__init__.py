@@ -8,8 +8,7 @@ import gymnasium
 
 from dualtaxi.env import DualTaxiEnv
 from dualtaxi.grid import DEFAULT_MAP
-from dualtaxi.rewards import Rewards
-from dualtaxi.transitions import Transitions
+from dualtaxi.transitions import Rewards, Transitions
 
 __all__ = ["DEFAULT_MAP", "DualTaxiEnv", "Rewards", "Transitions"]
 

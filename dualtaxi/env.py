@@ -13,15 +13,14 @@ from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
-from dualtaxi.encoding import AGENTS, Encoding, State, decode_action, encode_action
-from dualtaxi.grid import ACTIONS, DEFAULT_MAP, Grid
-from dualtaxi.rendering import Picture, draw_text
-from dualtaxi.rewards import Rewards, is_number
-from dualtaxi.scene import describe_scene, place_things
+from dualtaxi.grid import ACTIONS, AGENTS, DEFAULT_MAP, Grid, State, decode_action, encode_action
+from dualtaxi.rendering import Picture, describe_scene, draw_text, place_things
 from dualtaxi.transitions import (
     EVENT_NAMES,
+    Rewards,
     Transitions,
     build_transitions,
+    is_number,
     legal_actions,
     start_distribution,
     summed,
@@ -129,7 +128,7 @@ class DualTaxiEnv(gymnasium.Env[Any, Any]):
     - `success_events`: the events that mean success.
     - `penalty_below`: the published statistics call a step whose summed reward is below it a penalty.
     - `scene`, `scene_cells` (int16 [S, things]), `scene_carriers` (int8 [S, things]): how to draw a state;
-      see `dualtaxi.scene`.
+      see `dualtaxi.rendering.describe_scene`.
 
     `s` is the current state, as in Gymnasium's toy-text environments; it may be set, to look at a state.
 
@@ -193,15 +192,14 @@ class DualTaxiEnv(gymnasium.Env[Any, Any]):
         self.rewards = Rewards.of(rewards)
         self.slip = float(slip)
         self.grid = Grid.from_text(DEFAULT_MAP if map is None else map)
-        self.encoding = Encoding(self.grid.rows, self.grid.columns, len(self.grid.landmarks))
 
-        pairs = build_transitions(self.grid, self.encoding, self.rewards, self.slip)
+        pairs = build_transitions(self.grid, self.rewards, self.slip)
         self.transitions: Transitions = pairs if self.competitive else summed(pairs)
-        self.initial_state_distrib: NDArray[np.float64] = start_distribution(self.encoding)
+        self.initial_state_distrib: NDArray[np.float64] = start_distribution(self.grid)
         self.initial_state_distrib.flags.writeable = False
         self._start_states = np.flatnonzero(self.initial_state_distrib)
-        self._legal = legal_actions(self.grid, self.encoding)
-        self.observation_space = spaces.Discrete(self.encoding.states)
+        self._legal = legal_actions(self.grid)
+        self.observation_space = spaces.Discrete(self.grid.states)
         self.action_space = spaces.Discrete(math.prod(self.agent_action_counts))
         self.s: int | None = None
         self.last_actions: tuple[int, int] | None = None
@@ -275,17 +273,17 @@ class DualTaxiEnv(gymnasium.Env[Any, Any]):
 
     @cached_property
     def _places(self) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
-        return place_things(self.grid, self.encoding)
+        return place_things(self.grid)
 
     def encode(
         self, taxi_1: tuple[int, int], taxi_2: tuple[int, int], passenger: int, destination: int
     ) -> int:
         """Return the number of a state; taxis as (row, column), passenger and destination as numbers."""
-        return self.encoding.encode(taxi_1, taxi_2, passenger, destination)
+        return self.grid.encode(taxi_1, taxi_2, passenger, destination)
 
     def decode(self, state: int) -> State:
         """Return the fields of a state."""
-        return self.encoding.decode(state)
+        return self.grid.decode(state)
 
     def encode_action(self, action_1: int, action_2: int) -> int:
         """Return the joint action of the two taxis' actions."""

@@ -12,10 +12,9 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from dualtaxi.encoding import AGENTS
 from dualtaxi.env import DualTaxiEnv
-from dualtaxi.grid import ACTIONS
-from dualtaxi.rewards import Rewards
+from dualtaxi.grid import ACTIONS, AGENTS
+from dualtaxi.transitions import Rewards
 
 try:
     from pettingzoo import ParallelEnv
@@ -63,7 +62,7 @@ class DualTaxiParallelEnv(ParallelEnv, RecordConstructorArgs):  # type: ignore[m
         self.possible_agents = list(AGENTS)
         self.agents: list[str] = []
         self._taken = 0
-        self._observation_spaces = {agent: spaces.Discrete(self.game.encoding.states) for agent in AGENTS}
+        self._observation_spaces = {agent: spaces.Discrete(self.game.grid.states) for agent in AGENTS}
         self._action_spaces = {agent: spaces.Discrete(len(ACTIONS)) for agent in AGENTS}
 
     def observation_space(self, agent: str) -> spaces.Discrete:

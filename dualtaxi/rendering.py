@@ -1,17 +1,26 @@
-"""A state as text for a terminal, and as a picture."""
+"""A state as text for a terminal, as a picture, and as a scene that others draw without knowing the rules."""
 
 from __future__ import annotations
 
 import os
+from itertools import cycle
+from typing import Any
 
 import numpy as np
 from gymnasium.utils import colorize
 from numpy.typing import NDArray
 
 from dualtaxi.drawing import Canvas, ink_on, mix, text_width
-from dualtaxi.encoding import State
-from dualtaxi.grid import ACTIONS, Grid
-from dualtaxi.scene import BLACK, ORANGE, PURPLE, SKY_BLUE, YELLOW, landmark_colours
+from dualtaxi.grid import ACTIONS, AGENTS, MOVES, Grid, State
+
+THINGS = (*AGENTS, "passenger", "destination")
+"""What has a place in every state, in the order of `scene_cells` and `scene_carriers`."""
+
+# Okabe and Ito (2008), "Color Universal Design": distinguishable with any common colour blindness.
+BLACK, ORANGE, SKY_BLUE, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, VERMILLION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+
+_NAMED_COLOURS = {"R": VERMILLION, "G": GREEN, "Y": YELLOW, "B": BLUE}
 
 LEGEND = "1 2 taxis, p passenger waiting, P passenger in the taxi, * destination"
 
@@ -43,11 +52,11 @@ def draw_text(grid: Grid, state: State, actions: tuple[int, int] | None) -> str:
 
 def _coloured_map(grid: Grid, state: State) -> list[str]:
     """Return the lines of the map, one character a cell."""
-    cells = {(mark.row, mark.column): mark.name for mark in grid.landmarks}
+    cells = {mark.cell: mark.name for mark in grid.landmarks}
     waits_at, rider = _passenger_place(grid, state)
     if waits_at is not None:
         cells[waits_at] = colorize(cells[waits_at], "blue", bold=True)
-    goal = grid.landmarks[state.destination][1:]
+    goal = grid.landmarks[state.destination].cell
     cells[goal] = colorize(cells[goal], "magenta")
     for taxi, place, colour in ((1, state.taxi_2, "red"), (0, state.taxi_1, "yellow")):
         shown = cells.get(place, str(taxi + 1))
@@ -63,8 +72,8 @@ def _lettered_map(grid: Grid, state: State) -> list[str]:
         signs.setdefault(place, [" "] * 5)[position] = sign
 
     for mark in grid.landmarks:
-        put(mark[1:], 0, mark.name)
-    put(grid.landmarks[state.destination][1:], 1, "*")
+        put(mark.cell, 0, mark.name)
+    put(grid.landmarks[state.destination].cell, 1, "*")
     put(state.taxi_1, 2, "1")
     put(state.taxi_2, 3, "2")
     waits_at, rider = _passenger_place(grid, state)
@@ -92,7 +101,7 @@ def _passenger_place(grid: Grid, state: State) -> tuple[tuple[int, int] | None, 
     """Return the cell where the passenger waits and the taxi (0 or 1) the passenger is in; one is None."""
     count = len(grid.landmarks)
     if state.passenger < count:
-        return grid.landmarks[state.passenger][1:], None
+        return grid.landmarks[state.passenger].cell, None
     return None, state.passenger - count
 
 
@@ -126,7 +135,7 @@ class Picture:
         """Return the picture of a state and of the actions that led to it, uint8 [height, width, 3]."""
         canvas = Canvas(self._map.pixels.copy())
         waits_at, rider = _passenger_place(self._grid, state)
-        goal_x, goal_y = self._corner(self._grid.landmarks[state.destination][1:])
+        goal_x, goal_y = self._corner(self._grid.landmarks[state.destination].cell)
         _ring(canvas, goal_x, goal_y)
         _flag(canvas, goal_x + 85, goal_y + 10)
         if waits_at is not None:
@@ -150,13 +159,13 @@ class Picture:
         canvas.box(edge, (self._left + across + _FRAME, self._bottom + _FRAME), _INK, 14)
         canvas.box((self._left, self._top), (self._left + across, self._top + down), _ROAD, 7)
         marks = list(zip(self._grid.landmarks, landmark_colours(self._grid), strict=True))
-        tints = {mark[1:]: mix(_WHITE, colour, 0.28) for mark, colour in marks}
+        tints = {mark.cell: mix(_WHITE, colour, 0.28) for mark, colour in marks}
         for row in range(self._grid.rows):
             for column in range(self._grid.columns):
                 x, y = self._corner((row, column))
                 canvas.box((x, y), (x + _CELL, y + _CELL), tints.get((row, column), _WHITE), 6)
         for mark, colour in marks:
-            x, y = self._corner(mark[1:])
+            x, y = self._corner(mark.cell)
             canvas.box((x + 10, y + 9), (x + 46, y + 45), colour, 7)
             canvas.text((x + 28 - text_width("R", 20) / 2, y + 17), mark.name, 20, ink_on(colour))
         for row, column in self._grid.walls:
@@ -246,3 +255,63 @@ def _taxi(canvas: Canvas, centre: tuple[float, float], taxi: int, west: bool, ca
     slab((-11, -2), (11, 18), _WHITE, 4)
     left, top = at(0, 1.5)
     canvas.text((left - text_width("1", 13) / 2, top), str(taxi + 1), 13, BLACK)
+
+
+def landmark_colours(grid: Grid) -> tuple[str, ...]:
+    """Return the colour of each landmark as "#rrggbb": R, G, Y and B are what they stand for."""
+    names = [mark.name for mark in grid.landmarks]
+    unused = [colour for name, colour in _NAMED_COLOURS.items() if name not in names]
+    others = cycle(unused or _NAMED_COLOURS.values())
+    return tuple(_NAMED_COLOURS.get(name) or next(others) for name in names)
+
+
+def describe_scene(grid: Grid) -> dict[str, Any]:
+    """Return the parts of the scene that never change, as a plain dict that JSON can hold.
+
+    Its keys: `rows`, `columns`; `walls` (pairs of neighbouring [row, column] cells with a wall between);
+    `landmarks` (`name`, `cell`, `colour`); `things` (`name`, `label`, `kind`, and `agent` if one moves it);
+    `actions` of one agent (`name`, and `move` in [rows, columns] or None).
+    """
+    movers = [
+        {"name": agent, "label": agent.replace("_", " "), "kind": "mover", "agent": agent} for agent in AGENTS
+    ]
+    others = [
+        {"name": "passenger", "label": "passenger", "kind": "passenger"},
+        {"name": "destination", "label": "destination", "kind": "goal"},
+    ]
+    moves = [list(move) for move in MOVES]
+    return {
+        "rows": grid.rows,
+        "columns": grid.columns,
+        "walls": [[[row, column], [row, column + 1]] for row, column in grid.walls],
+        "landmarks": [
+            {"name": mark.name, "cell": [mark.row, mark.column], "colour": colour}
+            for mark, colour in zip(grid.landmarks, landmark_colours(grid), strict=True)
+        ],
+        "things": movers + others,
+        "actions": [
+            {"name": name, "move": moves[number] if number < len(moves) else None}
+            for number, name in enumerate(ACTIONS)
+        ],
+    }
+
+
+def place_things(grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
+    """Return where each thing is in each state, and what carries it.
+
+    Returns:
+        Cell index (row * columns + column) of each of `THINGS`, int16 [S, 4], and the index in `THINGS` of
+        the thing that carries it, or -1, int8 [S, 4]; both read-only.
+    """
+    axes = np.indices(grid.state_shape).reshape(len(grid.state_shape), -1)
+    cell_1, cell_2, passenger, destination = axes
+    waits_at = np.append(grid.landmark_cells, (0, 0))[passenger]  # the two zeros are never chosen below
+    rides_in = passenger - len(grid.landmarks)
+    passenger_cell = np.choose(rides_in.clip(-1) + 1, (waits_at, cell_1, cell_2))
+    cells = np.stack((cell_1, cell_2, passenger_cell, grid.landmark_cells[destination]), axis=1).astype(
+        np.int16
+    )
+    carriers = np.full(cells.shape, -1, dtype=np.int8)
+    carriers[:, THINGS.index("passenger")] = rides_in.clip(-1)
+    cells.flags.writeable = carriers.flags.writeable = False
+    return cells, carriers

@@ -1,18 +1,19 @@
-"""The rules of the game, as arrays over every state and joint action."""
+"""The rules of the game: what a step is worth, and the outcomes of every joint action in every state."""
 
 from __future__ import annotations
 
+import difflib
 import itertools
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
+from numbers import Real
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dualtaxi.encoding import AGENTS, Encoding
-from dualtaxi.grid import ACTIONS, DROP_OFF, MOVES, PICKUP, SIDEWAYS, Grid
-from dualtaxi.rewards import Rewards
+from dualtaxi.grid import ACTIONS, AGENTS, DROP_OFF, MOVES, PICKUP, SIDEWAYS, Grid
 
 _TAXI_EVENTS = ("pickup", "drop_off", "wrong_stop", "illegal_pickup", "illegal_drop_off")
 
@@ -31,6 +32,69 @@ _TAXI_1 = np.s_[:, np.newaxis, :, :, :, np.newaxis]  # [cells, passengers, desti
 _TAXI_2 = np.s_[np.newaxis, :, :, :, np.newaxis, :]  # the same of taxi 2
 _MOVE_1 = np.s_[:, np.newaxis, np.newaxis, np.newaxis, :, np.newaxis]  # [cells, actions] of taxi 1
 _MOVE_2 = np.s_[np.newaxis, :, np.newaxis, np.newaxis, np.newaxis, :]
+
+
+@dataclass(frozen=True)
+class Rewards:
+    """The reward a taxi gets for a step, by what it did; the defaults are the published values.
+
+    Attributes:
+        step: A move (also one against a wall).
+        idle_step: A move while the passenger rides in the other taxi.
+        pickup: A legal pickup.
+        illegal_action: A pickup where no passenger waits, a drop-off without passenger or off the landmarks.
+        drop_off: The passenger delivered at the destination.
+        wrong_drop_off: The passenger put out at another landmark; `None` means the same as `step`.
+        collision: Both taxis would end in one cell; each gets this and nothing else.
+    """
+
+    step: float = -2.0
+    idle_step: float = -1.0
+    pickup: float = 0.0
+    illegal_action: float = -10.0
+    drop_off: float = 100.0
+    wrong_drop_off: float | None = None
+    collision: float = -15.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is None and field.name == "wrong_drop_off":
+                continue
+            if not is_number(value) or not math.isfinite(value):
+                raise ValueError(f"rewards.{field.name} is {value!r}, expected a finite number")
+
+    @classmethod
+    def of(cls, given: Rewards | Mapping[str, Any] | None) -> Rewards:
+        """Return `given` as `Rewards`; names that a mapping leaves out keep their defaults.
+
+        Raises:
+            ValueError: A name is unknown, or a value is not a finite number.
+        """
+        if isinstance(given, Rewards):
+            return given
+        if given is not None and not isinstance(given, Mapping):
+            raise ValueError(f"rewards is {given!r}, expected a mapping such as {{'drop_off': 50}}")
+        given = dict(given or {})
+        names = [field.name for field in fields(cls)]
+        for name in given:
+            if name not in names:
+                near = difflib.get_close_matches(str(name), names, n=1)
+                hint = f"did you mean {near[0]!r}? " if near else ""
+                raise ValueError(
+                    f"rewards has the unknown name {name!r}; {hint}the names are {', '.join(names)}"
+                )
+        return cls(**given)
+
+    @property
+    def put_out(self) -> float:
+        """The reward for putting the passenger out at a landmark other than the destination."""
+        return self.step if self.wrong_drop_off is None else self.wrong_drop_off
+
+
+def is_number(value: object) -> bool:
+    """Return whether `value` is a real number; True and False, which YAML writes as yes and no, are none."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,12 +144,11 @@ class Way(NamedTuple):
     probability: NDArray[np.float64]  # [actions]
 
 
-def build_transitions(grid: Grid, encoding: Encoding, rewards: Rewards, slip: float) -> Transitions:
+def build_transitions(grid: Grid, rewards: Rewards, slip: float) -> Transitions:
     """Return the transitions with one reward a taxi (R = 2).
 
     Args:
         grid: The map.
-        encoding: The numbering of the map's states.
         rewards: What a step is worth.
         slip: Probability that a move goes sideways, half of it to either side, independently for each taxi.
 
@@ -93,13 +156,13 @@ def build_transitions(grid: Grid, encoding: Encoding, rewards: Rewards, slip: fl
         ValueError: The map is too large for its table to be held in memory.
     """
     ways = _ways(slip)
-    count = encoding.states * len(ACTIONS) ** 2 * len(ways) ** 2
+    count = grid.states * len(ACTIONS) ** 2 * len(ways) ** 2
     if count > MAX_OUTCOMES:
         raise ValueError(
-            f"map and slip make {count:,} outcomes ({encoding.states:,} states), expected at most "
+            f"map and slip make {count:,} outcomes ({grid.states:,} states), expected at most "
             f"{MAX_OUTCOMES:,}; use a smaller map, fewer landmarks, or no slip"
         )
-    sure = _sure_transitions(grid, encoding, rewards)
+    sure = _sure_transitions(grid, rewards)
     return sure if len(ways) == 1 else _with_slip(sure, ways)
 
 
@@ -135,10 +198,10 @@ def taxi_effects(taxi: int, grid: Grid, rewards: Rewards) -> Effects:
     )
 
 
-def _sure_transitions(grid: Grid, encoding: Encoding, rewards: Rewards) -> Transitions:
+def _sure_transitions(grid: Grid, rewards: Rewards) -> Transitions:
     """Return the transitions without slip, one outcome each (K = 1)."""
     taxi_1, taxi_2 = (taxi_effects(taxi, grid, rewards) for taxi in range(len(AGENTS)))
-    cell_1, cell_2, passenger, destination = np.ogrid[tuple(slice(n) for n in (*encoding.shape, 1, 1))][:4]
+    cell_1, cell_2, passenger, destination = np.ogrid[tuple(slice(n) for n in (*grid.state_shape, 1, 1))][:4]
     after_1, after_2 = grid.cell_after[_MOVE_1], grid.cell_after[_MOVE_2]
     passenger_1, passenger_2 = taxi_1.passenger[_TAXI_1], taxi_2.passenger[_TAXI_2]
     collide = after_1 == after_2
@@ -147,8 +210,8 @@ def _sure_transitions(grid: Grid, encoding: Encoding, rewards: Rewards) -> Trans
 
     passenger_after = np.where(passenger_1 != passenger, passenger_1, passenger_2)
     passenger_after = np.where(undone, passenger, passenger_after)
-    state = _number(encoding, cell_1, cell_2, passenger, destination)
-    moved = _number(encoding, after_1, after_2, passenger_after, destination)
+    state = _number(grid, cell_1, cell_2, passenger, destination)
+    moved = _number(grid, after_1, after_2, passenger_after, destination)
     # The published rules judge a delivery before they look for a collision, so one that a
     # collision undoes still ends the episode.
     ends = taxi_1.delivers[_TAXI_1] | taxi_2.delivers[_TAXI_2] | shared
@@ -159,27 +222,27 @@ def _sure_transitions(grid: Grid, encoding: Encoding, rewards: Rewards) -> Trans
         for taxi, earned in enumerate((taxi_1.reward[_TAXI_1], taxi_2.reward[_TAXI_2]))
     ]
     return Transitions(
-        next_state=_fold(encoding, np.where(collide, state, moved), np.int32),
-        probability=_fold(encoding, np.ones(1), np.float64),
-        rewards=np.stack([_fold(encoding, part, np.float64) for part in pay], axis=-1),
-        terminated=_fold(encoding, ends, np.bool_),
-        events=_fold(encoding, happened | collision, np.uint32),
+        next_state=_fold(grid, np.where(collide, state, moved), np.int32),
+        probability=_fold(grid, np.ones(1), np.float64),
+        rewards=np.stack([_fold(grid, part, np.float64) for part in pay], axis=-1),
+        terminated=_fold(grid, ends, np.bool_),
+        events=_fold(grid, happened | collision, np.uint32),
     )
 
 
-def _number(encoding: Encoding, *axes: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Return state numbers from (cell 1, cell 2, passenger, destination); see `Encoding.shape`."""
+def _number(grid: Grid, *axes: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return state numbers from (cell 1, cell 2, passenger, destination); see `Grid.state_shape`."""
     number = axes[0]
-    for axis, count in zip(axes[1:], encoding.shape[1:], strict=True):
+    for axis, count in zip(axes[1:], grid.state_shape[1:], strict=True):
         number = number * count + axis
     return number
 
 
-def _fold(encoding: Encoding, values: NDArray[Any], dtype: type[np.generic]) -> NDArray[Any]:
+def _fold(grid: Grid, values: NDArray[Any], dtype: type[np.generic]) -> NDArray[Any]:
     """Return values over the six axes as an array of their own, [states, joint actions, 1]."""
     count = len(ACTIONS)
-    whole = np.broadcast_to(values, (*encoding.shape, count, count))
-    return np.array(whole, dtype=dtype, order="C").reshape(encoding.states, count * count, 1)
+    whole = np.broadcast_to(values, (*grid.state_shape, count, count))
+    return np.array(whole, dtype=dtype, order="C").reshape(grid.states, count * count, 1)
 
 
 def _ways(slip: float) -> list[Way]:
@@ -251,26 +314,26 @@ def summed(transitions: Transitions) -> Transitions:
     )
 
 
-def legal_actions(grid: Grid, encoding: Encoding) -> NDArray[np.bool_]:
+def legal_actions(grid: Grid) -> NDArray[np.bool_]:
     """Return which actions of each taxi hit no wall and are no illegal pickup or drop-off, [S, 2, 6]."""
     cells, count = np.arange(grid.cells), len(ACTIONS)
     blocked = (grid.cell_after == cells[:, np.newaxis]) & (np.arange(count) < len(MOVES))
-    legal = np.empty((*encoding.shape, len(AGENTS), count), dtype=np.bool_)
+    legal = np.empty((*grid.state_shape, len(AGENTS), count), dtype=np.bool_)
     for taxi in range(len(AGENTS)):
         allowed = ~(taxi_effects(taxi, grid, Rewards()).illegal | blocked[:, np.newaxis, np.newaxis, :])
         legal[..., taxi, :] = np.expand_dims(allowed, axis=1 - taxi)
-    return legal.reshape(encoding.states, len(AGENTS), count)
+    return legal.reshape(grid.states, len(AGENTS), count)
 
 
-def start_distribution(encoding: Encoding) -> NDArray[np.float64]:
+def start_distribution(grid: Grid) -> NDArray[np.float64]:
     """Return the probability of starting in each state, float64 [S].
 
     Uniform over states with the taxis in different cells and the passenger waiting at a landmark
     other than the destination.
     """
-    cell_1, cell_2, passenger, destination = np.ogrid[tuple(slice(n) for n in encoding.shape)]
-    waiting = (passenger < encoding.landmarks) & (passenger != destination)
-    starts = np.broadcast_to((cell_1 != cell_2) & waiting, encoding.shape).ravel()
+    cell_1, cell_2, passenger, destination = np.ogrid[tuple(slice(n) for n in grid.state_shape)]
+    waiting = (passenger < len(grid.landmarks)) & (passenger != destination)
+    starts = np.broadcast_to((cell_1 != cell_2) & waiting, grid.state_shape).ravel()
     return starts / np.count_nonzero(starts)
 
 
