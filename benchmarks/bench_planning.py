@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.learners import train, tutorial_learner
 from runner.environments.mdp import Mdp
-from runner.planning.evaluation import evaluate_policy
-from runner.planning.optimum import greedy_policy, optimal_values
+from runner.planning.exact import evaluate_policy, greedy_policy, optimal_values
 
 DISCOUNT = 0.99
 

@@ -30,7 +30,7 @@ from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable, RunnerError
 from runner.execution.session import configured_tables, evaluation_metrics
 from runner.learning.learner import Learner
-from runner.planning.evaluation import ExactEvaluator
+from runner.planning.exact import ExactEvaluator
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
 from runner.runs.branches import training_branches

@@ -40,8 +40,7 @@ from runner.learning.algorithms import POLICY, QLearning
 from runner.learning.kernel import Tally
 from runner.learning.learner import CHOSEN, NEVER, Learner
 from runner.learning.schedules import compile_schedule, schedule_value
-from runner.planning.evaluation import action_values, joint_probabilities, policy_values
-from runner.planning.optimum import optimal_values
+from runner.planning.exact import action_values, joint_probabilities, optimal_values, policy_values
 from runner.recording import schema
 from runner.recording.layout import blank_records
 from runner.recording.reader import Recording

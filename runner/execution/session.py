@@ -26,7 +26,7 @@ from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import Diverged, RunnerError, StorageError, truncated_message
 from runner.learning.learner import Learner, NamedTables
-from runner.planning.evaluation import ExactEvaluator
+from runner.planning.exact import ExactEvaluator
 from runner.recording import schema
 from runner.recording.layout import layout_of
 from runner.recording.messages import Message, QTable, encode, encode_log, encode_q_table

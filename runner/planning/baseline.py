@@ -73,12 +73,12 @@ def _cached(path: Path, mdp: Mdp) -> RandomBaseline:
     """Return the baseline from a file of the user's cache, which is written if it is missing."""
     with contextlib.suppress(OSError, ValueError):
         stored = read_object(path, _MAX_BYTES)
-        length, returned, finish = (
-            stored.get(name) for name in ("mean_length", "mean_return", "success_percent")
+        percent, length, returned = (
+            stored.get(name) for name in ("success_percent", "mean_length", "mean_return")
         )
-        if isinstance(length, float) and isinstance(returned, float) and isinstance(finish, float | None):
-            return RandomBaseline(math.nan if finish is None else finish, length, returned, mdp.step_limit)
-    from runner.planning.evaluation import evaluate_stochastic_policy, random_policy  # loads Numba
+        if isinstance(percent, float | None) and isinstance(length, float) and isinstance(returned, float):
+            return RandomBaseline(math.nan if percent is None else percent, length, returned, mdp.step_limit)
+    from runner.planning.exact import evaluate_stochastic_policy, random_policy  # loads Numba
 
     outcome = evaluate_stochastic_policy(mdp, random_policy(mdp), mdp.rewards.shape[-1], discount=1.0)
     baseline = RandomBaseline(

@@ -14,10 +14,17 @@ from hypothesis import strategies as st
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
-from runner.planning import baseline, evaluation
+from runner.planning import baseline, exact
 from runner.planning.baseline import random_baseline
-from runner.planning.evaluation import evaluate_policy, evaluate_stochastic_policy, random_policy
-from runner.planning.optimum import best_response, best_response_to_stochastic, greedy_policy, optimal_values
+from runner.planning.exact import (
+    best_response,
+    best_response_to_stochastic,
+    evaluate_policy,
+    evaluate_stochastic_policy,
+    greedy_policy,
+    optimal_values,
+    random_policy,
+)
 
 DISCOUNT = 0.9
 
@@ -317,5 +324,5 @@ def test_the_random_baseline_is_computed_once_and_a_damaged_cache_is_not_believe
         baseline._remembered.clear()
         assert baseline.random_baseline(mdp) == computed
     baseline._remembered.clear()
-    monkeypatch.setattr(evaluation, "evaluate_stochastic_policy", None)
+    monkeypatch.setattr(exact, "evaluate_stochastic_policy", None)
     assert baseline.random_baseline(mdp) == computed

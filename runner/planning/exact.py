@@ -1,4 +1,4 @@
-"""The exact return, length and success of a policy from every start state, without playing episodes."""
+"""Exact results without playing episodes: of a policy from every start state, the optimum, best responses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,10 @@ from runner.environments.mdp import Mdp
 from runner.errors import EnvironmentNotUsable
 from runner.planning import kernel
 from runner.planning.kernel import Chain, Paths
-from runner.planning.optimum import (
-    best_response,
-    best_response_to_stochastic,
-    greedy_policy,
-    optimal_values,
-    require_discount,
-    sweep_tolerance,
-)
-from runner.util.arrays import Flags, Floats, Ints, Ints32
+from runner.util.arrays import Flags, Floats, Ints, Ints32, Scalar
 
+TOLERANCE: Final = 1e-10
+"""How far a value may be from the true one."""
 Policy = Ints32 | Sequence[Floats]
 """The joint action of each state; or for each learner the probabilities of its own actions."""
 
@@ -60,8 +54,8 @@ class PolicyOutcome:
 
 
 @dataclass(frozen=True)
-class _Chosen:
-    """The outcomes of the action that a policy chooses in each state, [S, K] each."""
+class _RewardProcess:
+    """The Markov reward process that a policy induces: the outcomes of each state, [S, K] each."""
 
     next_state: Ints32
     probability: Floats
@@ -71,6 +65,9 @@ class _Chosen:
     success: Flags
     penalty: Flags | Floats
     """Whether a step is a penalty; of merged outcomes its probability."""
+
+
+# --- policies -----------------------------------------------------------------------------------------
 
 
 def evaluate_policy(mdp: Mdp, policy: Ints32, learners: int, discount: float) -> PolicyOutcome:
@@ -83,7 +80,7 @@ def evaluate_policy(mdp: Mdp, policy: Ints32, learners: int, discount: float) ->
         policy: [S]: the joint action of each state.
         learners: 1, or the number of agents; each has its own return.
     """
-    return _measured(mdp, _chosen(mdp, policy, learners), discount)
+    return _measured(mdp, _deterministic_process(mdp, policy, learners), discount)
 
 
 def evaluate_stochastic_policy(
@@ -96,7 +93,7 @@ def evaluate_stochastic_policy(
             independently of each other.
         learners: 1, whose actions are the joint ones, or the number of agents.
     """
-    return _measured(mdp, _drawn(mdp, joint_probabilities(policies), learners), discount)
+    return _measured(mdp, _stochastic_process(mdp, joint_probabilities(policies), learners), discount)
 
 
 def policy_values(mdp: Mdp, joint: Floats, learners: int, discount: float) -> Floats:
@@ -109,10 +106,10 @@ def policy_values(mdp: Mdp, joint: Floats, learners: int, discount: float) -> Fl
         learners: 1, or the number of agents; each has its own reward.
     """
     require_discount(discount)
-    chosen = _drawn(mdp, joint, learners)
-    if not _is_certain(chosen):
-        return _stochastic_values(chosen, discount)
-    chain = _chain(chosen)
+    process = _stochastic_process(mdp, joint, learners)
+    if not _is_certain(process):
+        return _stochastic_values(process, discount)
+    chain = _chain(process)
     return _chain_values(chain, kernel.find_paths(chain), discount)
 
 
@@ -139,7 +136,7 @@ def joint_probabilities(policies: Sequence[Floats]) -> Floats:
     )
 
 
-def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> PolicyOutcome:
+def _measured(mdp: Mdp, process: _RewardProcess, discount: float) -> PolicyOutcome:
     if not mdp.step_limit:
         raise EnvironmentNotUsable(
             f"{mdp.env_id}: found no step limit, expected one: without it some episodes never end."
@@ -147,8 +144,8 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> PolicyOutcome:
     starts = np.flatnonzero(mdp.start > 0)
     weights = mdp.start[starts]
     cycles: tuple[Cycle, ...] = ()
-    if _is_certain(chosen):
-        chain = _chain(chosen)
+    if _is_certain(process):
+        chain = _chain(process)
         paths = kernel.find_paths(chain)
         lengths, sums, counts = kernel.play_all(chain, paths, starts, mdp.step_limit)
         timed_out = (paths.cycle[starts] >= 0) | (paths.length[starts] > mdp.step_limit)
@@ -158,14 +155,14 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> PolicyOutcome:
         values = _chain_values(chain, paths, discount)
         cycles = _cycles(paths, starts, weights)
     else:
-        p, penalty = chosen.probability, chosen.penalty
-        gains = np.column_stack([np.ones(len(p)), (p * penalty).sum(axis=1), _expected_rewards(chosen)])
-        after, ends, success = chosen.next_state, chosen.terminated, chosen.success
+        p, penalty = process.probability, process.penalty
+        gains = np.column_stack([np.ones(len(p)), (p * penalty).sum(axis=1), _expected_rewards(process)])
+        after, ends, success = process.next_state, process.terminated, process.success
         chances, expected = kernel.expect(after, p, ends, success, gains, mdp.step_limit)
         succeeded, ended = _means(chances[starts], weights)
         success_percent, timeout_percent = 100 * succeeded, 100 * (1 - ended)
         totals = expected[starts]
-        values = _stochastic_values(chosen, discount)
+        values = _stochastic_values(process, discount)
     length, penalties, *returns = _means(totals, weights)
     return PolicyOutcome(
         starts=len(starts),
@@ -179,16 +176,16 @@ def _measured(mdp: Mdp, chosen: _Chosen, discount: float) -> PolicyOutcome:
     )
 
 
-def _is_certain(chosen: _Chosen) -> bool:
+def _is_certain(process: _RewardProcess) -> bool:
     """Return whether each state has one outcome; merged outcomes may be penalties by chance."""
-    only_one = ((chosen.probability > 0).sum(axis=1) == 1).all()
-    return bool(only_one and np.isin(chosen.penalty, (0, 1)).all())
+    only_one = ((process.probability > 0).sum(axis=1) == 1).all()
+    return bool(only_one and np.isin(process.penalty, (0, 1)).all())
 
 
-def _chosen(mdp: Mdp, policy: Ints32, learners: int) -> _Chosen:
-    """Return the outcomes of each state under a deterministic policy."""
+def _deterministic_process(mdp: Mdp, policy: Ints32, learners: int) -> _RewardProcess:
+    """Return the process that a deterministic policy induces."""
     rows = np.arange(mdp.states)
-    return _Chosen(
+    return _RewardProcess(
         mdp.next_state[rows, policy],
         mdp.probability[rows, policy],
         mdp.rewards_of(learners)[rows, policy],
@@ -198,15 +195,15 @@ def _chosen(mdp: Mdp, policy: Ints32, learners: int) -> _Chosen:
     )
 
 
-def _drawn(mdp: Mdp, joint: Floats, learners: int) -> _Chosen:
-    """Return the outcomes of each state under a policy that draws, [S, J]."""
+def _stochastic_process(mdp: Mdp, joint: Floats, learners: int) -> _RewardProcess:
+    """Return the process that a policy induces which draws with these probabilities, [S, J]."""
     if ((joint > 0).sum(axis=1) == 1).all():
-        return _chosen(mdp, joint.argmax(axis=1).astype(np.int32), learners)
+        return _deterministic_process(mdp, joint.argmax(axis=1).astype(np.int32), learners)
     return _merged(mdp, joint[..., None] * mdp.probability, learners)
 
 
-def _merged(mdp: Mdp, probability: Floats, learners: int) -> _Chosen:
-    """Return the outcomes of each state under a policy that draws, [S, J, K] as [S, K'].
+def _merged(mdp: Mdp, probability: Floats, learners: int) -> _RewardProcess:
+    """Return the process of outcomes with these probabilities, [S, J, K], as [S, K'].
 
     Outcomes that lead to the same state are merged, with the mean of their rewards: of 36 joint actions of
     two taxis many do, and every outcome takes time at every step of an episode.
@@ -229,7 +226,7 @@ def _merged(mdp: Mdp, probability: Floats, learners: int) -> _Chosen:
     total = np.bincount(group, chance)
     rewards = mdp.rewards_of(learners)[at]
     penalty = mdp.summed_rewards[at] < mdp.penalty_below
-    return _Chosen(
+    return _RewardProcess(
         padded(mdp.next_state[at][first]),
         padded(total),
         padded(np.stack([np.bincount(group, chance * own) / total for own in rewards.T], axis=1)),
@@ -239,14 +236,14 @@ def _merged(mdp: Mdp, probability: Floats, learners: int) -> _Chosen:
     )
 
 
-def _chain(chosen: _Chosen) -> Chain:
-    only = np.arange(len(chosen.next_state)), chosen.probability.argmax(axis=1)
+def _chain(process: _RewardProcess) -> Chain:
+    only = np.arange(len(process.next_state)), process.probability.argmax(axis=1)
     return Chain(
-        chosen.next_state[only].astype(np.int64),
-        np.ascontiguousarray(chosen.rewards[only]),
-        chosen.terminated[only],
-        chosen.success[only],
-        chosen.penalty[only],
+        process.next_state[only].astype(np.int64),
+        np.ascontiguousarray(process.rewards[only]),
+        process.terminated[only],
+        process.success[only],
+        process.penalty[only],
     )
 
 
@@ -260,19 +257,19 @@ def _chain_values(chain: Chain, paths: Paths, discount: float) -> Floats:
     return values
 
 
-def _stochastic_values(chosen: _Chosen, discount: float) -> Floats:
+def _stochastic_values(process: _RewardProcess, discount: float) -> Floats:
     """Return the discounted values of outcomes by chance, [S, L]; nan for a discount of 1."""
-    rewards = _expected_rewards(chosen)
+    rewards = _expected_rewards(process)
     values = np.full_like(rewards, np.nan)
     if discount < 1:
         values[:] = 0.0
-        weight = discount * chosen.probability * ~chosen.terminated
-        kernel.discounted(chosen.next_state, weight, rewards, values, sweep_tolerance(discount))
+        weight = discount * process.probability * ~process.terminated
+        kernel.discounted(process.next_state, weight, rewards, values, sweep_tolerance(discount))
     return values
 
 
-def _expected_rewards(chosen: _Chosen) -> Floats:
-    return np.asarray((chosen.probability[..., None] * chosen.rewards).sum(axis=1))
+def _expected_rewards(process: _RewardProcess) -> Floats:
+    return np.asarray((process.probability[..., None] * process.rewards).sum(axis=1))
 
 
 def _cycles(paths: Paths, starts: Ints, weights: Floats) -> tuple[Cycle, ...]:
@@ -302,6 +299,116 @@ def _mean(values: Floats | Flags, weights: Floats) -> float:
 def _means(columns: Floats, weights: Floats) -> tuple[float, ...]:
     """Return the weighted mean of each column of [N, C]."""
     return tuple(_mean(column, weights) for column in columns.T)
+
+
+# --- the optimum, and best responses ------------------------------------------------------------------
+
+
+def optimal_values(mdp: Mdp, discount: float) -> Floats:
+    """Return what all agents together can get at most from each state, [S], to within 1e-10.
+
+    Value iteration, in place: Sutton and Barto, Reinforcement Learning, 2nd edition, section 4.4. The
+    horizon is infinite: an episode that the environment cuts off counts as if it went on.
+    """
+    weight = _weight(mdp, discount)
+    reward = (mdp.probability * mdp.summed_rewards).sum(axis=-1)
+    return _iterated(mdp.next_state, weight, reward, discount)
+
+
+def greedy_policy(mdp: Mdp, discount: float, values: Floats) -> Ints32:
+    """Return the joint action that leads to the most of these values, [S]; the first of equals.
+
+    Values that differ by rounding only count as equal.
+    """
+    reward = (mdp.probability * mdp.summed_rewards).sum(axis=-1)
+    worth = reward + (_weight(mdp, discount) * values[mdp.next_state]).sum(axis=-1)
+    close = worth >= worth.max(axis=1, keepdims=True) - 1e-8
+    return np.asarray(close.argmax(axis=1), np.int32)
+
+
+def best_response(mdp: Mdp, policy: Ints32, learner: int, learners: int, discount: float) -> Floats:
+    """Return what one learner can get at most from each state while all others keep to a policy, [S].
+
+    Args:
+        policy: [S]: the joint action of each state.
+        learner: whose own action is free, and whose reward counts.
+        learners: how many there are; 1 is all agents together, whose best response is the optimum.
+    """
+    widths = mdp.action_counts if learners > 1 else (mdp.joint_actions,)
+    stride = int(np.prod(widths[learner + 1 :], dtype=np.int64))
+    own = policy // stride % widths[learner]
+    joint = (policy - own * stride)[:, None] + np.arange(widths[learner]) * stride
+    rows = np.arange(mdp.states)[:, None]
+    reward = (mdp.probability * mdp.rewards_of(learners)[..., learner]).sum(axis=-1)
+    weight = _weight(mdp, discount)[rows, joint]
+    return _iterated(mdp.next_state[rows, joint], weight, reward[rows, joint], discount)
+
+
+def best_response_to_stochastic(
+    mdp: Mdp, policies: Sequence[Floats], learner: int, discount: float
+) -> Floats:
+    """Return what one learner can get at most from each state while all others draw from their policies, [S].
+
+    Args:
+        policies: one a learner, [S, n]: the probability of each of its own actions; a single one is over
+            joint actions, and its best response is the optimum.
+        learner: whose own action is free, and whose reward counts.
+    """
+    widths = tuple(policy.shape[1] for policy in policies)
+    states, outcomes = mdp.states, mdp.probability.shape[2]
+
+    def by_own_action(array: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Return [S, J, K] as [S, own action, others' joint actions and outcomes]."""
+        parts = np.moveaxis(array.reshape(states, *widths, outcomes), 1 + learner, 1)
+        return parts.reshape(states, widths[learner], -1)
+
+    others: Floats = np.ones((states, 1))
+    for number, policy in enumerate(policies):
+        if number != learner:
+            others = (others[:, :, None] * policy[:, None, :]).reshape(states, -1)
+    chance = np.repeat(others, outcomes, axis=1)[:, None, :]
+    reward = chance * by_own_action(mdp.probability * mdp.rewards_of(len(policies))[..., learner])
+    weight = chance * by_own_action(_weight(mdp, discount))
+    return _iterated(by_own_action(mdp.next_state), weight, reward.sum(axis=-1), discount)
+
+
+def require_discount(discount: float) -> None:
+    """Refuse a discount with which an infinite process may have no value.
+
+    Raises:
+        EnvironmentNotUsable: it is not below 1.
+    """
+    if not 0 <= discount < 1:
+        raise EnvironmentNotUsable(
+            f"found discount {discount}, expected one from 0 up to below 1: "
+            "else a process without an end has no value."
+        )
+
+
+def sweep_tolerance(discount: float) -> float:
+    """Return by how much the last sweep may change a value so that all are within the tolerance."""
+    return TOLERANCE * (1 - discount) / max(discount, 0.5)
+
+
+def _weight(mdp: Mdp, discount: float) -> Floats:
+    """Return the discounted probability [S, J, K] that an outcome comes and the episode goes on."""
+    require_discount(discount)
+    return np.asarray(discount * mdp.probability * ~mdp.terminated)
+
+
+def _iterated(next_state: Ints32, weight: Floats, reward: Floats, discount: float) -> Floats:
+    values = np.zeros(len(next_state))
+    kernel.iterate_values(
+        np.ascontiguousarray(next_state),
+        np.ascontiguousarray(weight),
+        np.ascontiguousarray(reward),
+        values,
+        sweep_tolerance(discount),
+    )
+    return values
+
+
+# --- all measures of an evaluation --------------------------------------------------------------------
 
 
 class ExactEvaluator:
