@@ -7,16 +7,19 @@ The scalars are those of YAML 1.2's core schema, which editors use too: `1e-3` i
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import yaml
 
-from runner.config.values import MAX_DEPTH, Path
 from runner.errors import ConfigError, shortened
 from runner.util.yaml_text import INT, SCALARS, TAG
 
+Path = tuple[str | int, ...]
+"""The place of a value in a configuration: keys and list positions from the top."""
+MAX_DEPTH = 50
+"""The deepest nesting of values, which also stops a value that contains itself."""
 MAX_NODES = 100_000
 """The most values of a text, with its aliases expanded."""
 
@@ -55,6 +58,24 @@ class Document:
         keys = tuple(map(str, path))
         around = (self.places.get(keys[:length]) for length in range(len(keys), -1, -1))
         return next((place for place in around if place), None)
+
+
+def value_at(value: object, path: Path) -> object:
+    """Return the value at a path, whose list positions may be text; None if there is none."""
+    for part in path:
+        if isinstance(value, Mapping):
+            value = value.get(part)
+        elif isinstance(value, list | tuple) and (at := position_in(value, part)) is not None:
+            value = value[at]
+        else:
+            return None
+    return value
+
+
+def position_in(items: Sequence[object], part: str | int) -> int | None:
+    """Return a part of a path as a position in `items`, if it is one."""
+    text = str(part)
+    return int(text) if text.isascii() and text.isdecimal() and int(text) < len(items) else None
 
 
 class _Loader(yaml.SafeLoader):

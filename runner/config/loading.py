@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from runner.config.document import Document, Place, Problem, read_yaml
+from runner.config.document import MAX_DEPTH, Document, Path, Place, Problem, position_in, read_yaml, value_at
 from runner.config.model import (
     EXPLORATION,
     LEARNERS,
@@ -26,9 +26,8 @@ from runner.config.model import (
     Tables,
 )
 from runner.config.schema import found, problems_in, refuse, schema_at
-from runner.config.sections import RecordingSection
+from runner.config.sections import ConfigSection, RecordingSection
 from runner.config.shipped import config_path, suggestion
-from runner.config.values import MAX_DEPTH, ConfigSection, Path, position_in, value_at
 from runner.errors import ConfigError, shortened
 from runner.util.humanize import size
 from runner.util.packing import Packing

@@ -18,6 +18,7 @@ from runner.config.sections import (
     Algorithm,
     AlgorithmSection,
     BranchSection,
+    ConfigSection,
     Environment,
     EvaluationSection,
     Exploration,
@@ -25,6 +26,7 @@ from runner.config.sections import (
     InitialTable,
     Log,
     NStep,
+    Optional,
     Probability,
     Quirks,
     RecordingSection,
@@ -32,8 +34,8 @@ from runner.config.sections import (
     Snapshots,
     StepSize,
     WolfPhc,
+    refusal,
 )
-from runner.config.values import ConfigSection, Optional, refusal
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
 from runner.util.yaml_text import write_yaml
 

@@ -11,9 +11,9 @@ from typing import Any, Final
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from runner.config.document import Document, Place, Problem
+from runner.config.document import Document, Path, Place, Problem, value_at
 from runner.config.model import KEYS, SECTION_OF, ExperimentFile
-from runner.config.values import REFUSED, Path, value_at
+from runner.config.sections import REFUSED
 from runner.errors import ConfigError, ConfigProblem, RunnerError, nearest, shortened
 from runner.util.values import Json, JsonView
 

@@ -87,7 +87,7 @@ def mdp_of(env: Any, kwargs: JsonView) -> Mdp:
 
 def _read(env_id: str, kwargs: JsonView, env: Any, rewards: str) -> Mdp:
     """Return the attributes of an environment, not yet checked; a team shares the summed reward."""
-    from runner.config.values import plain  # reading a recording needs none of it
+    from runner.config.sections import plain  # reading a recording needs none of it
 
     base = env.unwrapped
     limit = env.spec.max_episode_steps if env.spec is not None else None

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 
 from runner.config import ExperimentConfig, from_mapping
 from runner.config.model import SECTION_OF, Name, Seed, SeveralSeeds
-from runner.config.values import ConfigSection, Count, refusal
+from runner.config.sections import ConfigSection, Count, refusal
 from runner.util.values import Json, JsonView
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from gymnasium.envs.toy_text.taxi import TaxiEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from runner.config.values import frozen
+from runner.config.sections import frozen
 from runner.environments.loading import load_mdp
 from runner.environments.mdp import Mdp, from_parts
 from runner.errors import EnvironmentNotUsable
