@@ -27,7 +27,7 @@ from runner.config.loading import recorded_packing
 from runner.errors import ConfigError, RecordingError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Copied
 from runner.loops.extras import ExtrasWriter
-from runner.loops.outcomes import Outcomes
+from runner.loops.messages import Outcomes
 from runner.loops.shard_sources import PHASES, UNIT, Source, open_sources
 from runner.loops.step_buffer import StepBuffer
 from runner.recording import schema

@@ -19,8 +19,8 @@ from runner.config.model import NOT_CONTENT
 from runner.errors import ConfigError, RunnerError, StorageError, truncated_message
 from runner.loops.description import Described
 from runner.loops.fold import OWNER_WAITS, fold_if_over
+from runner.loops.messages import Outcomes
 from runner.loops.options import Options
-from runner.loops.outcomes import Outcomes
 from runner.recording import schema
 from runner.recording.gym_spaces import recorded_space
 from runner.recording.maker import EnvironmentMaker

@@ -1,12 +1,13 @@
-"""What a loop records besides its steps: logged numbers and texts, arrays, infos and pictures."""
+"""What a loop records besides its steps: logged values, arrays, infos, pictures; and its last results."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
@@ -14,21 +15,26 @@ from typing import Any, Final, NamedTuple, Protocol
 import numpy as np
 
 from runner.drawing.raster import image_bytes
-from runner.errors import ConfigError, shortened
+from runner.environments.mdp import Mdp
+from runner.errors import ConfigError, RecordingError, shortened
 from runner.loops.media import Picture, media_of
 from runner.loops.options import ALL_INFO, Options, pillow
-from runner.loops.outcomes import Outcomes
 from runner.loops.step_buffer import StepBuffer
-from runner.loops.values import MAX_ARRAY_BYTES, arrays_of, check_log_name, logged_number, numbers_of
+from runner.loops.values import numbers_of
 from runner.recording import schema
+from runner.recording.gym_values import only_number
 from runner.recording.messages import encode, encode_image, encode_log, frame_id, scalar_encoder
+from runner.recording.metrics import METRICS, RECENT_EPISODES, defined_metrics, finite_mean
 from runner.recording.recorder import Recorder
 from runner.recording.schema import STEP_NANOSECONDS, Topic, topics_of
 from runner.runs.checkpoints import MAX_CHECKPOINTS, MAX_NAME_LENGTH, Store, is_checkpoint_name
+from runner.util.arrays import Array, Floats, Records
 from runner.util.extras import require
-from runner.util.jsonable import as_json, exact_json, is_exact, is_packed, packed
-from runner.util.values import flatten, is_utf8
+from runner.util.jsonable import as_json, as_mapping, exact_json, is_exact, is_packed, packed
+from runner.util.packing import MAX_CHUNK_BYTES
+from runner.util.values import Json, flatten, is_utf8
 
+MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 MAX_INFO_BYTES: Final = 4 << 20
 """The most bytes of JSON for the info of one step."""
 _MAX_WAITING: Final = 1024
@@ -37,21 +43,12 @@ _MAX_SERIES: Final = 4096
 """The most names of logged numbers with encoders at hand."""
 _LONG_NAME: Final = 200
 """Numbers under longer names do not wait, because together they would be large."""
-
-
-def _info_text(value: Any, limit: int) -> str:
-    """Return a field of an info as JSON of at most `limit` bytes."""
-    text = ""
-    is_array = is_packed(value)
-    if is_array and value.nbytes <= limit:
-        array = packed(value)
-        data = array.pop("base64")  # has nothing to escape, so the encoder need not look at it
-        text = f'{json.dumps(array)[:-1]}, "base64": "{data}"' + "}"
-    elif not is_array:
-        text = json.dumps(as_json(value, packs=True))
-    if not 0 < len(text) <= limit:
-        raise ValueError(f"it takes more than {MAX_INFO_BYTES:,} bytes of JSON")
-    return text
+_MAX_KEYS: Final = 1 << 20
+"""The most arrays in a checkpoint."""
+_MAX_SUMMARY_NAMES: Final = 64
+"""The most names with their last logged value in a summary."""
+_MAX_SUMMARY_TRIALS: Final = 1 << 17
+"""The most trials of an evaluation that are in a summary, the last ones."""
 
 
 class LoopState(Protocol):
@@ -117,12 +114,12 @@ class Messages:
                 if isinstance(content, Picture):
                     self.picture(name, content)
                 else:
-                    check_log_name(name, value)
+                    _check_log_name(name, value)
                     self.snapshot(phase, name, content)
                 return
-            value = logged_number(name, value)
+            value = _logged_number(name, value)
             if series is None:
-                check_log_name(name, value)
+                _check_log_name(name, value)
                 self.has_logged = True
                 if len(self._series) == _MAX_SERIES:  # a loop with names without end
                     self._series.clear()
@@ -148,7 +145,7 @@ class Messages:
                 self._outcomes.take_logged(name, value)
 
     def _log_text(self, name: str, text: str) -> None:
-        check_log_name(name, text)
+        _check_log_name(name, text)
         if not is_utf8(text):
             raise ConfigError(f"log: found {text!r} for {name!r}, expected text that is valid Unicode")
         if len(text) > MAX_ARRAY_BYTES // 4:
@@ -165,7 +162,7 @@ class Messages:
 
     def snapshot(self, phase: str, name: str, array: object) -> None:
         """Record an array of numbers, or all arrays of a mapping, as they are now."""
-        arrays = dict(arrays_of(name, array))
+        arrays = dict(_arrays_of(name, array))
         with self._loop.lock:
             if not self._loop.records():
                 return
@@ -187,7 +184,7 @@ class Messages:
             if not self._loop.records():
                 return ""
             step, episode = self._loop.rows(phase).progress
-        content, kind = content_of(name, value, pickle)
+        content, kind = checkpoint_content(name, value, pickle)
         digest, size = Store(self._run_folder.parent).put(self._run_folder.name, content)
         fields = {"name": name, "phase": phase, "step": step, "episode": episode}
         fields |= {"digest": digest, "size": size, "format": kind}
@@ -273,7 +270,7 @@ class Messages:
 
     def picture(self, name: str, picture: Picture) -> None:
         """Record a picture or a film under a name, at this moment; another thread encodes it."""
-        check_log_name(name, "a picture")
+        _check_log_name(name, "a picture")
         pillow()
         with self._loop.lock:
             if self._loop.records():
@@ -286,10 +283,73 @@ class Messages:
         self._recorder.submit(topic, lambda: encode_image(encoded(), kind, position, name), position)
 
 
-_MAX_KEYS: Final = 1 << 20
+def _logged_number(name: str, value: Any) -> float:
+    """Return a logged number, which may stand in an array of one.
+
+    Raises:
+        ConfigError: it is not a number.
+    """
+    try:
+        if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch
+            value = detach()
+        is_array = np.size(value) == 1 and np.ndim(value)
+        return float(only_number(value, name) if is_array else value)
+    except (TypeError, ValueError, OverflowError, RuntimeError, RecordingError) as error:
+        raise ConfigError(
+            f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, "
+            "text, an array of numbers or a picture."
+        ) from error
 
 
-def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
+def _check_log_name(name: object, value: object) -> None:
+    """Refuse a name that a logged value cannot have.
+
+    Raises:
+        ConfigError: it is empty, or not text.
+    """
+    if name == "":
+        raise ConfigError(f"log: found an empty name for {value!r}, expected a name that is not empty")
+    if not isinstance(name, str) or not is_utf8(name):
+        raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
+
+
+def _arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
+    """Yield the arrays of a snapshot: the value itself, or the arrays of a mapping as `name/key`.
+
+    Raises:
+        ConfigError: a value holds something else than numbers, or too many.
+    """
+    if not isinstance(name, str) or not is_utf8(name):
+        raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
+    if (inside := as_mapping(value)) is not None:
+        for key, part in inside.items():
+            yield from _arrays_of(f"{name}/{key}", part)
+        return
+    values = numbers_of(value, "snapshot", f"for {name!r}", "an array of numbers")
+    if values.nbytes > MAX_ARRAY_BYTES:
+        raise ConfigError(
+            f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
+            f"{MAX_ARRAY_BYTES:,}; record it in parts."
+        )
+    yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
+
+
+def _info_text(value: Any, limit: int) -> str:
+    """Return a field of an info as JSON of at most `limit` bytes."""
+    text = ""
+    is_array = is_packed(value)
+    if is_array and value.nbytes <= limit:
+        array = packed(value)
+        data = array.pop("base64")  # has nothing to escape, so the encoder need not look at it
+        text = f'{json.dumps(array)[:-1]}, "base64": "{data}"' + "}"
+    elif not is_array:
+        text = json.dumps(as_json(value, packs=True))
+    if not 0 < len(text) <= limit:
+        raise ValueError(f"it takes more than {MAX_INFO_BYTES:,} bytes of JSON")
+    return text
+
+
+def checkpoint_content(name: str, value: object, pickle: bool) -> tuple[bytes | memoryview | Path, str]:
     """Return the content of a checkpoint, and its format.
 
     Args:
@@ -329,7 +389,10 @@ def content_of(name: str, value: object, pickle: bool) -> tuple[bytes | memoryvi
 
 def _safetensors(name: str, values: Mapping[str, Any]) -> bytes:
     if not 0 < len(values) <= _MAX_KEYS:
-        raise ConfigError(f"checkpoint: found {len(values):,} arrays for {name!r}, expected at least one")
+        raise ConfigError(
+            f"checkpoint: found {len(values):,} arrays for {name!r}, expected at least one, and at most "
+            f"{_MAX_KEYS:,}"
+        )
     torch = sys.modules.get("torch")
     is_torch = torch is not None and all(isinstance(value, torch.Tensor) for value in values.values())
     module = "safetensors.torch" if is_torch else "safetensors.numpy"
@@ -342,3 +405,68 @@ def _safetensors(name: str, values: Mapping[str, Any]) -> bytes:
         for key, value in values.items()
     }
     return bytes(save(arrays))
+
+
+class Outcomes:
+    """Returns and lengths of the last training episodes and of the last evaluation, and logged values.
+
+    `summary` returns what `runner.analysis.evaluations.loop_summary` computes from a whole recording.
+    """
+
+    def __init__(self, mdp: Mdp | None) -> None:
+        has_success = mdp is not None and bool(mdp.success_events)
+        has_penalties = mdp is not None and math.isfinite(mdp.penalty_below)
+        self._defined = defined_metrics(has_success, has_penalties)
+        self._trained = 0
+        self._recent = np.empty((0, 2))
+        """[episodes, 2]: returns and lengths of the last training episodes."""
+        self._evaluated_after = -1
+        self._trials = 0
+        """Number of trials of the last evaluation."""
+        self._values: dict[str, Floats] = {}
+        """Values of those trials, summed over agents, by metric."""
+        self._logged: dict[str, float | None] = {}
+
+    def take_episodes(self, topic: Topic, records: Records) -> None:
+        """Add episodes that the recorder gets."""
+        if topic.phase == "train":
+            self._trained += len(records)
+            last = records[-RECENT_EPISODES:]
+            results = np.column_stack([last["returns"].sum(axis=1), last["length"]])
+            self._recent = np.concatenate([self._recent, results])[-RECENT_EPISODES:]
+        else:
+            if self._evaluated_after != self._trained:
+                self._evaluated_after = self._trained
+                self._trials = 0
+                self._values = {}
+            self._trials += len(records)
+            for metric in self._defined:
+                values = metric.of_trials(records).astype(np.float64)
+                values = values.sum(axis=1) if metric.per_agent else values
+                before = self._values.get(metric.name, np.empty(0))
+                self._values[metric.name] = np.concatenate([before, values])[-_MAX_SUMMARY_TRIALS:]
+
+    def take_logged(self, name: str, value: float) -> None:
+        """Add a logged value."""
+        if name in self._logged or len(self._logged) < _MAX_SUMMARY_NAMES:
+            self._logged[name] = value if math.isfinite(value) else None
+
+    def summary(self) -> Json:
+        """Return `last_evaluation`, `recent_training` and `logged`, as JSON can hold them."""
+        returns, lengths = self._recent.T
+        return {
+            "last_evaluation": self._evaluation(),
+            "recent_training": {
+                "episodes": len(self._recent),
+                "mean_length": finite_mean(lengths),
+                "mean_return": finite_mean(returns),
+            },
+            "logged": self._logged,
+        }
+
+    def _evaluation(self) -> Json | None:
+        if not self._trials:
+            return None
+        unknown = np.empty(0)
+        values = {metric.name: metric.of_usable(self._values.get(metric.name, unknown)) for metric in METRICS}
+        return {"episode": self._evaluated_after, "trials": self._trials, **values}

@@ -1,26 +1,21 @@
-"""Values on their way into a recording, checked: rewards, logged numbers, arrays."""
+"""Values as a loop gives them: copied, converted to arrays, or refused."""
 
 from __future__ import annotations
 
 import copy
 import sys
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from runner.errors import ConfigError, RecordingError
+from runner.errors import ConfigError
 from runner.recording import schema
-from runner.recording.gym_values import SCALARS, only_number
+from runner.recording.gym_values import SCALARS
 from runner.recording.spaces import Value
 from runner.util.arrays import Array
-from runner.util.jsonable import as_mapping
-from runner.util.packing import MAX_CHUNK_BYTES
-from runner.util.values import is_utf8
 
-MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 _PACKAGE: Final = str(Path(__file__).parents[1])
 UNCHANGEABLE: Final = frozenset((bool, int, float, str, type(None), *SCALARS))
 """Classes of values that nobody can change in place."""
@@ -39,57 +34,6 @@ def as_given(action: Value) -> Value:
         return copy.deepcopy(action)
     except Exception:  # such as a tensor with a gradient: it is recorded, or refused, as it is after the step
         return action
-
-
-def logged_number(name: str, value: Any) -> float:
-    """Return a logged number, which may stand in an array of one.
-
-    Raises:
-        ConfigError: it is not a number.
-    """
-    try:
-        if callable(detach := getattr(value, "detach", None)):  # a tensor of PyTorch
-            value = detach()
-        is_array = np.size(value) == 1 and np.ndim(value)
-        return float(only_number(value, name) if is_array else value)
-    except (TypeError, ValueError, OverflowError, RuntimeError, RecordingError) as error:
-        raise ConfigError(
-            f"log: found {type(value).__name__} for {name!r}, expected a number that a float64 holds, "
-            "text, an array of numbers or a picture."
-        ) from error
-
-
-def check_log_name(name: object, value: object) -> None:
-    """Refuse a name that a logged value cannot have.
-
-    Raises:
-        ConfigError: it is empty, or not text.
-    """
-    if name == "":
-        raise ConfigError(f"log: found an empty name for {value!r}, expected a name that is not empty")
-    if not isinstance(name, str) or not is_utf8(name):
-        raise ConfigError(f"log: found the name {name!r} for {value!r}, expected text that is valid Unicode")
-
-
-def arrays_of(name: str, value: object) -> Iterator[tuple[str, Array]]:
-    """Yield the arrays of a snapshot: the value itself, or the arrays of a mapping as `name/key`.
-
-    Raises:
-        ConfigError: a value holds something else than numbers, or too many.
-    """
-    if not isinstance(name, str) or not is_utf8(name):
-        raise ConfigError(f"snapshot: found the name {name!r}, expected an array of numbers and a name.")
-    if (inside := as_mapping(value)) is not None:
-        for key, part in inside.items():
-            yield from arrays_of(f"{name}/{key}", part)
-        return
-    values = numbers_of(value, "snapshot", f"for {name!r}", "an array of numbers")
-    if values.nbytes > MAX_ARRAY_BYTES:
-        raise ConfigError(
-            f"snapshot: found {values.nbytes:,} bytes for {name!r}, expected at most "
-            f"{MAX_ARRAY_BYTES:,}; record it in parts."
-        )
-    yield name, values.astype(values.dtype.newbyteorder("<"), copy=False)
 
 
 def numbers_of(value: object, where: str, purpose: str, expected: str) -> Array:
