@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.analysis.episodes import STEP, EpisodeRef, StepLike
-from runner.environments.games import is_game
+from runner.environments.interfaces import is_game
 from runner.errors import CannotRedo, ConfigError, RunnerError
 from runner.execution.branching import TrainingBranch, branch_training
 from runner.loops.actions import Names, action_in_words, action_names, parsed_action

@@ -18,7 +18,7 @@ from typing import Any, Final, Unpack
 
 import numpy as np
 
-from runner.environments.games import MultiAgent
+from runner.environments.interfaces import MultiAgent
 from runner.errors import EnvironmentNotUsable, RunnerError, truncated_message
 from runner.integrations.libraries import OF_THE_RUN, Callback, as_setting, require_tested
 from runner.integrations.shapes import as_run_name

@@ -20,7 +20,7 @@ from gymnasium.wrappers import HumanRendering, OrderEnforcing, PassiveEnvChecker
 from gymnasium.wrappers.vector import HumanRendering as VectorHumanRendering
 from gymnasium.wrappers.vector import RecordVideo as VectorRecordVideo
 
-from runner.environments.layers import class_name, creator_of, name_of
+from runner.environments.interfaces import class_name, creator_of, name_of
 from runner.recording.maker import FUNCTION_NAME
 from runner.replay.scripts import MAIN
 from runner.replay.trust import is_left_out

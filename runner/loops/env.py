@@ -11,16 +11,17 @@ from typing import Any, Literal, Unpack
 import gymnasium
 from gymnasium.vector import VectorEnv
 
-from runner.environments.games import (
+from runner.environments.gym_types import Env, Info, ResetOptions, ResetResult, StepResult
+from runner.environments.interfaces import (
     ByAgent,
     GameStepResult,
     Turns,
+    class_name,
     game_spaces,
     is_game,
     is_in_turns,
+    layers_of,
 )
-from runner.environments.gym_types import Env, Info, ResetOptions, ResetResult, StepResult
-from runner.environments.layers import class_name, layers_of
 from runner.environments.mdp import MAX_AGENTS
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe

@@ -22,9 +22,16 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, VectorActionWrapper
 from gymnasium.wrappers import OrderEnforcing
 
-from runner.environments.games import MultiAgent, Turns
 from runner.environments.gym_types import AnyVectorEnv
-from runner.environments.layers import class_name, layers_of, name_of, spaces_of_one, top_package
+from runner.environments.interfaces import (
+    MultiAgent,
+    Turns,
+    class_name,
+    layers_of,
+    name_of,
+    spaces_of_one,
+    top_package,
+)
 from runner.errors import ConfigError
 from runner.loops.actions import action_names
 from runner.loops.arguments import (

@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.environments.games import game_spaces, is_game
+from runner.environments.interfaces import game_spaces, is_game
 from runner.errors import CannotRedo, ConfigError, RecordingError, RunnerError
 from runner.export.minari import episodes_in
 from runner.loops.env import record_alone

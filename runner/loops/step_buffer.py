@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode
 
-from runner.environments.layers import final_observations
+from runner.environments.interfaces import final_observations
 from runner.environments.mdp import step_counts
 from runner.errors import RecordingError
 from runner.loops.description import Copied, Described

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv, VectorWrapper
 
 from runner.environments.gym_types import AnyVectorEnv, Info, ResetOptions, ResetResult, VectorStepResult
-from runner.environments.layers import class_name, layers_of, spaces_of_one
+from runner.environments.interfaces import class_name, layers_of, spaces_of_one
 from runner.errors import ConfigError, EnvironmentNotUsable
 from runner.loops.description import Described, describe
 from runner.loops.generators import GeneratorWatch, States, vector_watch

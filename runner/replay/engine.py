@@ -11,7 +11,7 @@ from typing import Final, Self
 
 import numpy as np
 
-from runner.environments.games import as_parallel, is_game
+from runner.environments.interfaces import as_parallel, is_game
 from runner.errors import CannotRedo, shortened
 from runner.recording import schema
 from runner.recording.maker import EnvironmentMaker

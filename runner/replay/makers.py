@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 from msgspec import Meta
 
-from runner.environments.games import as_parallel
-from runner.environments.layers import class_name, creator_of, layers_of, name_of
+from runner.environments.interfaces import as_parallel, class_name, creator_of, layers_of, name_of
 from runner.errors import CannotRedo, RecordingError, shortened
 from runner.recording import schema
 from runner.recording.description import environment_count

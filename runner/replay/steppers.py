@@ -14,9 +14,8 @@ from gymnasium import spaces
 from gymnasium.vector.utils import concatenate, create_empty_array
 from numpy.typing import NDArray
 
-from runner.environments.games import game_spaces
 from runner.environments.gym_types import Space
-from runner.environments.layers import final_observations, spaces_of_one
+from runner.environments.interfaces import final_observations, game_spaces, spaces_of_one
 from runner.errors import CannotRedo, shortened
 from runner.recording.gym_spaces import recorded_space, value_of
 from runner.recording.gym_values import LeafValues, SpaceValues, StateValues, element_of, filler

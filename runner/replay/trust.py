@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from runner.environments.layers import name_of, top_package
+from runner.environments.interfaces import name_of, top_package
 from runner.errors import CannotRedo
 from runner.recording.maker import EnvironmentMaker
 from runner.replay.scripts import MAIN, script_of_run, why_not_defined

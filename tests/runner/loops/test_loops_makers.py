@@ -22,7 +22,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 import runner
 from runner.analysis.episodes import EpisodeRef
 from runner.cli.episode import ShownEpisode
-from runner.environments.layers import name_of
+from runner.environments.interfaces import name_of
 from runner.errors import ConfigError, RecordingError
 from runner.execution.verify import verify
 from runner.export.pictures import describer
