@@ -20,7 +20,7 @@ import time
 import traceback
 import types
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from multiprocessing import process
+from multiprocessing import process, resource_tracker
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
@@ -123,7 +123,8 @@ def starting_processes(with_main: bool = True, hash_seed: int | None = None) -> 
         if not with_main or not _is_guarded(main):
             sys.modules["__main__"] = types.ModuleType("__main__")
         try:
-            yield
+            with _interrupts_blocked():
+                yield
         except EOFError as error:  # the fork server could not open what it needs
             raise OSError(errno.EMFILE, os.strerror(errno.EMFILE)) from error
         finally:
@@ -133,6 +134,23 @@ def starting_processes(with_main: bool = True, hash_seed: int | None = None) -> 
                     del os.environ[name]
                 else:
                     os.environ[name] = value
+
+
+@contextlib.contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Start processes in the block that Ctrl-C, which reaches every process of a terminal, does not stop.
+
+    A fork server imports modules for a second before it ignores the signal itself.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    resource_tracker.ensure_running()  # or its start, which the first process causes, unblocks the signal
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _is_guarded(main: types.ModuleType) -> bool:

@@ -124,6 +124,26 @@ def test_a_fork_server_that_is_killed_while_a_process_starts_is_replaced():
     assert (done.stdout, done.stderr) == ("first\nsecond\n", "")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no fork server on Windows")
+def test_ctrl_c_does_not_stop_a_fork_server_that_is_importing(tmp_path):
+    (tmp_path / "slow.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from runner.util.processes import process_context, start_process\n"
+        "if __name__ == '__main__':\n"
+        "    start_process(process_context(['slow']), print, 'started').join()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, script],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.stdout, done.stderr) == ("started\n", "")
+
+
 def test_a_process_that_cannot_be_started_is_an_error_of_the_system():
     def start():
         raise EOFError
