@@ -68,8 +68,23 @@ from runner.views.view import Given
 
 MAX_FILM_STEPS: Final = 5_000
 """The most steps of a film, as one film is made at a time."""
+MAX_PICTURES: Final = 48
+"""Logged pictures that a page shows, of `MAX_PICTURE_BYTES` together."""
+MAX_PICTURE_BYTES: Final = 16 << 20
+_STEPS_BEFORE: Final = 1
+"""Steps before the first one of a part, so that it includes the step that led there."""
 RecordKind = Literal["training", "optimality"]
-Form = Literal["json", "html", "file"]
+AnswerForm = Literal["json", "html", "file"]
+
+
+@dataclass(frozen=True)
+class ShownDifference:
+    """What differs between two runs."""
+
+    tabs: Mapping[str, tuple[str, Sequence[str], str]]
+    """Lead, notes and HTML of tabs: where they diverge and what else differs, their Q-tables, their code."""
+    first_frame: str | None = None
+    """The first frame of the replays that differs; None if there is none."""
 
 
 def run_histograms(path: Path, axis: str) -> bytes:
@@ -102,7 +117,7 @@ def require_few(found: int, limit: int) -> None:
 
 
 def answer(
-    subject: Path | Run | Sequence[Run], question: Callable[..., Answer], form: Form, values: Given
+    subject: Path | Run | Sequence[Run], question: Callable[..., Answer], form: AnswerForm, values: Given
 ) -> bytes:
     """Return an answer about a recording or runs: as --json prints it, as HTML, or as a file."""
     with open_recording(subject) if isinstance(subject, Path) else nullcontext(subject) as content:
@@ -239,23 +254,6 @@ def places_in(runs: Sequence[Run], step: EpisodeRef) -> list[EpisodeRef]:
         alone if isinstance(origin, BranchOrigin) and origin.run == other.run_id else step
         for origin, other in zip(origins, reversed(runs), strict=True)
     ]
-
-
-MAX_PICTURES: Final = 48
-"""Logged pictures that a page shows, of `MAX_PICTURE_BYTES` together."""
-MAX_PICTURE_BYTES: Final = 16 << 20
-_STEPS_BEFORE: Final = 1
-"""Steps before the first one of a part, so that it includes the step that led there."""
-
-
-@dataclass(frozen=True)
-class ShownDifference:
-    """What differs between two runs."""
-
-    tabs: Mapping[str, tuple[str, Sequence[str], str]]
-    """Lead, notes and HTML of tabs: where they diverge and what else differs, their Q-tables, their code."""
-    first_frame: str | None = None
-    """The first frame of the replays that differs; None if there is none."""
 
 
 def episode_part(path: Path, at: EpisodeRef, start: int, steps: int) -> bytes:

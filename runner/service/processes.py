@@ -67,6 +67,7 @@ KEEP_SECONDS: Final = 60.0
 """How long an idle process waits for its next call, which then need not wait for one to start."""
 _STOP_SECONDS: Final = 5.0
 """How long a process may take to end when nobody waits for its call any more."""
+_STOPPING: Final = "the service is stopping; try again once it has started again."
 
 
 def lower_priority() -> None:
@@ -225,12 +226,12 @@ class ProcessPool:
             del self._thread.child
             self._end(child)
             if self._closed.is_set():
-                raise Busy("the service is stopping; try again when it was started again.") from None
+                raise Busy(_STOPPING) from None
             raise
 
     def _start(self) -> ChildProcess:
         if self._closed.is_set():
-            raise Busy("the service is stopping; try again when it was started again.")
+            raise Busy(_STOPPING)
         try:
             child = ChildProcess(self._memory_bytes, self._context, keep_seconds=self._keep_seconds)
         except OSError as error:

@@ -23,7 +23,7 @@ from runner.runs.run import Run
 from runner.service import computed
 from runner.service.api.reading import RunName, RunNames, found_runs
 from runner.service.api.replay import OCTETS
-from runner.service.computed import Form, link, require_few
+from runner.service.computed import AnswerForm, link, require_few
 from runner.service.dependencies import (
     CatalogueOf,
     Computation,
@@ -46,13 +46,15 @@ _NAMES: Final[dict[str, Any]] = {
     "runs": {"run": (RunNames, ...)},
 }
 """What a query has of several runs: the names of two, or of any number."""
+MAX_THUMBNAILS: Final = 24
+"""The most hits that a page shows pictures of."""
 PageNumber = Annotated[int, Query(alias="page", ge=1, lt=10**9)]
 
 
 def _add_routes(view: View) -> None:
     given_type = _type_of(view)
 
-    def add(form: Form, ending: str, media_type: str, summary: str, **options: Any) -> None:
+    def add(form: AnswerForm, ending: str, media_type: str, summary: str, **options: Any) -> None:
         async def answer(
             run: RecordedRun, compute: ComputationOf, settings: SettingsOf, given: Any
         ) -> Response:
@@ -140,7 +142,7 @@ def _add_route_of_runs(view: View) -> None:
 
 
 async def _answer(
-    compute: Computation, run: Run, view: View, form: Form, given: BaseModel, page: int | None = None
+    compute: Computation, run: Run, view: View, form: AnswerForm, given: BaseModel, page: int | None = None
 ) -> bytes:
     """Return the answer to what is given; on a page, with its own values, and of a long list its rows."""
     values = given.model_dump()
@@ -211,9 +213,6 @@ for _view in (*shipped_views(), *map(view_named, installed_names())):
             _add_route_of_runs(_view)
 
 
-MAX_PICTURES: Final = 24
-"""The most hits that a page shows pictures of."""
-
 Sql = Annotated[str, Query(max_length=MAX_QUERY, description="One SELECT, as for `dualtaxi sql`.")]
 Runs = Annotated[str, Query(max_length=3000, description="A filter of runs, as for `dualtaxi ls`.")]
 
@@ -279,7 +278,7 @@ async def find_page(request: Request, search: SearchOf) -> Response:
         "problem": "",
         "found": None,
         "left_out": (),
-        "max_pictures": MAX_PICTURES,
+        "max_thumbnails": MAX_THUMBNAILS,
     }
     try:
         if search.expression.strip():

@@ -30,13 +30,11 @@ from runner.util.values import Json
 from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
-    from runner.analysis.sections import Section
     from runner.analysis.summary import RunDetails
     from runner.runs.catalogue.filters import Filter
     from runner.runs.catalogue.index import CatalogueIndex
     from runner.runs.catalogue.usage import Sums, Usage
     from runner.runs.run import Run
-    from runner.util.values import Json
 
 ON_A_TERMINAL: Final = 50
 """Runs listed on a terminal by default."""
@@ -194,13 +192,9 @@ def _csv_lines(rows: Iterable[Row], columns: Sequence[str]) -> Iterator[str]:
     """Return lines of CSV after a heading; tags are separated by blanks, logged values are a JSON object."""
 
     def cell(value: object) -> object:
-        return (
-            " ".join(value)
-            if isinstance(value, list)
-            else json.dumps(value)
-            if isinstance(value, dict)
-            else value
-        )
+        if isinstance(value, list):
+            return " ".join(value)
+        return json.dumps(value) if isinstance(value, dict) else value
 
     return csv_lines(columns, (map(cell, as_json(row, columns).values()) for row in rows))
 

@@ -135,7 +135,7 @@ PHASES: Final = {"train": "training", "eval": "evaluation"}
 """Values of an input, and what pages call them."""
 EVERYTHING: Final = view_input("all", "Include everything, not only a selection.", kind=bool, default=False)
 ONLY_HERE: Final = view_input("", "")
-"""An input of a command alone, the option that commands share by its name: code, trust in it, or a filter."""
+"""Declares an input that only the command has: the option that commands share under this name."""
 
 
 def rows_in(start: int, stop: int | None) -> range:
@@ -161,11 +161,11 @@ class View:
     subject: Literal[
         "recording", "run", "pair", "runs", "any run", "file", "folder", "folders", "sweep", "environment"
     ] = "recording"
-    """What the function takes first: a recording; or the run, to read files stored next to it, with answers
-    that are not cached and have no API route, as they hold paths; or a list of two or more runs.
-    Only a command names any run, which may lack its recording; a file by its path, with its run if any;
-    the folder of runs, or several; a sweep, by its name and its folder of runs; or an environment, of which
-    it is the MDP."""
+    """What the function takes first. Commands and the service have `recording`, an open one; `run`, to read
+    files next to its recording (its answers may hold paths, so they are not cached and have no API route);
+    `pair` and `runs`, a list of two or more. Commands alone have `any run`, which may lack its recording;
+    `file`, a path and its run or None; `folder` and `folders` of runs; `sweep`, a name and its folder of
+    runs; and `environment`, an MDP."""
     button: str = ""
     """Text of the button that sends the form; empty if the page has none."""
     lead: str = ""
