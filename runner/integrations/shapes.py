@@ -59,12 +59,13 @@ def forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def logs(convert: Callable[..., object], arguments: str, **layout: object) -> Callable[..., None]:
+def logs(name: str, convert: Callable[..., object], arguments: str, **layout: object) -> Callable[..., None]:
     """Return a method of a tracker that logs a picture, film or array, and leaves out what is none.
 
-        add_video = logs(film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
+        add_video = logs("add_video", film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
 
     Args:
+        name: of the method.
         convert: returns the content of a `Media` for the script's value, and for the layout by name.
         arguments: what the tracker calls the name, the value, the step and further arguments, in its order.
         layout: the arguments that say how to read the value, with their defaults; others are ignored.
@@ -73,11 +74,11 @@ def logs(convert: Callable[..., object], arguments: str, **layout: object) -> Ca
 
     def method(self: Any, *given: object, **named: object) -> None:
         by_name = dict(zip(names, given, strict=False)) | named
-        name, value, step = map(by_name.get, names[:3])
+        tag, value, step = map(by_name.get, names[:3])
         chosen = {key: by_name.get(key, default) for key, default in layout.items()}
-        self.script.log(name, Media(convert, value, **chosen), step)
+        self.script.log(tag, Media(convert, value, **chosen), step)
 
-    method.__name__ = arguments
+    method.__name__ = name
     method.__doc__ = f"Log a value; takes {', '.join(names)}."
     return forgiving(method)
 

@@ -136,11 +136,15 @@ class SummaryWriter(Tracker):
             self.script.settings = _settings(text[match.end() :]) | self.script.settings
         self.script.log(tag, text, global_step)
 
-    add_histogram = logs(histogram_of, "tag values global_step")
-    add_tensor = logs(array_of, "tag tensor global_step")
-    add_image = logs(picture_of, "tag img_tensor global_step walltime dataformats", dataformats="CHW")
-    add_images = logs(picture_of, "tag img_tensor global_step walltime dataformats", dataformats="NCHW")
-    add_video = logs(film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
+    add_histogram = logs("add_histogram", histogram_of, "tag values global_step")
+    add_tensor = logs("add_tensor", array_of, "tag tensor global_step")
+    add_image = logs(
+        "add_image", picture_of, "tag img_tensor global_step walltime dataformats", dataformats="CHW"
+    )
+    add_images = logs(
+        "add_images", picture_of, "tag img_tensor global_step walltime dataformats", dataformats="NCHW"
+    )
+    add_video = logs("add_video", film_of, "tag vid_tensor global_step fps", dataformats="NTCHW", fps=4)
 
     @forgiving
     def add_figure(

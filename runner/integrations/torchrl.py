@@ -214,8 +214,8 @@ class Logger(_Logger):  # type: ignore[misc]
         self.script.name = self.exp_name
         return writer
 
-    log_histogram = logs(histogram_of, "name data step")
-    log_video = logs(film_of, "name video step", dataformats="NTCHW", fps=30)
+    log_histogram = logs("log_histogram", histogram_of, "name data step")
+    log_video = logs("log_video", film_of, "name video step", dataformats="NTCHW", fps=30)
 
     def log_scalar(self, name: str, value: object, step: int | None = None) -> None:
         """Log a number."""

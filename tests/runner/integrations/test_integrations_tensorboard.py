@@ -57,6 +57,14 @@ def test_histograms_pictures_films_and_figures_are_recorded():
     ]
 
 
+def test_each_method_warns_once_of_what_it_leaves_out():
+    with SummaryWriter() as writer:
+        for method in (writer.add_image, writer.add_images):
+            with pytest.warns(RuntimeWarning, match=r"found shape \[8\], expected the axes"):
+                method("bad", np.zeros(8))
+            method("bad", np.zeros(8))  # a second warning would be an error
+
+
 def test_pictures_keep_their_pixels():
     import io
 
