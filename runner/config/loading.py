@@ -241,7 +241,7 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
             rivals = tuple(key for key, section in SECTION_OF.items() if section.algorithm != read.value)
         for rival in rivals:
             if rival not in assigned:
-                document.value = {key: each for key, each in document.value.items() if key != rival}
+                document.value = {key: kept for key, kept in document.value.items() if key != rival}
                 document.problems = _without(document.problems, (rival,))
         for length in range(1, len(path)):
             if not isinstance(value_at(document.value, path[:length]), Mapping | list | tuple):

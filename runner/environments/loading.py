@@ -141,15 +141,9 @@ def _make(env_id: str, kwargs: JsonView) -> Any:
                 f"environment {env_id!r}: the module {module!r} cannot be imported ({_raised(error)})."
             ) from error
     if name not in gymnasium.registry:
-        stems = {
-            env_name.rpartition("-v")[0]: env_name for env_name in gymnasium.registry
-        }  # the newest comes last
-        near = difflib.get_close_matches(name.rpartition("-v")[0], stems, n=1, cutoff=0.6)
-        before = (
-            f"{module}:" if module and near and stems[near[0]].startswith(name.rpartition("-v")[0]) else ""
+        raise EnvironmentNotUsable(
+            f"environment {env_id!r}: Gymnasium knows no such id.{_nearest_id(module, name)}"
         )
-        hint = f" Did you mean '{before}{stems[near[0]]}'?" if near else ""
-        raise EnvironmentNotUsable(f"environment {env_id!r}: Gymnasium knows no such id.{hint}")
     try:
         return gymnasium.make(name, disable_env_checker=True, **kwargs)
     except Exception as error:  # an environment may raise anything
@@ -160,6 +154,20 @@ def _make(env_id: str, kwargs: JsonView) -> Any:
         raise EnvironmentNotUsable(
             f"environment {env_id!r} cannot be made with {given}: {error if is_clear else _raised(error)}"
         ) from error
+
+
+def _nearest_id(module: str, name: str) -> str:
+    """Return a hint at the registered id that was probably meant, without regard to versions."""
+    import gymnasium
+
+    stem = name.rpartition("-v")[0]
+    newest = {env_name.rpartition("-v")[0]: env_name for env_name in gymnasium.registry}
+    near = difflib.get_close_matches(stem, newest, n=1, cutoff=0.6)
+    if not near:
+        return ""
+    meant = newest[near[0]]
+    is_of_module = module and meant.startswith(stem)
+    return f" Did you mean '{module}:{meant}'?" if is_of_module else f" Did you mean '{meant}'?"
 
 
 def _raised(error: Exception) -> str:
@@ -216,6 +224,25 @@ def _transitions(env_id: str, base: object) -> Transitions:
 # Okabe and Ito (2008): distinguishable with any common colour blindness.
 _VERMILLION, _GREEN, _YELLOW, _BLUE = "#D55E00", "#009E73", "#F0E442", "#0072B2"
 _GREY = "#777777"
+
+_MOVES: Final = {
+    "south": [1, 0], "north": [-1, 0], "east": [0, 1], "west": [0, -1],
+    "down": [1, 0], "up": [-1, 0], "right": [0, 1], "left": [0, -1],
+}  # fmt: skip
+_TAXI_COLOURS: Final = (_VERMILLION, _GREEN, _YELLOW, _BLUE)
+_FALL: Final = -100.0
+_START: Final = {"name": "S", "label": "start", "kind": "start", "colour": _GREY}
+_GOAL: Final = {"name": "G", "label": "goal", "kind": "goal", "colour": _GREEN}
+_LAKE: Final = {
+    b"S": _START,
+    b"G": _GOAL,
+    b"H": {"name": "H", "label": "hole", "kind": "hazard", "colour": _BLUE},
+}
+_CLIFF: Final = {
+    b"S": _START,
+    b"G": _GOAL,
+    b"C": {"name": "C", "label": "cliff", "kind": "hazard", "colour": _VERMILLION},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,25 +346,6 @@ _ADAPTERS: Final[Mapping[str, Callable[[str, object, Transitions], GridWorld]]] 
     "gymnasium.envs.toy_text.taxi.TaxiEnv": _taxi,
     "gymnasium.envs.toy_text.frozen_lake.FrozenLakeEnv": _frozen_lake,
     "gymnasium.envs.toy_text.cliffwalking.CliffWalkingEnv": _cliff,
-}
-
-_MOVES: Final = {
-    "south": [1, 0], "north": [-1, 0], "east": [0, 1], "west": [0, -1],
-    "down": [1, 0], "up": [-1, 0], "right": [0, 1], "left": [0, -1],
-}  # fmt: skip
-_TAXI_COLOURS: Final = (_VERMILLION, _GREEN, _YELLOW, _BLUE)
-_FALL: Final = -100.0
-_START: Final = {"name": "S", "label": "start", "kind": "start", "colour": _GREY}
-_GOAL: Final = {"name": "G", "label": "goal", "kind": "goal", "colour": _GREEN}
-_LAKE: Final = {
-    b"S": _START,
-    b"G": _GOAL,
-    b"H": {"name": "H", "label": "hole", "kind": "hazard", "colour": _BLUE},
-}
-_CLIFF: Final = {
-    b"S": _START,
-    b"G": _GOAL,
-    b"C": {"name": "C", "label": "cliff", "kind": "hazard", "colour": _VERMILLION},
 }
 
 

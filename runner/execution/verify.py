@@ -284,11 +284,8 @@ def _check_content(recording: Recording, installed: bool, report: Report, trust:
 
 
 def _retrain(recording: Recording, job: Job, installed: bool, report: Report, trust: bool) -> Verification:
-    from runner.execution.session import (
-        Session,
-        recorded_tables,  # they load Numba
-        recorder_for,
-    )
+    # They load Numba.
+    from runner.execution.session import Session, recorded_tables, recorder_for
     from runner.learning.learner import Learner
 
     env = job.config.env
@@ -337,7 +334,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
     except Diverged as error:
         return _with_difference(verification, error, "differs")
     result = recording.result
-    # an interrupted run that stated its result is compared with it if all steps of the result are recorded
+    # An interrupted run that stated its result is compared with it if all steps of the result are recorded.
     whole = complete or bool(result.content_digest and result.steps_recorded)
     steps = {"train": recording.train.steps.count(), "eval": recording.eval.steps.count()}
     if whole:  # else the job was run a little further than it is recorded

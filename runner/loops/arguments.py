@@ -113,7 +113,8 @@ def _kept(kind: type[Any]) -> dict[str, str]:
             value = value.args[0]  # noqa: PLW2901 - what is copied
         if isinstance(value, ast.Name) and isinstance(target, ast.Attribute):
             is_own = ast.unparse(target.value) == itself and stored[f".{target.attr}"] == 1
-            kept |= {value.id: target.attr} if is_own and not stored[value.id] else {}
+            if is_own and not stored[value.id]:
+                kept[value.id] = target.attr
     members = (member for base in kind.__mro__ for member in vars(base).values() if member is not constructor)
     methods = (inspect.unwrap(member) for member in members if inspect.isfunction(member))
     changed = {
@@ -238,8 +239,9 @@ def wrappers_as_fields(wrappers: Sequence[Any], spec: object, assumed: list[str]
     if isinstance(spec, EnvSpec) and not isinstance(creator_of(spec), type):
         checkers = (PassiveEnvChecker, OrderEnforcing)
         firsts = [number for number, wrapper in enumerate(left) if type(wrapper) in checkers]
-        inner = next(iter(firsts), 0)
-        if not firsts:  # both were left out, or only an inner environment is recorded
+        if firsts:
+            inner = firsts[0]
+        else:  # both were left out, or only an inner environment is recorded
             assumed.append(name_of(spec.entry_point))
     del left[:inner]
     checker = left.pop(0) if left and type(left[0]) is PassiveEnvChecker else None
@@ -290,7 +292,8 @@ def game_wrapper_fields(wrapper: object, assumed: list[str]) -> Json:
         entry_point, kwargs = entry_point_of(type(wrapper)), plain_kwargs(kwargs, f"the wrapper {name}")
     except CannotBeMade:
         entry_point, kwargs, is_certain = factory_of(wrapper)
-    assumed += [] if is_certain else [name]
+    if not is_certain:
+        assumed.append(name)
     return {"entry_point": entry_point, "kwargs": kwargs}
 
 

@@ -44,6 +44,8 @@ class RecordedBatches(Recorded):
 
     why_not_made = f"it was recorded in batches, and is known by its name alone; {NAME_MAKE}"
     """Why an environment cannot be made again that is known by its name alone."""
+    _is_open = False
+    """Whether the run has begun; one of named environments begins with the first batch."""
 
     def __init__(
         self,
@@ -80,12 +82,13 @@ class RecordedBatches(Recorded):
             maker = replace(maker, reason=self.why_not_made)
         self.env = envs
         self._record_into(Loop(described, self._options, maker, self._mode))
+        self._is_open = True
         super()._enter(self._phase)
 
     def _enter(self, phase: str) -> None:
         check_phase(phase)
         self._phase = phase
-        if "_loop" in vars(self):
+        if self._is_open:
             super()._enter(phase)
 
     def reset(self, observations: object) -> None:
@@ -98,7 +101,7 @@ class RecordedBatches(Recorded):
             RecordingError: the observations are not of their space, or not [N, ...].
         """
         observations = _numpy(observations)
-        if "_loop" not in vars(self):
+        if not self._is_open:
             self._first = observations  # until the actions are known too
             return
         try:
@@ -145,16 +148,24 @@ class RecordedBatches(Recorded):
         """
         try:
             self._record_batch(
-                (observations, actions, rewards, terminated, truncated), final_observations, extras or {}
+                observations, actions, rewards, terminated, truncated, final_observations, extras or {}
             )
         except Exception as error:
-            if "_loop" not in vars(self):
+            if not self._is_open:
                 raise
             self._loop.fail(error)
 
-    def _record_batch(self, arrays: tuple[object, ...], finals: object, extras: Mapping[str, object]) -> None:
+    def _record_batch(
+        self,
+        observations: object,
+        actions: object,
+        rewards: object,
+        terminated: object,
+        truncated: object,
+        finals: object,
+        extras: Mapping[str, object],
+    ) -> None:
         """Record T steps, from the arguments of `batch`."""
-        observations, actions, rewards, terminated, truncated = arrays
         paid = np.asarray(as_array(rewards))
         if paid.ndim != 2 or not paid.size or paid.dtype.kind not in "biuf":
             raise ConfigError(f"rewards: found {paid.dtype} of shape {paid.shape}, expected numbers [T, N]")
@@ -166,7 +177,7 @@ class RecordedBatches(Recorded):
         if {len(part) for part in _arrays(seen) if part.ndim} == {steps + 1}:
             before = element_of(seen, 0)
             seen = element_of(seen, slice(1, None))
-        if "_loop" not in vars(self):
+        if not self._is_open:
             self._open_from(before, seen, done)
         self._check_finals(finals, ends | cut, seen)
         with self._loop.lock:
@@ -222,11 +233,11 @@ class RecordedBatches(Recorded):
 
     def close(self, **kwargs: object) -> None:
         """Close the recording as finished, and environments that were given."""
-        if "_loop" in vars(self):
+        if self._is_open:
             super().close(**kwargs)
 
     def __exit__(self, *raised: object) -> Literal[False]:
-        return super().__exit__(*raised) if "_loop" in vars(self) else False
+        return super().__exit__(*raised) if self._is_open else False
 
 
 def record_batches(

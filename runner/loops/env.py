@@ -205,7 +205,7 @@ def record(
     if frames_every:
         require_pictures(env)
     maker = maker_of(env, checked_make(make))
-    loop: Loop = Loop(described, options_of(recordings, options), maker)
+    loop = Loop(described, options_of(recordings, options), maker)
     return RecordedEnv(env, loop, phase)
 
 

@@ -250,13 +250,14 @@ class PendingExtras:
         self._final[phase] = first + count - 1
 
     def _grow(self, row: int, values: Any, lead: tuple[int, ...] | None = None) -> Mapping[str, object]:
-        """Add the names that are new, and let arrays vary in length that have another one for the first time.
-
-        Returns the values that can be recorded.
+        """Add columns for new names, and let the first axis of an array vary once its length changes.
 
         Args:
             row: the first row that may have them.
             values: [*lead, ...] each; by default of one step.
+
+        Returns:
+            The values that can be recorded.
         """
         if not isinstance(values, Mapping):
             self._leave_out(ConfigError(f"extras: found {type(values).__name__}, expected values by name"))

@@ -245,19 +245,19 @@ class _Fold:
             Shard(source.name, source.n, source.recording.status, source.taken["train"], source.taken["eval"])
             for source in self._sources
         ]
-        names = {"run_id": self._run.run_id, "name": str(self._run.facts["name"])}
-        seeded = {"seeded": "false"} if not self._run.has_seed else {}
         spaces = dict(self._first.spaces)
         for source in self._sources[1:]:  # with the widest numbers of all recorded actions
             spaces["action"] = _widest(spaces["action"], source.recording.spaces["action"])
-        run = {key: value for key, value in self._first.run.items() if key != "seeded"}
-        return (
-            run
-            | names
-            | seeded
-            | {"seed": str(self._run.seed), "created": self._run.created_text, "environments": "1"}
-            | {"spaces": json.dumps(spaces), "shards": json.dumps([vars(shard) for shard in shards])}
-        )
+        facts = {key: value for key, value in self._first.run.items() if key != "seeded"} | {
+            "run_id": self._run.run_id,
+            "name": str(self._run.facts["name"]),
+            "seed": str(self._run.seed),
+            "created": self._run.created_text,
+            "environments": "1",
+            "spaces": json.dumps(spaces),
+            "shards": json.dumps([vars(shard) for shard in shards]),
+        }
+        return facts if self._run.has_seed else facts | {"seeded": "false"}
 
     def _own_makers(self) -> dict[str, EnvironmentMaker]:
         """Return how the environments of shards were made, where they differ from the run's."""

@@ -50,8 +50,7 @@ class LoopRun:
         self._options = options
         self._maker = maker
         self.own_makers: dict[str, EnvironmentMaker] = {}
-        """How the environments of phases were made, where another one is recorded into the run; without the
-        phases that are written."""
+        """Makers of environments that were recorded into the run for one phase, until they are written."""
         self._config = options.config(described)
         self._is_described = False
         self.is_settled = not recorded_space(described.action).can_widen()
@@ -130,7 +129,7 @@ class LoopRun:
 
     def _run_facts(self) -> dict[str, str]:
         described = self.described
-        mdp = self.described.mdp
+        mdp = described.mdp
         run = self.run
         content = {key: value for key, value in self._config.items() if key not in NOT_CONTENT}
         job = json.dumps(content | {"seed": self._options.seed}, sort_keys=True)

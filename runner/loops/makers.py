@@ -281,7 +281,8 @@ def game_maker_of(env: Any, make: str) -> EnvironmentMaker:
                 raise CannotBeMade(f"the wrapper {class_name(outer)} does not record its arguments")
             entry_point = f"{module}:{function}" if has_function else entry_point_of(type(base))
             arguments, is_certain = arguments_of(base)
-            assumed += [] if is_certain else [class_name(base)]
+            if not is_certain:
+                assumed.append(class_name(base))
         fields: Json = {
             "entry_point": entry_point,
             "kwargs": plain_kwargs(arguments, f"the game {class_name(base)}"),

@@ -162,8 +162,8 @@ def values_along(
     steps = len(steps_of_episode.rewards)
     for t in range(steps):
         with from_policy(policy):
-            thought = act(element_of(steps_of_episode.observations, t))
-        for name, value in _named(thought).items():
+            returned = act(element_of(steps_of_episode.observations, t))
+        for name, value in _named(returned).items():
             rows.setdefault(name, []).append(value)
     try:
         values = {name: np.stack(arrays) for name, arrays in rows.items()}
