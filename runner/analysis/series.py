@@ -31,8 +31,6 @@ from runner.util.values import JsonView
 Readings = dict[str, dict[str, float]]
 """Metric -> line (an agent, a reward, or "") -> value."""
 
-FURTHER_NAMES: Final = ""
-"""Key of `RunSeries.not_finite` that counts the values under names beyond the first 64."""
 LOGGED: Final = "training.logged."
 """Prefix of the names under which a loop logged values."""
 _MAX_TITLE: Final = 40
@@ -62,6 +60,8 @@ class RunSeries:
     not_finite: Mapping[str, int] = field(default_factory=dict)
     """Metric -> number of recorded values that are infinite, NaN or too large to be averaged, which the
     readings leave out."""
+    unread: int = 0
+    """Number of values that were logged under names beyond the first 64, which the readings leave out too."""
     axis: Axis = EPISODES
     """The axis of the positions."""
     environment: str = ""
@@ -106,16 +106,15 @@ def values_left_out(runs: Collection[RunSeries]) -> list[str]:
         + ", ".join(
             f"{counted(count, 'value')} of “{title_of(metric)[0]}”"
             for metric, count in run.not_finite.items()
-            if metric != FURTHER_NAMES
         )
         + "."
         for run in runs
-        if run.not_finite.keys() - {FURTHER_NAMES}
+        if run.not_finite
     ] + [
         f"Run {run.run_id}: left out, as they have other names than the first {_MAX_NAMES} that were logged: "
-        f"{count:,} values. Choose others by their names."
+        f"{run.unread:,} values. Choose others by their names."
         for run in runs
-        if (count := run.not_finite.get(FURTHER_NAMES))
+        if run.unread
     ]
 
 
@@ -212,7 +211,8 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
     evaluated = [moments.of_moment(record.episode, record.step) for record in evaluations]
     readings = [evaluation_readings(record) for record in evaluations]
     averaged = ""
-    names: dict[str, None] = {}
+    names: Counter[str] = Counter()
+    unread = 0
     recent: Readings = {}
     recent_episodes, is_unended = 0, False
     aligned: Sequence[float] = ()
@@ -236,6 +236,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         readings = [single_agent_unnamed(values) for values in readings]
         wanted = {name.removeprefix(LOGGED) for name in metrics}
         training, averaged = _loop_training(recording, moments, names, wanted, not_finite)
+        unread = 0 if wanted else sum(list(names.values())[_MAX_NAMES:])
         is_unended = not recording.train.episodes.count()
         if recording.status == "finished" and len(last := recording.train.recent_episodes()):
             recent = _episode_readings(
@@ -254,6 +255,7 @@ def read_series(recording: Recording, axis: Axis = EPISODES, metrics: Collection
         training=sorted(training, key=lambda entry: entry[0]),
         content_digest=recording.result.content_digest or "",
         not_finite=dict(not_finite),
+        unread=unread,
         axis=axis,
         environment=_environment(recording),
         recent=recent,
@@ -341,14 +343,14 @@ def single_agent_unnamed(readings: Readings) -> Readings:
 def _loop_training(
     recording: Recording,
     moments: Positions,
-    names: dict[str, None],
+    names: Counter[str],
     wanted: Collection[str],
     not_finite: Counter[str],
 ) -> tuple[list[tuple[float, Readings]], str]:
     """Return means over stretches of training by the end of the stretch, and a sentence on the stretches.
 
-    Logged values are read under the names `wanted`, or under the first 64 names if that is empty. All names
-    that were logged are added to `names`.
+    Logged values are read under the names `wanted`, or under the first 64 names if that is empty. `names`
+    gets the number of values of every name, and `not_finite` that of the values left out.
     """
     edges, averaged = _edges(recording, moments)
     training = _mean_episodes(recording, moments, edges, not_finite)
@@ -442,7 +444,7 @@ def _mean_scalars(
     recording: Recording,
     moments: Positions,
     edges: Floats,
-    names: dict[str, None],
+    names: Counter[str],
     wanted: Collection[str],
     not_finite: Counter[str],
 ) -> tuple[dict[str, Floats], bool]:
@@ -468,13 +470,11 @@ def _mean_scalars(
         usable = is_usable(rows["value"])
         for k, (logged, phase) in enumerate(series):
             name = logged if phase == "train" else f"{logged} ({phase})"
-            names[name] = None
             of_series = rows["series"] == k
+            names[name] += int(of_series.sum())
             if name not in sums:
-                if wanted and name not in wanted:
-                    continue
-                if not wanted and len(sums) >= _MAX_NAMES:
-                    not_finite[FURTHER_NAMES] += int(of_series.sum())
+                is_read = name in wanted if wanted else len(sums) < _MAX_NAMES
+                if not is_read:
                     continue
                 sums[name], counts[name] = np.zeros(bins), np.zeros(bins)
             if left_out := int((of_series & ~usable).sum()):
