@@ -55,13 +55,277 @@ from runner.sweep.workers import Workers, worker_pool
 from runner.util.processes import Stop
 from runner.util.values import JsonView
 
+DEFAULT_SEEDS: Final = 20
+MAX_SEEDS: Final = 10_000
+_PROBES: Final = 2
+"""Seeds of A and of B that are trained first, to see how long a run takes; the first one loads kernels."""
+_EPISODES: Final = (100, 1000, 10_000)
+"""Lengths of the short runs in which the first step that differs is looked for, one after the other."""
+
+Source = str | os.PathLike[str] | JsonView | ExperimentConfig | Run
+Report = Callable[[int, int, str], None]
+"""Called several times a second with how many are done, of how many, and of what: `RUNS`, then `EPISODES`."""
+RUNS: Final = "runs trained"
+EPISODES: Final = "episodes of two short runs recorded"
+
+
+class ExplanationBusy(RunnerError):
+    """Another process computes the explanation."""
+
+
+def explain(
+    a: Source,
+    b: Source,
+    *,
+    metric: str | None = None,
+    at: int | None = None,
+    seeds: int = DEFAULT_SEEDS,
+    workers: int | None = None,
+    ray: str | None = None,
+    recordings: str | os.PathLike[str] | None = None,
+    report: Report = lambda *_: None,
+    planned: Callable[[SamplingPlan], None] = lambda _: None,
+    stop: Stop = lambda: False,
+    trust: bool = False,
+) -> Explanation:
+    """Train mixtures of two configurations, and return which settings make the difference between them.
+
+    Interrupted, it keeps what was trained: called again, it continues. The result is kept in the recordings
+    folder, too.
+
+    Args:
+        a: a run or a configuration, the file of a configuration, or the name of a run or of a shipped
+            configuration.
+        b: another, as `a`.
+        metric: the metric of an evaluation; by default the success rate, or the mean return if the
+            environment does not define success.
+        at: training episodes after which the metric is read; by default at the end of each configuration.
+        seeds: number of seeds of each mixture, counted from the seed of A.
+        workers: maximum number of processes; one per processor by default.
+        ray: the address of a cluster of Ray, or empty for this machine; None for no Ray.
+        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
+        report: called several times a second with how many runs are trained, of how many, and what is
+            counted; at last with the episodes of the two short runs that show the first step.
+        planned: called with what will be trained, before it is.
+        stop: called several times a second; return True to stop.
+        trust: whether environments of runs may be made that `runner.replay.trust` refuses.
+
+    Raises:
+        CannotRedo: an environment may not be made.
+        RunnerError: nothing differs, or too much; they cannot be mixed; a mixture does not have the metric.
+        KeyboardInterrupt: it was interrupted, or `stop` returned True.
+    """
+    folder = recordings_folder(recordings)
+    question = ask(a, b, metric=metric, at=at, seeds=seeds, recordings=folder, trust=trust)
+    pool: Workers[Measurement, MixtureResult]
+    with worker_pool(workers, ray, 2**MAX_ALL) as pool:
+        return answer(question, pool, report, planned, stop)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is to be explained."""
+
+    name: str
+    """The folder of what is known of the two."""
+    a: Side
+    b: Side
+    mixing: Mixing
+    seeds: tuple[int, ...]
+    metric: str | None
+    at: int | None
+    recordings: Path
+    notes: tuple[str, ...]
+
+    @property
+    def mixtures(self) -> tuple[int, int]:
+        """How many mixtures are run, at least and at most."""
+        return mixture_bounds(len(self.mixing.factors))
+
+
+def ask(
+    a: Source,
+    b: Source,
+    *,
+    metric: str | None,
+    at: int | None,
+    seeds: int,
+    recordings: Path,
+    trust: bool = False,
+    require: Callable[[ExperimentConfig], None] = lambda _: None,
+) -> Question:
+    """Return what is to be explained; arguments and errors as for `explain`.
+
+    `require` is called with each configuration before anything is read that it names; it may refuse.
+    """
+    if not 1 <= seeds <= MAX_SEEDS:
+        raise RunnerError(f"seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
+    if at is not None and at < 1:
+        raise RunnerError(f"at: found {at}, expected a number of training episodes from 1 on.")
+    (side_a, config_a, first), (side_b, config_b, other) = (
+        _resolved(source, recordings, trust, require) for source in (a, b)
+    )
+    mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
+    notes = list(mixing.notes)
+    if first != other:
+        notes.append(f"all mixtures have the same seeds, though A has seed {first} and B seed {other}")
+    values = [mixing.a.to_mapping(), mixing.b.to_mapping()]
+    digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
+    names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
+    chosen = tuple(range(first, first + seeds) if first + seeds <= 2**64 else range(seeds))
+    name = f"{'-'.join(names)}-{digest}"
+    return Question(name, side_a, side_b, mixing, chosen, metric, at, recordings, tuple(notes))
+
+
+def answer(
+    question: Question,
+    pool: Workers[Measurement, MixtureResult],
+    report: Report = lambda *_: None,
+    planned: Callable[[SamplingPlan], None] = lambda _: None,
+    stop: Stop = lambda: False,
+) -> Explanation:
+    """Return the explanation of a question, trained by some workers; see `explain`."""
+    began = time.monotonic()
+    mixing = question.mixing
+    folder = question.recordings
+    results = folder / FOLDER / question.name
+    busy = ExplanationBusy("another process computes the same explanation; try again when it has finished.")
+    lock = acquired(results / LOCK, busy)
+
+    def report_runs(done: int, total: int) -> None:
+        if stop():
+            raise KeyboardInterrupt("what was trained is kept")
+        report(done, total, RUNS)
+
+    try:
+        mixtures = Mixtures(mixing, question.seeds, folder, results, pool, report_runs)
+        ends = (0, mixing.everything)
+        if not mixtures.known(ends):
+            check_metric(question)
+        mixtures.measure(ends, _PROBES)
+        sides = [mixtures.readings(end)[0] for end in ends]
+        game = Game(mixtures, _metric_of(sides, question.metric))
+        planned(game.plan())
+        players = game.players()
+        settings = settings_of(game, players)
+        step = None
+        if settings[0].share is not None:
+            strongest = next(i for i, factor in enumerate(mixing.factors) if factor.name == settings[0].name)
+            step = _first_step(
+                mixing,
+                strongest,
+                question.seeds[0],
+                folder,
+                question.name,
+                lambda done, total: report(done, total, EPISODES),
+                stop,
+            )
+        explanation = Explanation(
+            name=f"{question.name}/{re.sub(r'[^A-Za-z0-9_.-]+', '_', game.metric)}",
+            a=question.a,
+            b=question.b,
+            metric=game.metric,
+            at=question.at,
+            episodes=mixing.a.episodes,
+            seeds=question.seeds,
+            method="all mixtures" if len(mixing.factors) <= MAX_ALL else "delta debugging",
+            value_a=game.mean(0),
+            value_b=game.mean(mixing.everything),
+            difference=game.difference,
+            settings=settings,
+            interactions=interactions_of(game, players),
+            smallest=game.smallest(players),
+            mixtures=tuple(game.mixture(number) for number in game.ordered()),
+            first_step=step,
+            notes=question.notes,
+            trained=mixtures.trained,
+            seconds=time.monotonic() - began,
+        )
+        write_explanation(explanation, folder)
+        return explanation
+    finally:
+        lock.release()
+
+
+def _resolved(
+    source: Source, recordings: Path, trust: bool, require: Callable[[ExperimentConfig], None]
+) -> tuple[Side, ExperimentConfig, int]:
+    """Return the name, the configuration and the first seed of a run or a configuration.
+
+    Raises:
+        RunnerError: there is none, or it is a loop, whose learning is the user's own.
+    """
+    if isinstance(source, Mapping):
+        source = from_mapping(source)
+    if isinstance(source, str | os.PathLike):
+        path = Path(source)
+        experiments = [name for name, each in shipped().items() if each.kind == "experiment"]
+        if path.suffix in (".yaml", ".yml") or os.fspath(source) in experiments:
+            source = load(path)
+        else:
+            try:
+                source = find_run(os.fspath(source), recordings)
+            except RunNotFound as error:
+                hint = (
+                    nearest(path.name, experiments) or " `dualtaxi config ls` lists those that are shipped."
+                )
+                raise RunNotFound(f"{error}\nThere is no configuration of this name either.{hint}") from error
+    if isinstance(source, ExperimentConfig):
+        require(source)
+        return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
+    require_trained(
+        source,
+        is_trained=True,
+        refusal=f"run {source.run_id} was recorded from a training loop of your own, which cannot be trained "
+        f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "
+        "and where they diverge, and `dualtaxi compare` compares many.",
+    )
+    require_may_train(source.recording, source.file.config, trust)
+    config = from_mapping(source.file.config)
+    require(config)
+    return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
+
+
+def check_metric(question: Question) -> None:
+    """Check that evaluations of A and of B have the metric, by an episode of each.
+
+    Rewards are not checked: `training.reward.VALUE` depends on what was received.
+    """
+    mixing, metric = question.mixing, question.metric
+    if metric is None or metric.startswith("training.reward"):
+        return
+    sides = []
+    for number in (0, mixing.everything):
+        values = mixing.config(number).to_mapping()
+        short = from_mapping(values | {"episodes": 1, "evaluation": values["evaluation"] | {"trials": 1}})
+        sides.append(dict.fromkeys(measure(short, 0, question.recordings) or (), 0.0))
+    _metric_of(sides, metric)
+
+
+def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
+    """Return the metric: the one that was chosen, the success rate, or the mean return.
+
+    The sides are the readings of A and of B.
+
+    Raises:
+        RunnerError: there is no such metric in evaluations of A and of B.
+    """
+    shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
+    candidates = [metric] if metric is not None else ["success_percent", "mean_return"]
+    for name in candidates:
+        if name in shared:
+            return name
+    names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
+    raise RunnerError(
+        f"metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
+        f"{nearest(metric or '', shared)}"
+    )
+
+
 # --- the first step that differs ----------------------------------------------------------------------
 
-_EPISODES: Final = (100, 1000, 10_000)
-"""Training episodes in which the step is looked for, one after the other."""
 
-
-def first_step(
+def _first_step(
     mixing: Mixing,
     number: int,
     seed: int,
@@ -162,269 +426,3 @@ def _difference(before: Run, after: Run, setting: str, what: str) -> FirstStep |
         f"(runs {before.run_id} without it and {after.run_id} with it, which are recorded)."
     )
     return FirstStep(setting, before.run_id, after.run_id, step, episode, t, (first, *sentences))
-
-
-# --- explanations -------------------------------------------------------------------------------------
-
-Source = str | os.PathLike[str] | JsonView | ExperimentConfig | Run
-DEFAULT_SEEDS: Final = 20
-MAX_SEEDS: Final = 10_000
-_PROBES: Final = 2
-"""Seeds of A and of B that are trained first, to see how long a run takes; the first one loads kernels."""
-
-
-class ExplanationBusy(RunnerError):
-    """Another process computes the explanation."""
-
-
-Report = Callable[[int, int, str], None]
-"""Called several times a second with how many are done, of how many, and of what: `RUNS`, then `EPISODES`."""
-RUNS: Final = "runs trained"
-EPISODES: Final = "episodes of two short runs recorded"
-
-
-def explain(
-    a: Source,
-    b: Source,
-    *,
-    metric: str | None = None,
-    at: int | None = None,
-    seeds: int = DEFAULT_SEEDS,
-    workers: int | None = None,
-    ray: str | None = None,
-    recordings: str | os.PathLike[str] | None = None,
-    report: Report = lambda *_: None,
-    planned: Callable[[SamplingPlan], None] = lambda _: None,
-    stop: Stop = lambda: False,
-    trust: bool = False,
-) -> Explanation:
-    """Train mixtures of two configurations, and return which settings make the difference between them.
-
-    Interrupted, it keeps what was trained: called again, it continues. The result is kept in the recordings
-    folder, too.
-
-    Args:
-        a: a run, a configuration, a file of one, or the name of a shipped one or of a run.
-        b: another.
-        metric: the metric of an evaluation; the success rate, or the mean return if nothing is a success.
-        at: training episodes after which it is read; by default at the end of each.
-        seeds: number of seeds of each mixture, from that of A on.
-        workers: maximum number of processes; one per processor by default.
-        ray: the address of a cluster of Ray, or empty for this machine; None for no Ray.
-        recordings: the recordings folder: $DUALTAXI_RECORDINGS, or ./recordings, by default.
-        report: called several times a second with how many runs are trained, of how many, and what is
-            counted; at last with the episodes of the two short runs that show the first step.
-        planned: called with what will be trained, before it is.
-        stop: called several times a second; return True to stop.
-        trust: whether environments of runs may be made that `runner.replay.trust` refuses.
-
-    Raises:
-        CannotRedo: an environment may not be made.
-        RunnerError: nothing differs, or too much; they cannot be mixed; a mixture does not have the metric.
-        KeyboardInterrupt: it was interrupted, or `stop` returned True.
-    """
-    folder = recordings_folder(recordings)
-    question = ask(a, b, metric=metric, at=at, seeds=seeds, recordings=folder, trust=trust)
-    pool: Workers[Measurement, MixtureResult]
-    with worker_pool(workers, ray, 2**MAX_ALL) as pool:
-        return answer(question, pool, report, planned, stop)
-
-
-@dataclass(frozen=True)
-class Question:
-    """What is to be explained."""
-
-    name: str
-    """The folder of what is known of the two."""
-    a: Side
-    b: Side
-    mixing: Mixing
-    seeds: tuple[int, ...]
-    metric: str | None
-    at: int | None
-    recordings: Path
-    notes: tuple[str, ...]
-
-    @property
-    def mixtures(self) -> tuple[int, int]:
-        """How many mixtures are run, at least and at most."""
-        return mixture_bounds(len(self.mixing.factors))
-
-
-def ask(
-    a: Source,
-    b: Source,
-    *,
-    metric: str | None,
-    at: int | None,
-    seeds: int,
-    recordings: Path,
-    trust: bool = False,
-    require: Callable[[ExperimentConfig], None] = lambda _: None,
-) -> Question:
-    """Return what is to be explained; arguments and errors as for `explain`.
-
-    `require` is called with each configuration before anything is read that it names; it may refuse.
-    """
-    if not 1 <= seeds <= MAX_SEEDS:
-        raise RunnerError(f"seeds: found {seeds}, expected 1 to {MAX_SEEDS:,}.")
-    if at is not None and at < 1:
-        raise RunnerError(f"at: found {at}, expected a number of training episodes from 1 on.")
-    (side_a, config_a, first), (side_b, config_b, other) = (
-        _resolved(source, recordings, trust, require) for source in (a, b)
-    )
-    mixing = mix(config_a, config_b, at, exact=(metric or "").startswith("exact."))
-    notes = list(mixing.notes)
-    if first != other:
-        notes.append(f"all mixtures have the same seeds, though A has seed {first} and B seed {other}")
-    values = [mixing.a.to_mapping(), mixing.b.to_mapping()]
-    digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
-    names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
-    chosen = tuple(range(first, first + seeds) if first + seeds <= 2**64 else range(seeds))
-    name = f"{'-'.join(names)}-{digest}"
-    return Question(name, side_a, side_b, mixing, chosen, metric, at, recordings, tuple(notes))
-
-
-def answer(
-    question: Question,
-    pool: Workers[Measurement, MixtureResult],
-    report: Report = lambda *_: None,
-    planned: Callable[[SamplingPlan], None] = lambda _: None,
-    stop: Stop = lambda: False,
-) -> Explanation:
-    """Return the explanation of a question, trained by some workers; see `explain`."""
-    began = time.monotonic()
-    mixing = question.mixing
-    folder = question.recordings
-    own = folder / FOLDER / question.name
-    busy = ExplanationBusy("another process computes the same explanation; try again when it has finished.")
-    lock = acquired(own / LOCK, busy)
-
-    def report_runs(done: int, total: int) -> None:
-        if stop():
-            raise KeyboardInterrupt("what was trained is kept")
-        report(done, total, RUNS)
-
-    try:
-        mixtures = Mixtures(mixing, question.seeds, folder, own, pool, report_runs)
-        ends = (0, mixing.everything)
-        if not mixtures.known(ends):
-            check_metric(question)
-        mixtures.measure(ends, _PROBES)
-        sides = [mixtures.readings(end)[0] for end in ends]
-        game = Game(mixtures, _metric_of(sides, question.metric))
-        planned(game.plan())
-        players = game.players()
-        settings = settings_of(game, players)
-        step = None
-        if settings[0].share is not None:
-            strongest = next(i for i, each in enumerate(mixing.factors) if each.name == settings[0].name)
-            step = first_step(
-                mixing,
-                strongest,
-                question.seeds[0],
-                folder,
-                own.name,
-                lambda done, total: report(done, total, EPISODES),
-                stop,
-            )
-        explanation = Explanation(
-            name=f"{question.name}/{re.sub(r'[^A-Za-z0-9_.-]+', '_', game.metric)}",
-            a=question.a,
-            b=question.b,
-            metric=game.metric,
-            at=question.at,
-            episodes=mixing.a.episodes,
-            seeds=question.seeds,
-            method="all mixtures" if len(mixing.factors) <= MAX_ALL else "delta debugging",
-            value_a=game.mean(0),
-            value_b=game.mean(mixing.everything),
-            difference=game.difference,
-            settings=settings,
-            interactions=interactions_of(game, players),
-            smallest=game.smallest(players),
-            mixtures=tuple(game.mixture(number) for number in game.ordered()),
-            first_step=step,
-            notes=question.notes,
-            trained=mixtures.trained,
-            seconds=time.monotonic() - began,
-        )
-        write_explanation(explanation, folder)
-        return explanation
-    finally:
-        lock.release()
-
-
-def _resolved(
-    source: Source, recordings: Path, trust: bool, require: Callable[[ExperimentConfig], None]
-) -> tuple[Side, ExperimentConfig, int]:
-    """Return a name, the configuration and the seed of a run or a configuration.
-
-    Raises:
-        RunnerError: there is none, or it is a loop, whose learning is the user's own.
-    """
-    if isinstance(source, Mapping):
-        source = from_mapping(source)
-    if isinstance(source, str | os.PathLike):
-        path = Path(source)
-        experiments = [name for name, each in shipped().items() if each.kind == "experiment"]
-        if path.suffix in (".yaml", ".yml") or os.fspath(source) in experiments:
-            source = load(path)
-        else:
-            try:
-                source = find_run(os.fspath(source), recordings)
-            except RunNotFound as error:
-                hint = (
-                    nearest(path.name, experiments) or " `dualtaxi config ls` lists those that are shipped."
-                )
-                raise RunNotFound(f"{error}\nThere is no configuration of this name either.{hint}") from error
-    if isinstance(source, ExperimentConfig):
-        require(source)
-        return Side(source.name), resolve_initial_q(source, recordings), source.seeds[0]
-    require_trained(
-        source,
-        is_trained=True,
-        refusal=f"run {source.run_id} was recorded from a training loop of your own, which cannot be trained "
-        f"here with other settings. `dualtaxi diff {source.run_id} OTHER` shows in what two loops differ "
-        "and where they diverge, and `dualtaxi compare` compares many.",
-    )
-    require_may_train(source.recording, source.file.config, trust)
-    config = from_mapping(source.file.config)
-    require(config)
-    return Side(source.name, source.run_id), resolve_initial_q(config, recordings), source.seed
-
-
-def check_metric(question: Question) -> None:
-    """Check that evaluations of A and of B have the metric, by an episode of each.
-
-    Rewards are not checked: `training.reward.VALUE` depends on what was received.
-    """
-    mixing, metric = question.mixing, question.metric
-    if metric is None or metric.startswith("training.reward"):
-        return
-    sides = []
-    for number in (0, mixing.everything):
-        values = mixing.config(number).to_mapping()
-        short = from_mapping(values | {"episodes": 1, "evaluation": values["evaluation"] | {"trials": 1}})
-        sides.append(dict.fromkeys(measure(short, 0, question.recordings) or (), 0.0))
-    _metric_of(sides, metric)
-
-
-def _metric_of(sides: Sequence[Readings], metric: str | None) -> str:
-    """Return the metric: the one that was chosen, the success rate, or the mean return.
-
-    The sides are the readings of A and of B.
-
-    Raises:
-        RunnerError: there is no such metric in evaluations of A and of B.
-    """
-    shared = {name for name in sides[0] if all(side.get(name) is not None for side in sides)}
-    candidates = [metric] if metric is not None else ["success_percent", "mean_return"]
-    for name in candidates:
-        if name in shared:
-            return name
-    names = ", ".join(sorted(name for name in shared if not name.startswith("training.reward.")))
-    raise RunnerError(
-        f"metric: found {metric or 'none'!r}, expected one that evaluations of both have: {names}."
-        f"{nearest(metric or '', shared)}"
-    )

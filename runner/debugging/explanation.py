@@ -32,6 +32,14 @@ _FEW_SEEDS: Final = 20
 """With fewer seeds, percentile bootstrap intervals of a mean are clearly too narrow."""
 _MAX_MIXTURES: Final = 16
 """Mixtures that are listed as text."""
+FOLDER: Final = ".explain"
+LOCK: Final = "owner.lock"
+TAG: Final = "explain={}"
+"""The tag of the short runs of an explanation, with its name."""
+_MAX_BYTES: Final = 32 << 20
+"""The largest file of a result that is read."""
+_MAX_VALUE: Final = 1e15
+"""Larger values cannot come from a metric."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +68,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Interaction:
-    """What two settings do together beyond what each does."""
+    """The effect that two settings have together beyond the effect of each."""
 
     settings: tuple[str, str]
     beyond: Estimate
@@ -72,10 +80,10 @@ class Mixture:
     """A configuration with some settings of B, the others of A."""
 
     settings: tuple[str, ...]
-    """Those that have the value of B."""
+    """The settings that have the value of B."""
     mean: Estimate
     values: tuple[float, ...]
-    """By the order of the seeds."""
+    """In the order of the seeds."""
 
 
 @dataclass(frozen=True)
@@ -117,14 +125,14 @@ class Explanation:
     interactions: tuple[Interaction, ...]
     """The largest first."""
     smallest: Mixture | None
-    """The fewest settings of B that make `ENOUGH` of the difference, or by delta debugging some of which none
-    can be left out; None if there is no clear difference."""
+    """The fewest settings of B that make `ENOUGH` of the difference; with delta debugging, settings of which
+    none can be left out. None if there is no clear difference."""
     mixtures: tuple[Mixture, ...]
-    """Those that were run, the fewest settings of B first."""
+    """The mixtures that were run, the fewest settings of B first."""
     first_step: FirstStep | None
     notes: tuple[str, ...]
     trained: int
-    """Runs that were trained now; the others were known from before."""
+    """Runs that were trained for this result; the others were measured before."""
     seconds: float
 
     @property
@@ -204,13 +212,12 @@ def sections(explanation: Explanation) -> list[Section]:
     """Return the result as sections of sentences and tables."""
     title = f"{explanation.a.name} (A) and {explanation.b.name} (B)"
     notes = [f"Note: {note}." for note in explanation.notes]
-    lines = [Section(title, [*summary(explanation), *notes]), _settings_section(explanation)]
+    result = [Section(title, [*summary(explanation), *notes]), _settings_section(explanation)]
     if explanation.interactions:
-        lines.append(_interactions_section(explanation))
+        result.append(_interactions_section(explanation))
     if explanation.first_step is not None:
-        lines.append(Section("First step", list(explanation.first_step.sentences)))
-    lines.append(_mixtures_section(explanation))
-    return lines
+        result.append(Section("First step", list(explanation.first_step.sentences)))
+    return [*result, _mixtures_section(explanation)]
 
 
 def _settings_section(explanation: Explanation) -> Section:
@@ -349,16 +356,6 @@ def _figures(explanation: Explanation) -> list[Figure]:
     return result
 
 
-FOLDER: Final = ".explain"
-LOCK: Final = "owner.lock"
-TAG: Final = "explain={}"
-"""The tag of the short runs of an explanation, with its name."""
-MAX_BYTES: Final = 32 << 20
-"""The largest file of a result that is read."""
-MAX_VALUE: Final = 1e15
-"""What no metric exceeds."""
-
-
 # --- on disk ------------------------------------------------------------------------------------------
 
 
@@ -376,7 +373,7 @@ def explanations_in(recordings: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class Trained:
-    """What an explanation trained, and its results: what may be removed."""
+    """The files and runs of an explanation, which may be removed."""
 
     name: str
     """The folder of the pair."""
@@ -408,7 +405,7 @@ def trained_in(recordings: Path) -> list[Trained]:
 
 
 def remove_trained(trained: Trained) -> None:
-    """Remove what an explanation trained, but runs that are kept or in use."""
+    """Remove the files and runs of an explanation, except runs that are kept or in use."""
     lock = acquired(trained.folder / LOCK, RunnerError(f"{trained.name} is being computed; it stays."))
     try:
         for run in trained.runs:
@@ -438,9 +435,9 @@ def read_explanation(name: str, recordings: Path) -> Explanation:
     path = recordings / FOLDER / f"{name}.json"
     try:
         with open_regular(path) as file:
-            content = file.read(MAX_BYTES + 1)
-        if len(content) > MAX_BYTES:
-            raise RunnerError(f"{path}: larger than {size(MAX_BYTES)}, expected an explanation.")
+            content = file.read(_MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
+            raise RunnerError(f"{path}: larger than {size(_MAX_BYTES)}, expected an explanation.")
         explanation = TypeAdapter(Explanation).validate_json(content)
         _check(explanation)
     except (OSError, ValueError) as error:
@@ -463,7 +460,7 @@ def _check(explanation: Explanation) -> None:
     named += [interaction.settings for interaction in explanation.interactions]
     if len(explanation.mixtures) < 2 or counts != {len(explanation.seeds)} or not explanation.seeds:
         raise ValueError("a mixture lacks values")
-    if not all(math.isfinite(value) and abs(value) < MAX_VALUE for value in numbers):
+    if not all(math.isfinite(value) and abs(value) < _MAX_VALUE for value in numbers):
         raise ValueError("a value is not finite")
     if not all(known_settings.issuperset(names) for names in named):
         raise ValueError("a setting is missing")
