@@ -39,8 +39,20 @@ def render(
     legend: Sequence[LegendEntry] = (),
     replays: bool = False,
 ) -> str:
-    """Return a self-contained page of sections, read from a source; `replays` says that some are replays."""
-    return templates().get_template("page.html").render(locals())
+    """Return a self-contained page of sections; `replays` adds the script that plays episodes."""
+    return (
+        templates()
+        .get_template("page.html")
+        .render(
+            title=title,
+            lead=lead,
+            sections=sections,
+            source=source,
+            notes=notes,
+            legend=legend,
+            replays=replays,
+        )
+    )
 
 
 @functools.cache
