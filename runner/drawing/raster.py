@@ -29,14 +29,12 @@ if TYPE_CHECKING:
 
 Pixels = NDArray[np.uint8]
 """A picture: [height, width, 3], red, green and blue."""
-
 _SPRITE: Final = 130
 """Side of the square in which a thing is drawn, in hundredths of a cell."""
 _FINE: Final = 4
 """Trails are drawn at this multiple of the resolution, for smooth edges."""
 _JPEG_QUALITY: Final = 90
 _PURPOSE: Final = "a picture"
-
 MAX_BARS: Final = 24
 """The most values that a picture shows."""
 BARS_WIDTH: Final = 480
@@ -46,22 +44,6 @@ _TEXT: Final = 13
 _MARGIN: Final = 10
 _BARS: Final = 160, 390
 """The columns of pixels between which bars are drawn; names are on their left, values on their right."""
-
-
-def require_packages() -> None:
-    """Check that the packages that draw pictures are installed."""
-    require("resvg_py", "PIL", extra="plots", purpose=_PURPOSE)
-    _fonts()
-
-
-def image_bytes(pixels: Pixels, kind: str) -> bytes:
-    """Return a picture as the bytes of a `png` (exact) or `jpeg` (smaller, and not exact)."""
-    from PIL import Image
-
-    buffer = BytesIO()
-    options: dict[str, int] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
-    Image.fromarray(pixels).save(buffer, kind, **options)
-    return buffer.getvalue()
 
 
 class SceneRaster:
@@ -144,70 +126,6 @@ class SceneRaster:
         return int(corner[0]), int(corner[1]), np.asarray(large.reduce(_FINE))
 
 
-def render_svg(picture: str, width: int, height: int) -> Image.Image:
-    """Return an SVG as an RGBA image of a width and a height in pixels."""
-    import resvg_py
-    from PIL import Image
-
-    files: list[str] = [str(path) for path in _fonts()]
-    png = resvg_py.svg_to_bytes(
-        svg_string=picture,
-        width=width,
-        height=height,
-        font_files=files,
-        skip_system_fonts=True,
-        font_family="DejaVu Sans",
-    )
-    return Image.open(BytesIO(bytes(png))).convert("RGBA")
-
-
-@functools.cache
-def font(size: int, bold: bool = False) -> FreeTypeFont:
-    """Return DejaVu Sans of a size in pixels."""
-    from PIL import ImageFont
-
-    return ImageFont.truetype(str(_fonts()[bold]), size, layout_engine=ImageFont.Layout.BASIC)
-
-
-def shortened(text: str, width: float, size: int, bold: bool = False) -> str:
-    """Return a text that is at most `width` pixels wide, its end replaced by an ellipsis if it is longer."""
-    drawn = font(size, bold)
-    text = text[: int(width)]
-    if drawn.getlength(text) <= width:
-        return text
-    while text and drawn.getlength(f"{text}…") > width:
-        text = text[:-1]
-    return f"{text}…"
-
-
-def wrapped(text: str, width: float, size: int, lines: int, bold: bool = False) -> list[str]:
-    """Return a text in at most `lines` lines that are at most `width` pixels wide."""
-    words = text[: lines * int(width)].split()
-    result: list[str] = []
-    while words and len(result) < lines - 1:
-        count = 1
-        while count < len(words) and font(size, bold).getlength(" ".join(words[: count + 1])) <= width:
-            count += 1
-        result.append(shortened(" ".join(words[:count]), width, size, bold))
-        words = words[count:]
-    return [*result, shortened(" ".join(words), width, size, bold)] if words else result
-
-
-def _rendered(content: str, box: str, width: int, height: int) -> Image.Image:
-    """Return elements as an RGBA image of the part of the plane in a box."""
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" width="{width}" height="{height}">'
-    return render_svg(f"{head}<style>{svg.STYLE}</style>{content}</svg>", width, height)
-
-
-def _fonts() -> tuple[Path, Path]:
-    """Return the files of the regular and the bold font, without importing Matplotlib."""
-    spec = importlib.util.find_spec("matplotlib")
-    if spec is None or spec.origin is None:
-        raise missing("matplotlib", "plots", _PURPOSE)
-    folder = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf"
-    return folder / "DejaVuSans.ttf", folder / "DejaVuSans-Bold.ttf"
-
-
 def draw_bars(names: Sequence[str], low: Floats, high: Floats, rows: Iterable[Floats]) -> Iterator[Pixels]:
     """Draw the values of each row as horizontal bars from zero; one that is not finite has no bar.
 
@@ -247,3 +165,89 @@ def draw_bars(names: Sequence[str], low: Floats, high: Floats, rows: Iterable[Fl
 
 def _middle(row: int) -> int:
     return _MARGIN + row * _LINE + _LINE // 2
+
+
+def render_svg(picture: str, width: int, height: int) -> Image.Image:
+    """Return an SVG as an RGBA image of a width and a height in pixels."""
+    import resvg_py
+    from PIL import Image
+
+    files: list[str] = [str(path) for path in _fonts()]
+    png = resvg_py.svg_to_bytes(
+        svg_string=picture,
+        width=width,
+        height=height,
+        font_files=files,
+        skip_system_fonts=True,
+        font_family="DejaVu Sans",
+    )
+    return Image.open(BytesIO(bytes(png))).convert("RGBA")
+
+
+def _rendered(content: str, box: str, width: int, height: int) -> Image.Image:
+    """Return elements as an RGBA image of the part of the plane in a box."""
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" width="{width}" height="{height}">'
+    return render_svg(f"{head}<style>{svg.STYLE}</style>{content}</svg>", width, height)
+
+
+def image_bytes(pixels: Pixels, kind: str) -> bytes:
+    """Return a picture as the bytes of a `png` (exact) or `jpeg` (smaller, and not exact)."""
+    from PIL import Image
+
+    buffer = BytesIO()
+    options: dict[str, int] = {"compress_level": 1} if kind == "png" else {"quality": _JPEG_QUALITY}
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+# --- text ---------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def font(size: int, bold: bool = False) -> FreeTypeFont:
+    """Return DejaVu Sans of a size in pixels."""
+    from PIL import ImageFont
+
+    return ImageFont.truetype(str(_fonts()[bold]), size, layout_engine=ImageFont.Layout.BASIC)
+
+
+def shortened(text: str, width: float, size: int, bold: bool = False) -> str:
+    """Return a text that is at most `width` pixels wide, its end replaced by an ellipsis if it is longer."""
+    drawn = font(size, bold)
+    text = text[: int(width)]
+    if drawn.getlength(text) <= width:
+        return text
+    while text and drawn.getlength(f"{text}…") > width:
+        text = text[:-1]
+    return f"{text}…"
+
+
+def wrapped(text: str, width: float, size: int, lines: int, bold: bool = False) -> list[str]:
+    """Return a text in at most `lines` lines that are at most `width` pixels wide."""
+    words = text[: lines * int(width)].split()
+    result: list[str] = []
+    while words and len(result) < lines - 1:
+        count = 1
+        while count < len(words) and font(size, bold).getlength(" ".join(words[: count + 1])) <= width:
+            count += 1
+        result.append(shortened(" ".join(words[:count]), width, size, bold))
+        words = words[count:]
+    return [*result, shortened(" ".join(words), width, size, bold)] if words else result
+
+
+# --- packages -----------------------------------------------------------------------------------------
+
+
+def require_packages() -> None:
+    """Check that the packages that draw pictures are installed."""
+    require("resvg_py", "PIL", extra="plots", purpose=_PURPOSE)
+    _fonts()
+
+
+def _fonts() -> tuple[Path, Path]:
+    """Return the files of the regular and the bold font, without importing Matplotlib."""
+    spec = importlib.util.find_spec("matplotlib")
+    if spec is None or spec.origin is None:
+        raise missing("matplotlib", "plots", _PURPOSE)
+    folder = Path(spec.origin).parent / "mpl-data" / "fonts" / "ttf"
+    return folder / "DejaVuSans.ttf", folder / "DejaVuSans-Bold.ttf"

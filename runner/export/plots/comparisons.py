@@ -40,16 +40,17 @@ _MEASURES: Final = (
     ("mean", "mean difference", 1),
     ("greedy_share", "other greedy action, %", 100),
 )
-
 _SCORE: Final = "normalised score"
 _LETTERS: Final = 150
 """Letters of a note on a line of the sheet."""
-
 _NAMES: Final = 205.0
 """Where charts begin, right of the names of settings."""
 _WIDTH: Final = 590.0
 _ROW: Final = 20.0
 _MAX_NAME: Final = 38
+
+
+# --- groups of runs -----------------------------------------------------------------------------------
 
 
 def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
@@ -70,6 +71,19 @@ def intervals_svg(metric: MetricResult, labels: list[str]) -> str:
         chart.text(x.start - 8, y.at(row) + 3, letter(number), "end", bold=True)
         _draw_group(chart, group, row, number)
     return chart.svg()
+
+
+def _draw_group(chart: Chart, group: GroupResult, row: int, number: int) -> None:
+    colour = series_colour(number)
+    height = chart.y.at(row)
+    values = np.array([value for value in group.values if math.isfinite(value)])
+    spread = np.linspace(-1, 1, len(values)) if len(values) > 1 else np.zeros(len(values))
+    chart.markers(values, row + _SPREAD * spread, colour, 0, 1.2, opacity=0.45)
+    if math.isfinite(group.median):
+        median = chart.x.at(group.median)
+        chart.shape([(median, height - 7.5), (median, height + 7.5)], stroke=palette.INK, width=1.6)
+    if all(map(math.isfinite, (group.iqm.value, group.iqm.low, group.iqm.high))):
+        draw_estimate(chart, group.iqm, row, number, 3.0)
 
 
 def profile_chart(
@@ -107,6 +121,24 @@ def profile_chart(
     return chart
 
 
+def draw_estimate(chart: Chart, estimate: Estimate, row: int, number: int, radius: float) -> None:
+    """Draw a value as the marker of a series in a row of a chart, and its interval as a thick line."""
+    if math.isfinite(estimate.low):
+        ends = [(chart.x.at(end), chart.y.at(row)) for end in (estimate.low, estimate.high)]
+        chart.shape(ends, stroke=series_colour(number), width=radius + 0.4)
+    value = np.array([estimate.value])
+    at = np.array([float(row)])
+    chart.markers(value, at, series_colour(number), series_marker(number), radius, edge=palette.INK)
+
+
+def letter(number: int) -> str:
+    """Return the letter of a group: A, B, ...; its number if there are more than 26."""
+    return chr(ord("A") + number) if number < 26 else str(number + 1)
+
+
+# --- two runs -----------------------------------------------------------------------------------------
+
+
 def tables_svg(tables: Sequence[TableDiff]) -> str:
     """Return the largest and the mean difference, and the share of other greedy actions, over episodes."""
     agents = list(dict.fromkeys(table.agent for table in tables))
@@ -132,43 +164,7 @@ def tables_svg(tables: Sequence[TableDiff]) -> str:
     return canvas.svg()
 
 
-def letter(number: int) -> str:
-    """Return the letter of a group: A, B, ...; its number if there are more than 26."""
-    return chr(ord("A") + number) if number < 26 else str(number + 1)
-
-
-def _draw_group(chart: Chart, group: GroupResult, row: int, number: int) -> None:
-    colour = series_colour(number)
-    height = chart.y.at(row)
-    values = np.array([value for value in group.values if math.isfinite(value)])
-    spread = np.linspace(-1, 1, len(values)) if len(values) > 1 else np.zeros(len(values))
-    chart.markers(values, row + _SPREAD * spread, colour, 0, 1.2, opacity=0.45)
-    if math.isfinite(group.median):
-        median = chart.x.at(group.median)
-        chart.shape([(median, height - 7.5), (median, height + 7.5)], stroke=palette.INK, width=1.6)
-    if all(map(math.isfinite, (group.iqm.value, group.iqm.low, group.iqm.high))):
-        draw_estimate(chart, group.iqm, row, number, 3.0)
-
-
-def draw_estimate(chart: Chart, estimate: Estimate, row: int, number: int, radius: float) -> None:
-    """Draw a value as the marker of a series in a row of a chart, and its interval as a thick line."""
-    if math.isfinite(estimate.low):
-        ends = [(chart.x.at(end), chart.y.at(row)) for end in (estimate.low, estimate.high)]
-        chart.shape(ends, stroke=series_colour(number), width=radius + 0.4)
-    value = np.array([estimate.value])
-    at = np.array([float(row)])
-    chart.markers(value, at, series_colour(number), series_marker(number), radius, edge=palette.INK)
-
-
-def task_charts(comparison: TaskComparison) -> list[Canvas]:
-    """Return the charts: each aggregate, the performance profile, and the curve where runs have one."""
-    labels = [result.label for result in comparison.algorithms]
-    title = f"Performance profile over {len(comparison.tasks)} environments"
-    profile = profile_chart(
-        "Performance profile", title, _SCORE, comparison.thresholds, comparison.algorithms, labels
-    )
-    curves = [_curves(comparison)] if len(comparison.positions) > 1 else []
-    return [_aggregates(comparison), profile, *curves]
+# --- algorithms over environments ---------------------------------------------------------------------
 
 
 def tasks_sheet(comparison: TaskComparison) -> Canvas:
@@ -190,6 +186,17 @@ def tasks_sheet(comparison: TaskComparison) -> Canvas:
         sheet.place(chart, WIDTH * i, head)
     sheet.notes(notes)
     return sheet
+
+
+def task_charts(comparison: TaskComparison) -> list[Canvas]:
+    """Return the charts: each aggregate, the performance profile, and the curve where runs have one."""
+    labels = [result.label for result in comparison.algorithms]
+    title = f"Performance profile over {len(comparison.tasks)} environments"
+    profile = profile_chart(
+        "Performance profile", title, _SCORE, comparison.thresholds, comparison.algorithms, labels
+    )
+    curves = [_curves(comparison)] if len(comparison.positions) > 1 else []
+    return [_aggregates(comparison), profile, *curves]
 
 
 def _aggregates(comparison: TaskComparison) -> Canvas:
@@ -228,6 +235,9 @@ def _curves(comparison: TaskComparison) -> Chart:
             chart.band(places, low, high, series_colour(i), opacity=0.2)
         chart.marked_line(places, np.array(result.curve), i)
     return chart
+
+
+# --- mixtures of settings -----------------------------------------------------------------------------
 
 
 class BarColumn(NamedTuple):
