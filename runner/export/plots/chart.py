@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.transforms import Transform
 
-Values = Floats
 
 TEXT: Final = 8.5
 SMALL: Final = 7.5
@@ -67,7 +66,7 @@ class Scale:
     log: bool = False
 
     @classmethod
-    def around(cls, values: Values, start: float, end: float, log: bool = False) -> Scale:
+    def around(cls, values: Floats, start: float, end: float, log: bool = False) -> Scale:
         """Return a scale on which the finite ones of values have a margin on both sides."""
         values = values[np.isfinite(values)]
         low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
@@ -77,7 +76,7 @@ class Scale:
         margin = 0.05 * (high - low) or 0.05 * abs(high) or 0.05
         return cls(low - margin, high + margin, start, end)
 
-    def __call__(self, values: Values) -> Values:
+    def __call__(self, values: Floats) -> Floats:
         """Return the places of values."""
         low, high = self.low, self.high
         if self.log:
@@ -102,7 +101,7 @@ class Scale:
 class ChartShape:
     """A polygon if it is filled, else a line, through points [n, 2]."""
 
-    points: Values
+    points: Floats
     fill: str = ""
     stroke: str = ""
     width: float = 1.0
@@ -115,7 +114,7 @@ class ChartShape:
 class Markers:
     """A marker at each of some points [n, 2]."""
 
-    points: Values
+    points: Floats
     marker: int
     radius: float
     fill: str
@@ -143,7 +142,7 @@ class Text:
 class Cells:
     """Filled rectangles [n, 4]: x and y of the upper left corner, width and height."""
 
-    points: Values
+    points: Floats
     fill: str
 
 
@@ -163,11 +162,11 @@ class Canvas:
         """Write a line of text; the style has the other fields of `Text`."""
         self.marks.append(Text(x, y, text, anchor, **style))
 
-    def shape(self, points: Sequence[Sequence[float]] | Values, **style: Any) -> None:
+    def shape(self, points: Sequence[Sequence[float]] | Floats, **style: Any) -> None:
         """Draw a line or a polygon; the style has the other fields of `ChartShape`."""
         self.marks.append(ChartShape(np.asarray(points, np.float64), **style))
 
-    def cells(self, rectangles: Values, fill: str) -> None:
+    def cells(self, rectangles: Floats, fill: str) -> None:
         """Fill rectangles [n, 4]: x and y of the upper left corner, width and height."""
         self.marks.append(Cells(rectangles, fill))
 
@@ -237,21 +236,21 @@ class Chart(Canvas):
             self.text(left - 5, at + 3, label, "end", size=8)
 
     def line(
-        self, x: Values, y: Values, colour: str, dash: int = 0, width: float = 1.5, **style: object
+        self, x: Floats, y: Floats, colour: str, dash: int = 0, width: float = 1.5, **style: object
     ) -> None:
         """Draw a line through points; `dash` is the number of a pattern of dashes."""
         points = np.column_stack(_thinned(self.x(x), self.y(y)))
         self.shape(points, stroke=colour, dash=dash, width=width, is_curve=True, **style)
 
-    def band(self, x: Values, low: Values, high: Values, fill: str, **style: object) -> None:
+    def band(self, x: Floats, low: Floats, high: Floats, fill: str, **style: object) -> None:
         """Fill the area between two lines."""
         lower, upper = (np.column_stack(_thinned(self.x(x), self.y(edge))) for edge in (low, high))
         self.shape(np.concatenate([lower, upper[::-1]]), fill=fill, **style)
 
     def markers(
         self,
-        x: Values,
-        y: Values,
+        x: Floats,
+        y: Floats,
         colour: str,
         marker: int,
         radius: float,
@@ -266,7 +265,7 @@ class Chart(Canvas):
             self.marks.append(Markers(points, marker, radius, fill, edge or colour, opacity))
 
     def marked_line(
-        self, x: Values, y: Values, number: int, dash: int = 0, at: tuple[Values, Values] | None = None
+        self, x: Floats, y: Floats, number: int, dash: int = 0, at: tuple[Floats, Floats] | None = None
     ) -> None:
         """Draw a line in a series' colour with about eight of its markers, at other points if given."""
         self.line(x, y, series_colour(number), dash)
@@ -336,7 +335,7 @@ def _written(attributes: dict[str, str]) -> str:
     return "".join(f' {name}="{value}"' for name, value in attributes.items() if value)
 
 
-def _thinned(x: Values, y: Values) -> tuple[Values, Values]:
+def _thinned(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Keep the first, lowest, highest and last of the points at one place along x, which draw the same."""
     if len(x) < 8 * _POINTS_PER_UNIT:
         return x, y

@@ -31,7 +31,6 @@ from runner.recording.machine import SAMPLE_SECONDS, Clock, HostMetrics
 from runner.util import humanize
 from runner.util.arrays import Floats
 
-Values = Floats
 _INTERVALS: Final = 200
 """The most intervals of the time in which steps are counted."""
 _GB, _MB = 1e9, 1e6
@@ -60,7 +59,7 @@ EXPLANATION: Final = (
 class _Panel(NamedTuple):
     title: str
     unit: str
-    lines: dict[str, Values]
+    lines: dict[str, Floats]
     top: float = 0.0
     """The least upper end of the axis."""
 
@@ -117,7 +116,7 @@ def _host_panels(host: HostMetrics) -> list[_Panel]:
     return [panel for panel in panels if any(np.isfinite(values).any() for values in panel.lines.values())]
 
 
-def _plot(panel: _Panel, seconds: Values, duration: float) -> Figure:
+def _plot(panel: _Panel, seconds: Floats, duration: float) -> Figure:
     unit, divisor = next(
         each
         for each in (("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))

@@ -6,7 +6,7 @@ for (a passenger at G, a destination R).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -27,7 +27,6 @@ from runner.replay.tables import tables_at
 from runner.util.arrays import Array, Flags, Floats, Ints
 from runner.util.humanize import capitalised
 
-Values = Floats
 Bounds = tuple[float, float]
 
 _HALFWAY: Final = 0.05
@@ -41,7 +40,7 @@ class MapStage:
     title: str
     episode: int
     step: int
-    tables: list[Values]
+    tables: list[Floats]
 
 
 class Choice(NamedTuple):
@@ -57,13 +56,10 @@ def stages_of(recording: Recording) -> list[MapStage]:
     """Return the tables before, in the middle of and after learning; fewer where they are the same.
 
     The middle is the snapshot nearest to half of the episodes; without one between the first and the last,
-    the steps up to there are replayed, if they were recorded. A loop's are those of its first table's name.
+    the steps up to there are replayed, if they were recorded. Of a loop, the first table counts.
     """
     by_step: dict[int, MapStage] = {}
-    name = ""
-    for table in recording.snapshots() if recording.has_tables else recorded_tables(recording):
-        if isinstance(table, Snapshot) and table.name != (name := name or table.name):
-            continue
+    for table in recording.snapshots() if recording.has_tables else _first_tables(recording):
         stage = by_step.setdefault(table.step, MapStage("", table.episode, table.step, []))
         stage.tables.append(np.asarray(table.values, np.float64))
     whole = [stage for stage in by_step.values() if len(stage.tables) == len(recording.agents)]
@@ -154,6 +150,15 @@ def situation_in_words(mdp: Mdp, state: int, free: Sequence[int]) -> str:
     return ", ".join(word for i, word in enumerate(words) if i not in free)
 
 
+def _first_tables(recording: Recording) -> Iterator[Snapshot]:
+    """Yield the tables that a loop recorded under the first name."""
+    name = ""
+    for table in recorded_tables(recording):
+        name = name or table.name
+        if table.name == name:
+            yield table
+
+
 def _replayed(recording: Recording, episode: int) -> MapStage | None:
     try:
         step = step_of_episode(recording, episode)
@@ -201,7 +206,7 @@ def _row(
     return Section(title, [text], figures=figures, layout=layout, ramp=bounds)
 
 
-def on_grid(mdp: Mdp, states: Ints, movers: list[int], values: Array) -> Values:
+def on_grid(mdp: Mdp, states: Ints, movers: list[int], values: Array) -> Floats:
     """Return the values of states by the cells of one or two movers, [cells] or [cells, cells], else NaN."""
     assert mdp.scene is not None
     assert mdp.scene_cells is not None
@@ -210,7 +215,7 @@ def on_grid(mdp: Mdp, states: Ints, movers: list[int], values: Array) -> Values:
     return grid
 
 
-def drawn(mdp: Mdp, grid: Values, bounds: Bounds, title: str, greedy: Values | None = None) -> str:
+def drawn(mdp: Mdp, grid: Floats, bounds: Bounds, title: str, greedy: Floats | None = None) -> str:
     """Return the map of values as `on_grid` returns them, with the greedy actions of one mover."""
     assert mdp.scene is not None
     if grid.ndim == 2:
