@@ -16,6 +16,7 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -229,14 +230,19 @@ def step_columns(
 @contextlib.contextmanager
 def _opened(run: Source) -> Iterator[Recording]:
     """Yield the run's open recording, if pandas is installed; one that is open already stays open."""
-    _frame([])
+    _require_pandas()
     with opened(run if isinstance(run, Run | Recording) else run_at(Path(run))) as recording:
         yield recording
 
 
+def _require_pandas() -> ModuleType:
+    pandas: ModuleType = require("pandas", extra="frames", purpose="a frame")
+    return pandas
+
+
 def _frame(data: object) -> pd.DataFrame:
     """Return a frame of columns by name, or of rows."""
-    frame: pd.DataFrame = require("pandas", extra="frames", purpose="a frame").DataFrame(data)
+    frame: pd.DataFrame = _require_pandas().DataFrame(data)
     return frame
 
 

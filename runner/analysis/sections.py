@@ -20,7 +20,6 @@ _NUMBERS: Final = re.compile(
 )
 """What cells of numbers consist of, such as `1,500`, `12 %`, `[0.5, 1]` and `2 to 3`."""
 
-
 NOT_DRAWN: Final = "`dualtaxi serve` draws the charts."
 
 
@@ -40,7 +39,7 @@ class Figure(NamedTuple):
 
 
 class LegendEntry(NamedTuple):
-    """The line of a legend that explains the colour of its place."""
+    """A line of a legend, whose position stands for a colour."""
 
     letter: str
     """What stands for it in text and figures; may be empty."""
@@ -126,7 +125,7 @@ class Grid:
     title: str = ""
     """Its title in a page, if that is not the section's."""
     links: Sequence[str] = ()
-    """The address of what each row is about, as in a `Link`."""
+    """The address that each row leads to, as in a `Link`."""
     streams: Sequence[str] = ()
     """The stream of each row, if the rows are lines of output: `stdout`, `stderr` or `note`."""
     paging: Paging | None = None
@@ -142,7 +141,7 @@ class Grid:
     status: str = ""
     """Heading of the column of statuses, which a page marks."""
     runs: str = ""
-    """Heading of the column of ids of runs, each of which leads to the page of that run."""
+    """Heading of the column of run ids, which link to the pages of the runs."""
 
     @property
     def numeric(self) -> tuple[bool, ...]:
@@ -186,7 +185,7 @@ class Section:
     sources: Sequence[SourceFile] = ()
     """Files, which a page shows whole, and text by their names."""
     is_folded: bool = False
-    """Whether a page folds the facts, and text leaves them out."""
+    """Whether a page folds the facts; text leaves them out."""
 
     @property
     def shown_facts(self) -> dict[str, str]:
@@ -211,13 +210,13 @@ class Section:
 
 
 class Answer:
-    """The answer to a question about recorded runs; what it is derived from declares the rest."""
+    """The answer to a question about recorded runs, with everything that a view shows of it."""
 
     exit_code: int = ExitCode.OK
     limits: Sequence[str] = ()
-    """What limits the answer, in sentences that are said where a page stands for the text."""
+    """Limits of the answer, a sentence each, printed where a page replaces the text."""
     contents: str = ""
-    """What the file has, in a few words; given for a page, and for a file that stands for the text."""
+    """What the file holds, in a few words; for a page, and where a file replaces the text."""
     lines: Mapping[str, Iterable[str]] = MappingProxyType({})
     """Forms of the command, such as `csv`, whose lines are printed one by one: there may be very many."""
     remarks: Iterable[str] = ()

@@ -105,7 +105,6 @@ class RunDetails(Answer):
     """The last results of a loop; None for a job."""
     extras: Mapping[str, RecordedExtras] = field(default_factory=dict)
     """The values that a loop recorded with the steps of each phase, where there are some."""
-
     first_resets: Mapping[str, RecordedReset] = field(default_factory=dict)
     """The first reset of each phase of a loop that has one."""
     checkpoints: tuple[Checkpoint, ...] = ()

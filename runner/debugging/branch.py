@@ -224,9 +224,8 @@ def branch_episode(run: Run, task: EpisodeBranch, recordings: Path, report: Repo
     checked_run_name(task.name)
     with storage_errors(recordings):
         recordings.mkdir(parents=True, exist_ok=True)
-        staging = tempfile.TemporaryDirectory(
-            prefix=".branch-", dir=recordings
-        )  # hidden: no run is listed there
+        # Runs in hidden folders are not listed.
+        staging = tempfile.TemporaryDirectory(prefix=".branch-", dir=recordings)
     with staging as name:
         staged = Path(name).absolute()
         for message in stream_from_child(_record_branch, run.recording.absolute(), staged, task):
@@ -236,11 +235,11 @@ def branch_episode(run: Run, task: EpisodeBranch, recordings: Path, report: Repo
                 run_id, origin, stopped, is_recorded = message
         with storage_errors(recordings / run_id):
             (staged / run_id).rename(recordings / run_id)
-    own = run_at(recordings / run_id)
+    branch_run = run_at(recordings / run_id)
     with open_recording(run.recording) as recording:
         before = _outcome(recording, origin.phase, origin.episode, "unfinished")
-    with open_recording(own.recording) as recording:
-        return Branch(own, origin, before, _outcome(recording, origin.phase, 0, stopped), is_recorded)
+    with open_recording(branch_run.recording) as recording:
+        return Branch(branch_run, origin, before, _outcome(recording, origin.phase, 0, stopped), is_recorded)
 
 
 def default_name(recording: Recording) -> str:

@@ -1,21 +1,18 @@
 """Conditions on a job's training, and the quantities that they name, after each training step.
 
-q[STATE, ACTION]       a Q-value; max(q[STATE]) and min(q[STATE]) those of a state
-greedy[STATE]          the greedy action
-greedy_success[STATE]  whether the greedy path from there has an event of success within the step limit
-visits[STATE]          how often a step began in the state; visits[STATE, ACTION] with this action
-step, episode          numbers of the training step and of its episode
-reward                 of the training step
-epsilon                the probability of exploring at the training step
+    q[STATE, ACTION]       a Q-value; max(q[STATE]) and min(q[STATE]) are a state's highest and lowest
+    greedy[STATE]          the greedy action
+    greedy_success[STATE]  whether the greedy path from there has an event of success within the step limit
+    visits[STATE]          how often a step began in the state; visits[STATE, ACTION]: with this action
+    step, episode          numbers of the training step and of its episode
+    reward                 the reward of the training step
+    epsilon                the probability of exploring at the training step
 
 With a table for each agent, `q.taxi_1[...]`, `reward.taxi_1`, `greedy.taxi_1[...]` and `visits.taxi_1[...]`
 are the agent's own; `greedy[...]` and `visits[...]` are then of joint actions.
 
-A condition becomes a tree of NumPy operations over columns, a column for each quantity, a row for each
-moment. All numbers are float64, so a division by zero is infinite or NaN.
-
-
-The values of a job's quantities after each training step; `runner.debugging.expressions` names them.
+A condition becomes a tree of NumPy operations over columns, a column for each quantity and a row for each
+moment, which `JobColumns` fills. All numbers are float64, so a division by zero is infinite or NaN.
 """
 
 from __future__ import annotations
@@ -64,7 +61,7 @@ _ACTION: Final = "an action"
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is read after each step."""
+    """A value that is read after each step."""
 
     name: str
     learner: int
@@ -94,7 +91,7 @@ class Expression:
     text: str
     condition: Series
     terms: tuple[Series, ...]
-    """The quantities in it, and the conditions that it combines: what explains its value."""
+    """The quantities in it, and the conditions that it combines."""
 
 
 class JobParser(Parser[Series]):
@@ -309,7 +306,7 @@ class JobColumns:
         config = from_mapping(recording.config)
         starts = sorted({0, *(branch.step for branch in config.branches)})
         self._segments = [(start, rules_of(config.from_step(start))) for start in starts]
-        """The rules of the training, each from a step on."""
+        """The rules of training, each with the step from which they apply."""
         several = len(recording.agents) > 1
         self._widths = list(self._mdp.action_counts) if several else [self._mdp.joint_actions]
         self._cells: dict[Quantity, slice] = {}
@@ -317,7 +314,8 @@ class JobColumns:
         self._paths = [quantity for quantity in quantities if quantity.name == "greedy_success"]
         names = {quantity.name for quantity in quantities}
         by_step = "epsilon" in names and (
-            len(starts) > 1 or any(rules.epsilon[1] == 1.0 for _, rules in self._segments)
+            len(starts) > 1
+            or any(bool(rules.epsilon[1]) for _, rules in self._segments)  # schedules by step, not by episode
         )
         self._every_step = by_step or bool(names & {"step", "reward"})
         self._by_episode = bool(names & {"episode", "epsilon"})
@@ -326,7 +324,8 @@ class JobColumns:
         if self._visits:
             self._count_visits(recording, start)
         self._replay = TableReplay(recording, start) if names & set(TABLE_NAMES) else None
-        self._last = self._first()
+        self.last = self._first()
+        """The values now, one row each; NaN for those of a step before the first step."""
 
     def _new_watch(self) -> Watch:
         offsets = [self._mdp.states * sum(self._widths[:i]) for i in range(len(self._widths))]
@@ -365,16 +364,11 @@ class JobColumns:
             succeeds=np.zeros(len(self._paths), np.bool_),
         )
 
-    @property
-    def last(self) -> Columns:
-        """The values now, one row each; NaN for those of a step before the first step."""
-        return self._last
-
     def take(self, block: Records, needed: int) -> Iterator[tuple[Ints, Columns]]:
-        """Yield the steps after which quantities may have changed, as places in a block, and their values.
+        """Yield the places in a block after which quantities may have changed, and the values there.
 
-        The block has the training steps that follow. The values have a row more, before the others: those
-        before the first of the steps. The place `needed` is included in any case; -1 for none.
+        The block has the training steps that follow. The values have one more row, the first: the values
+        before these steps. The place `needed` is always included; -1 for none.
         """
         width = max(len(self._watch.cells), 1)
         size = max(_VALUES_AT_ONCE // width, 1)
@@ -382,8 +376,8 @@ class JobColumns:
             part = block[first : first + size]
             places, columns = self._part(part, needed - first)
             if len(places):
-                whole = {key: np.concatenate([self._last[key], column]) for key, column in columns.items()}
-                self._last = {key: column[-1:] for key, column in whole.items()}
+                whole = {key: np.concatenate([self.last[key], column]) for key, column in columns.items()}
+                self.last = {key: column[-1:] for key, column in whole.items()}
                 yield places + first, whole
 
     def _part(self, block: Records, needed: int) -> tuple[Ints, Columns]:
@@ -429,7 +423,7 @@ class JobColumns:
         """Return the values at places in a block, each that of the last change before or at it."""
         at = np.searchsorted(changes.row, places, side="right")
         values = self._table_values(changes)
-        return {key: np.concatenate([self._last[key], value])[at] for key, value in values.items()}
+        return {key: np.concatenate([self.last[key], value])[at] for key, value in values.items()}
 
     def _table_values(self, changes: WatchedValues) -> dict[Quantity, Array]:
         columns: dict[Quantity, Array] = {}
@@ -473,7 +467,7 @@ class JobColumns:
 
 
 def check_lost(recording: Recording, expected: int, found: int) -> None:
-    """Refuse training steps of which some were lost before the step that was found.
+    """Check that no training steps were lost before the step that was found.
 
     Raises:
         RecordingError: another step was expected.

@@ -21,9 +21,8 @@ from runner.debugging.mixtures import MAX_ALL, Mixtures
 from runner.util.arrays import Floats
 
 T = TypeVar("T")
-
-
-# --- Shapley values, and the smallest set -------------------------------------------------------------
+_START_SECONDS: Final = 10.0
+"""About the time to start workers, load kernels in them, and record the two short runs of the first step."""
 
 
 def shapley_values(values: Floats) -> Floats:
@@ -36,11 +35,11 @@ def shapley_values(values: Floats) -> Floats:
 
 
 def shapley_interactions(values: Floats) -> dict[tuple[int, int], Floats]:
-    """Return for each pair of settings (i, j), i < j, what both do beyond each, averaged over the others.
+    """Return what each pair of settings (i, j), i < j, does together beyond the effect of each.
 
     The Shapley interaction index of M. Grabisch and M. Roubens, "An axiomatic approach to the concept of
-    interaction among players in cooperative games", 1999, [columns] of values [2^k, columns]. It is 0 for
-    settings whose effects add up.
+    interaction among players in cooperative games", 1999: an average over the other settings, [columns] of
+    values [2^k, columns]. It is 0 for settings whose effects add up.
     """
     pairs = itertools.combinations(range(len(values).bit_length() - 1), 2)
     return {pair: _effect(values, pair) for pair in pairs}
@@ -66,7 +65,7 @@ def minimal_set(items: Sequence[T], holds: Callable[[Sequence[T]], bool]) -> lis
     """Return items for which a property holds, and of which none can be left out.
 
     Delta debugging (A. Zeller and R. Hildebrandt, "Simplifying and isolating failure-inducing input", 2002).
-    `holds` takes some of the items, in their order; it is so of all of them, and not of none.
+    `holds` takes some of the items, in their order; it must hold for all of them, and not for none.
     """
     left = list(items)
     parts = 2
@@ -90,8 +89,7 @@ def minimal_set(items: Sequence[T], holds: Callable[[Sequence[T]], bool]) -> lis
     return left
 
 
-_START_SECONDS: Final = 10.0
-"""About the time to start workers, load kernels in them, and record the two short runs of the first step."""
+# --- the game of an explanation ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

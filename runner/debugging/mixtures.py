@@ -104,7 +104,7 @@ class Mixing:
     """The second, with the sections of A that only measure and record."""
     factors: tuple[Factor, ...]
     notes: tuple[str, ...]
-    """What is not mixed, and what is mixed only together."""
+    """Which settings are not mixed, and which are only mixed together."""
 
     @property
     def everything(self) -> int:
@@ -121,7 +121,7 @@ class Mixing:
         return [factor for i, factor in enumerate(self.factors) if mixture >> i & 1]
 
     def in_words(self, mixture: int) -> str:
-        """Return what a mixture is, for errors."""
+        """Describe a mixture, for errors."""
         names = ", ".join(factor.name for factor in self.chosen(mixture)) or "none"
         return f"the mixture with these settings of B: {names}"
 
@@ -129,8 +129,8 @@ class Mixing:
 def mix(a: ExperimentConfig, b: ExperimentConfig, at: int | None = None, exact: bool = False) -> Mixing:
     """Return the settings in which two experiments differ, grouped so that they can be mixed.
 
-    They are compared after `at` training episodes, by default each at its own end; `exact` is whether
-    evaluations need exact measures.
+    The experiments are compared after `at` training episodes, by default at the end of each; `exact` asks for
+    exact measures in evaluations.
 
     Raises:
         RunnerError: they differ in no setting, in too many, or in settings that cannot be mixed; or one of

@@ -44,7 +44,7 @@ class Value:
 
     expression: str
     before: Scalar
-    """None for a number that is NaN or belongs to a step before the first one, and for conditions then."""
+    """None for NaN, and for any value before the first training step."""
     after: Scalar
 
 
@@ -188,13 +188,12 @@ def when(
                 f"found first step {start:,} and last step {stop - 1:,}, expected them in order."
             )
         columns = JobColumns(recording, list(parser.quantities), max(start - 1, 0))
-        if start:
+        if start:  # bring the columns to the step before the first
             for block in recording.train.steps.blocks(start - 1, start):
-                deque(columns.take(block, 0), maxlen=0)  # what was known before the first step
-        terms = parsed.terms
+                deque(columns.take(block, 0), maxlen=0)
         with np.errstate(all="ignore"):
             held_before = bool(_values(parsed.condition, columns.last)[0])
-            knows = not any(np.isnan(_values(term, columns.last)).any() for term in terms)
+            is_known = not any(np.isnan(_values(term, columns.last)).any() for term in parsed.terms)
             moments, count, steps, end = _search(
                 recording, parsed, columns, every, limit, start, stop, report
             )
@@ -203,7 +202,7 @@ def when(
             expression=parsed.text,
             every=every,
             searched=(start, end.step),
-            held_before=held_before if knows else None,
+            held_before=held_before if is_known else None,
             intervals=tuple(map(Interval, moments[::2], [*moments[1::2], None])),
             count=count,
             steps=steps if every else None,

@@ -30,7 +30,7 @@ TRAIL: Final = 40
 TRAIL_WIDTH: Final = 7
 TRAIL_OPACITY: Final = 0.55
 BROAD: Final = 8.5 * CELL
-"""A page shows a grid that is wider than this over its whole width."""
+"""A page gives its whole width to a grid that is wider than this."""
 
 _FONT: Final = "font-family:'DejaVu Sans',sans-serif;font-weight:bold"
 _GRID: Final = palette.GRID
@@ -182,8 +182,8 @@ class SvgDrawing:
     ) -> str:
         """Return a whole picture, with a description for screen readers.
 
-        `place` is where the things are, [things, 3], None for anywhere, if a script moves them; the trail has
-        the places of earlier frames, [frames, things, 3]; `style` is CSS, empty if the page has it.
+        `place` is where the things are, [things, 3]; None if a script moves them. `trail` has the places of
+        earlier frames, [frames, things, 3]. `style` is the CSS; empty if the page has it.
         """
         if place is None:
             place = np.zeros((len(self._things), 3), np.int16)

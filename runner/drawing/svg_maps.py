@@ -57,8 +57,8 @@ def policy_map(
 ) -> str:
     """Return the map of one mover: the highest value and the greedy action in each cell.
 
-    Values and actions are [cells], nan where no action is better than another; without actions there are no
-    arrows. The bounds are those of the darkest and of the lightest colour.
+    `values` and `greedy` are [cells], nan where no action is better than another; without `greedy` there are
+    no arrows. The bounds are the values of the darkest and of the lightest colour.
     """
     letters = {
         row * scene["columns"] + column: mark["name"][:2]
@@ -155,7 +155,7 @@ def moves_map(
     widths = [(move, WIDEST * move.weight / heaviest) for move in moves if heaviest > 0]
     shapes = [
         _shape(scene, drawing, move, width)
-        for move, width in sorted(widths, key=lambda each: -each[1])
+        for move, width in sorted(widths, key=lambda drawn: -drawn[1])
         if width >= _FAINTEST
     ]
     things = "" if place is None else drawing.things(place)

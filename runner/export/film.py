@@ -198,11 +198,11 @@ def _with_palette(film: Path) -> Iterator[VideoFrame]:
 
     graph = av.filter.Graph()
     counted, shown = (graph.add("movie", filename=str(film)) for _ in range(2))
-    palette = graph.add("palettegen")
+    colours = graph.add("palettegen")
     coloured = graph.add("paletteuse", dither="none", diff_mode="rectangle")
-    counted.link_to(palette)
+    counted.link_to(colours)
     shown.link_to(coloured)
-    palette.link_to(coloured, 0, 1)
+    colours.link_to(coloured, 0, 1)
     coloured.link_to(graph.add("buffersink"))
     graph.configure()
     with contextlib.suppress(av.EOFError):

@@ -22,20 +22,21 @@ from runner.util.arrays import Floats, Records
 
 MAX_NUMBERS: Final = 64
 """Leaves of more numbers are not shown number by number."""
-Seen = tuple[Value | None, Step | None]
-"""An observation, and the step that led to it; none for the observation after a reset."""
 FEW: Final = 8
-"""Arrays of at most this number of numbers are written out in words."""
+"""Arrays of up to this many numbers are written out in words."""
 _LEAST_SIDE: Final = 16
 """An array of bytes is an image if it has at least this height and width."""
 
+Seen = tuple[Value | None, Step | None]
+"""An observation, and the step that led to it; none for the observation after a reset."""
+
 
 class Values:
-    """What can be shown of the observations of a recording; `name` is that of a value that has no parts.
+    """Flattens observations of a recording for display; `name` labels a value without parts.
 
     Attributes:
-        names: of the numbers, in the order of `numbers_in`.
-        image: the part that is an image, the first one; None if there is none.
+        names: the names of the numbers, in the order of `numbers_in`.
+        image: the first part that is an image; None if there is none.
     """
 
     def __init__(self, recording: Recording, name: str = "observation") -> None:
@@ -47,7 +48,7 @@ class Values:
             if leaf.dtype is not None and 0 < math.prod(leaf.dtype.shape) <= MAX_NUMBERS
         ]
         self._texts = [leaf for leaf in leaves if leaf.dtype is None]
-        self.names = [each for leaf in self._leaves for each in number_names(leaf, name, known=known)]
+        self.names = [label for leaf in self._leaves for label in number_names(leaf, name, known=known)]
         self.image = next((leaf for leaf in leaves if is_image(leaf)), None)
 
     def numbers_in(self, value: object) -> Floats:
@@ -215,7 +216,7 @@ def number_names(leaf: Leaf, name: str, skip: int = 0, known: Sequence[str] = ()
 
 
 def names_in(array: str, shape: tuple[int, ...]) -> Iterator[str]:
-    """Yield a name for each number of an array, row by row: `position[0]`; of a single one that of all."""
+    """Yield a name for each number of an array, row by row: `position[0]`; a single number is named as it."""
     for place in np.ndindex(shape):
         yield f"{array}[{', '.join(map(str, place))}]" if place else array
 

@@ -1,7 +1,7 @@
 """What differs between two runs: one object, from which text, JSON, Markdown and HTML are rendered.
 
 with open_recording(path_a) as a, open_recording(path_b) as b:
-    difference = diff(a, b)
+difference = diff(a, b)
 print(difference.divergence, difference.cause)
 """
 
@@ -53,7 +53,7 @@ from runner.util.values import Json
 NOT_CONTENT: Final = ("name", "recording")
 """Keys of the configuration whose difference alone leaves the content the same."""
 _BY_PATH: Final = ("config", "provenance", "costs")
-"""Fields of a `RunDiff` that are lists of values by path."""
+"""Fields of a `RunDiff` that list values by path."""
 _MAX_EXAMPLES: Final = 10
 """Differing transitions that are described."""
 
