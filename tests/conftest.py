@@ -11,10 +11,10 @@ from pathlib import Path
 import hypothesis
 import pytest
 
-import runner.util.fewer_searches  # noqa: F401 - as the command line does it, for the imports of all test modules too
 from runner.service.processes import PRELOADED
 from runner.util.processes import process_context
 
+gc.set_threshold(50_000)  # as the command line does it, for the imports of all test modules too
 hypothesis.settings.register_profile(
     "untimed", deadline=None, max_examples=40
 )  # a loaded machine is no reason to fail

@@ -179,7 +179,8 @@ def process_context(preload: Sequence[str] = ()) -> Any:
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     if preload:  # or it would forget those of others, if it does not run yet
-        context.set_forkserver_preload(["runner.util.fewer_searches", *preload])
+        # The entry point of the command line lets Python search for garbage less often.
+        context.set_forkserver_preload(["runner.__main__", *preload])
     return context
 
 
