@@ -19,6 +19,7 @@ from runner.analysis.evaluations import (
     training_records,
 )
 from runner.analysis.sections import Answer, Grid, Section
+from runner.config.document import write_yaml
 from runner.environments.naming import states_in_words
 from runner.errors import RecordingError
 from runner.recording import schema
@@ -37,7 +38,6 @@ from runner.runs.run import Run, command_for
 from runner.util.humanize import UNKNOWN, counted, duration, measure, number, size
 from runner.util.processes import Tell
 from runner.util.values import Json, JsonView
-from runner.util.yaml_text import write_yaml
 
 MAX_PROCESSES: Final = 16
 """Names of processes shown."""

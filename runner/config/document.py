@@ -1,4 +1,4 @@
-"""YAML text to plain values, with the place of each in the text.
+"""YAML: read into plain values, with the place of each in the text, and written from plain values.
 
 The scalars are those of YAML 1.2's core schema, which editors use too: `1e-3` is a number, `no` and
 `2026-11-01` are text. The values are null, booleans, numbers, text, lists and mappings.
@@ -9,12 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import yaml
 
 from runner.errors import ConfigError, shortened
-from runner.util.yaml_text import INT, SCALARS, TAG
 
 Path = tuple[str | int, ...]
 """The place of a value in a configuration: keys and list positions from the top."""
@@ -24,6 +23,22 @@ MAX_NODES = 100_000
 """The most values of a text, with its aliases expanded."""
 
 _LONGEST = 60
+_TAG: Final = "tag:yaml.org,2002:"
+_INT: Final = re.compile(r"^(?:[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+)$")
+_SCALARS: Final = (
+    ("null", re.compile(r"^(?:~|null|Null|NULL|)$"), ["~", "n", "N", ""]),
+    ("bool", re.compile(r"^(?:true|True|TRUE|false|False|FALSE)$"), list("tTfF")),
+    ("int", _INT, list("-+0123456789")),
+    (
+        "float",
+        re.compile(
+            r"^(?:[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+            r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+        ),
+        list("-+.0123456789"),
+    ),
+)
+"""Name -> what its text looks like, and the characters that it may begin with."""
 
 
 class Place(NamedTuple):
@@ -101,8 +116,8 @@ class _Loader(yaml.SafeLoader):
         return node
 
 
-for _name, _pattern, _first in SCALARS:
-    _Loader.add_implicit_resolver(TAG + _name, _pattern, _first)
+for _name, _pattern, _first in _SCALARS:
+    _Loader.add_implicit_resolver(_TAG + _name, _pattern, _first)
 
 
 def read_yaml(text: str, source: str, *, lines: bool = True) -> Document:
@@ -145,7 +160,7 @@ class _Builder:
             )
             raise yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
         self.places.setdefault(tuple(map(str, path)), self._place(node))
-        tag_name = node.tag.removeprefix(TAG)
+        tag_name = node.tag.removeprefix(_TAG)
         if isinstance(node, yaml.MappingNode) and tag_name == "map":
             return self._mapping(node, path)
         if isinstance(node, yaml.SequenceNode) and tag_name == "seq":
@@ -178,7 +193,7 @@ class _Builder:
             message = "found a list or mapping for a key, expected text"
         elif node.value == "<<" and node.style is None:
             message = "found the merge key <<, expected the keys themselves"
-        elif node.tag != TAG + "str":
+        elif node.tag != _TAG + "str":
             message = f"found the key {_shown(node.value)}, expected text: quote it"
         else:
             return str(node.value)
@@ -205,7 +220,7 @@ def _shown(text: str) -> str:
 
 
 def _whole_number(text: str) -> int:
-    if not INT.match(text):
+    if not _INT.match(text):
         raise ValueError(text)
     return int(text, 0) if text.startswith(("0o", "0x")) else int(text)
 
@@ -224,3 +239,31 @@ _KINDS: dict[str, tuple[Callable[[str], object], str]] = {
     "str": (str, "text"),
 }
 """The scalars by tag: the conversion of their text, and their name in messages."""
+
+
+# --- writing ------------------------------------------------------------------------------------------------
+
+
+class _Dumper(yaml.SafeDumper):
+    """Quotes what YAML 1.1 or 1.2 would not read as text."""
+
+    def ignore_aliases(self, data: object) -> bool:  # noqa: ARG002 - PyYAML's signature
+        return True
+
+
+def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    return dumper.represent_scalar(_TAG + "str", text, style=None if text.isprintable() else '"')
+
+
+_Dumper.add_representer(str, _represent_text)
+for _name, _pattern, _first in _SCALARS:
+    _Dumper.add_implicit_resolver(_TAG + _name, _pattern, _first)
+
+
+def write_yaml(value: Mapping[str, object], is_compact: bool = False) -> str:
+    """Return `value` as YAML, from which `read_yaml` returns an equal value; compact with `{a: 1, b: 2}`."""
+    style = None if is_compact else False
+    text: str = yaml.dump(
+        value, Dumper=_Dumper, sort_keys=False, default_flow_style=style, allow_unicode=True, width=110
+    )
+    return text

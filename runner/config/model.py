@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, Literal, Self, get_args
 from blake3 import blake3
 from pydantic import AfterValidator, Discriminator, Field, Tag, ValidationError, model_validator
 
+from runner.config.document import write_yaml
 from runner.config.sections import (
     Algorithm,
     AlgorithmSection,
@@ -37,7 +38,6 @@ from runner.config.sections import (
     refusal,
 )
 from runner.util.values import NAME_EXPECTED, NAME_PATTERN, Json, JsonView
-from runner.util.yaml_text import write_yaml
 
 Mode = Literal["cooperative", "competitive"]
 Tables = Literal["joint", "per_agent"]

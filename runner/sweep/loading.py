@@ -12,14 +12,13 @@ from typing import Final
 from pydantic import ValidationError
 
 from runner.config import ConfigError, ExperimentConfig, load
-from runner.config.document import Document, Place, Problem, read_yaml
+from runner.config.document import Document, Place, Problem, read_yaml, write_yaml
 from runner.config.loading import experiment_in, put, read_text
 from runner.config.model import SECTION_OF
 from runner.config.schema import Schema, found, problems_at, problems_in, refuse, without_references
 from runner.config.shipped import config_path
 from runner.errors import RunnerError
 from runner.sweep.model import Sweep, SweepFile, samples_of
-from runner.util.yaml_text import write_yaml
 
 MAX_NAME: Final = 50
 """The longest name of a sweep, which is part of a tag of its runs."""

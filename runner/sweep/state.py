@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from runner.config import from_mapping
-from runner.config.document import read_yaml
+from runner.config.document import read_yaml, write_yaml
 from runner.config.loading import read_text
 from runner.config.model import identity_of
 from runner.errors import ConfigError, RunnerError, nearest
@@ -25,7 +25,6 @@ from runner.sweep.loading import from_values
 from runner.sweep.model import Sweep
 from runner.util.files import read_object, replacing, storage_errors, write_object
 from runner.util.values import JsonView, flatten
-from runner.util.yaml_text import write_yaml
 
 FAILED: Final = "failed.json"
 MAX_FAILED_BYTES: Final = 8 << 20

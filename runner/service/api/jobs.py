@@ -15,6 +15,7 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from runner.client.jobs import JobEvent, JobsPage, JobState, JobStatus
+from runner.config.document import write_yaml
 from runner.errors import ConfigError
 from runner.runs.run import Run
 from runner.service.dependencies import JobsOf, RecordedRun, require_written
@@ -29,7 +30,6 @@ from runner.service.jobs.checking import (
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob, JobEstimate, QueuedJob
 from runner.service.problems import media_docs
-from runner.util.yaml_text import write_yaml
 
 POLL_SECONDS: Final = 0.25
 """Time between two looks for new events."""

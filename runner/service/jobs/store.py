@@ -33,12 +33,11 @@ from runner.client.jobs import (
     RunOfJob,
     StateEvent,
 )
-from runner.config.document import read_yaml
+from runner.config.document import read_yaml, write_yaml
 from runner.errors import RunnerError, StorageError
 from runner.runs.run import acquired, new_run_id
 from runner.service.errors import JobNotFound, LimitReached
 from runner.util.files import replacing, storage_errors
-from runner.util.yaml_text import write_yaml
 
 if TYPE_CHECKING:
     from filelock import FileLock

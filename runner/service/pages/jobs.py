@@ -20,6 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.episodes import EpisodeRef
 from runner.analysis.sections import Paging
 from runner.client.jobs import JobStatus
+from runner.config.document import write_yaml
 from runner.config.schema import branches, expected, json_schema, without_references
 from runner.debugging.explanation import explanations_in
 from runner.environments.naming import numbered_actions
@@ -49,7 +50,6 @@ from runner.service.pages.rendering import Form, Page, StatusName, run_page, to_
 from runner.service.problems import error_body, filled
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
-from runner.util.yaml_text import write_yaml
 
 router = APIRouter(include_in_schema=False)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from sweeping import described, swept
 
+from runner.config.document import write_yaml
 from runner.sweep.loading import from_values
-from runner.util.yaml_text import write_yaml
 
 
 @pytest.fixture(scope="session")

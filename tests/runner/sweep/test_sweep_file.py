@@ -29,7 +29,7 @@ def test_a_sweep_survives_a_round_trip_as_plain_values(sweep):
 
 
 def test_a_base_is_found_relative_to_the_file(tmp_path, file):
-    from runner.util.yaml_text import write_yaml
+    from runner.config.document import write_yaml
 
     (tmp_path / "base.yaml").write_text(write_yaml(BASE))
     assert load_sweep(file(base="base.yaml")) == load_sweep(file())
