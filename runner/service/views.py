@@ -17,7 +17,6 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.contents import damage_of
 from runner.analysis.sections import Grid
 from runner.errors import RecordingError, RunnerError
-from runner.query.text import cell_of
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed
@@ -35,6 +34,7 @@ from runner.service.dependencies import (
 from runner.service.errors import EXPECTED
 from runner.service.pages.rendering import Page, StatusName, installed_names, run_page
 from runner.service.problems import filled, media_docs, status_of
+from runner.util.row_text import cell_of
 from runner.views import shipped_views, view_named
 from runner.views.queries import FIND, MAX_QUERY, MAX_ROWS, SQL
 from runner.views.view import Input, View, rows_in

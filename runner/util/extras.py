@@ -15,7 +15,7 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -66,6 +66,25 @@ def missing(module: str, extra: str, purpose: str) -> MissingExtra:
         f"{purpose} needs {_PACKAGES.get(package, package)}, which is not installed. Install it by: "
         f"{install_command(extra)}"
     )
+
+
+class _NoPandas:
+    """Finds no pandas."""
+
+    @staticmethod
+    def find_spec(name: str, *_: object) -> None:
+        if name == "pandas":
+            raise ModuleNotFoundError(name=name)
+
+
+@contextlib.contextmanager
+def without_pandas() -> Iterator[None]:
+    """Keep Arrow from loading pandas, which takes as long as a query, only to see whether it is there."""
+    sys.meta_path.insert(0, _NoPandas)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(_NoPandas)
 
 
 def install_command(extra: str) -> str:

@@ -14,6 +14,7 @@ from typing import Final
 
 UNKNOWN: Final = "–"
 _MAX_LISTED: Final = 6
+_MAX_REMARKS: Final = 5
 _CONTROLS: Final = re.compile("[\0-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 """C0 without tab and newline, DEL, C1, overrides of the writing direction, and lone surrogates."""
 
@@ -127,3 +128,9 @@ def listed(names: Sequence[str], limit: int = _MAX_LISTED) -> str:
     """Return names as text, shortened to the first few: `a, b, c, d, e, f and 3 more`."""
     more = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {more:,} more" if more > 0 else "")
+
+
+def first_remarks(remarks: Sequence[str], rest: str) -> list[str]:
+    """Return the first five remarks; if there are more, also `rest`, with {} replaced by their number."""
+    more = len(remarks) - _MAX_REMARKS
+    return [*remarks[:_MAX_REMARKS], *([rest.format(f"{more:,}")] if more > 0 else [])]

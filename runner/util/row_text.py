@@ -1,4 +1,4 @@
-"""Rows as JSON or CSV, a line each, for tables of any length."""
+"""Rows as JSON or CSV, a line each, for tables of any length; their values as cells."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Iterable, Iterator, Mapping
 
+from runner.util.humanize import UNKNOWN
 from runner.util.values import finite
 
 
@@ -41,3 +42,15 @@ def csv_lines(columns: Iterable[str], rows: Iterable[Iterable[object]]) -> Itera
     write = csv.writer(_Passed(), lineterminator="\n").writerow
     yield write(columns)
     yield from map(write, rows)
+
+
+def csv_value(value: object) -> object:
+    """Return a value as a cell of CSV."""
+    return json.dumps(value) if isinstance(value, list | dict) else value
+
+
+def cell_of(value: object) -> str:
+    """Return a value as a cell of a table."""
+    if value is None:
+        return UNKNOWN
+    return f"{value:.6g}" if isinstance(value, float) else str(csv_value(value))

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, BinaryIO, Final
 
 from runner.analysis.sections import Answer, Grid, Section
 from runner.errors import ConfigError
-from runner.query.text import cell_of, csv_value, reasons_in_words, without_pandas
-from runner.util.extras import require
-from runner.util.humanize import counted, size
-from runner.util.row_text import csv_lines, json_list
+from runner.util.extras import require, without_pandas
+from runner.util.humanize import counted, first_remarks, size
+from runner.util.row_text import cell_of, csv_lines, csv_value, json_list
 from runner.views.view import NO_PROGRESS, ONLY_HERE, PHASES, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
+    from runner.query.find import Found
     from runner.query.sql import QueryResult
     from runner.util.values import Json
 
@@ -23,6 +23,11 @@ MAX_ROWS: Final = 1000
 """The most rows of a printed table of a query, and of an answer of the service."""
 MAX_QUERY: Final = 10_000
 """The most characters of a query in SQL."""
+
+
+def _reasons(answered: QueryResult | Found) -> Iterator[str]:
+    """Yield why the first runs were left out, once all rows are read."""
+    yield from first_remarks(answered.left_out, "Runs are left out for {} more reasons.")
 
 
 def find(
@@ -126,7 +131,7 @@ def find(
         say_how_many()
 
     data = found.as_json() | ({} if marked is None else {"marked": marked})
-    return ReadyAnswer(data, sections(), lines={"quiet": lines()}, remarks=reasons_in_words(found))
+    return ReadyAnswer(data, sections(), lines={"quiet": lines()}, remarks=_reasons(found))
 
 
 FIND: Final = View(
@@ -157,7 +162,7 @@ class Rows(Answer):
             "json": json_list("rows", (dict(zip(names, row, strict=True)) for row in rows)),
             "csv": csv_lines(names, (map(csv_value, row) for row in rows)),
         }
-        self.remarks = reasons_in_words(result)
+        self.remarks = _reasons(result)
 
     def as_json(self) -> Json:
         """Return an empty object: the rows are printed by `lines`."""

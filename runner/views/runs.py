@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.analysis.sections import Answer, Grid, Section
-from runner.query.text import MAX_PROBLEMS
 from runner.runs.catalogue.columns import (
     DEFAULT_JSON,
     FIELDS,
@@ -24,7 +23,7 @@ from runner.runs.catalogue.columns import (
     needed_for,
     with_same_as,
 )
-from runner.util.humanize import capitalised
+from runner.util.humanize import capitalised, first_remarks
 from runner.util.row_text import csv_lines, json_list
 from runner.util.values import Json
 from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
@@ -166,9 +165,8 @@ class Listing(Answer):
 
     def _remarks(self) -> Iterator[str]:
         """Yield problems of damaged runs; how many matching runs are not listed, or why none is."""
-        yield from map(capitalised, self._problems[:MAX_PROBLEMS])
-        if (more := len(self._problems) - MAX_PROBLEMS) > 0:
-            yield f"{more:,} more runs are damaged: `dualtaxi ls 'status == \"damaged\"'`."
+        rest = "{} more runs are damaged: `dualtaxi ls 'status == \"damaged\"'`."
+        yield from map(capitalised, first_remarks(self._problems, rest))
         folders = ", ".join(map(str, self._recordings))
         if self._listed < self._total:
             end = self._offset + self._listed
