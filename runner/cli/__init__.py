@@ -87,9 +87,9 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
     "Share": {
         "export": ("export", "Export a run for other programs."),
         "import": ("archive", "Import a recording into the folder of runs."),
-        "remote": ("remote", "Upload and download runs; submit and control jobs."),
-        "serve": ("serve", "Serve the runs to browsers and programs over HTTP."),
-        "token": ("serve", "Create, list and revoke access tokens of a server."),
+        "remote": ("server", "Upload and download runs; submit and control jobs."),
+        "serve": ("server", "Serve the runs to browsers and programs over HTTP."),
+        "token": ("server", "Create, list and revoke access tokens of a server."),
     },
 }
 """Section -> command -> its module in `runner.cli.commands`, or `_VIEW`; and its short help."""

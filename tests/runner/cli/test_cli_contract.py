@@ -18,7 +18,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.cli.commands import remote
+from runner.cli.commands.server import Server
 from runner.cli.parameter_types import RunName
 from runner.client.jobs import JobStatus, RunOfJob
 from runner.errors import ExitCode
@@ -191,7 +191,7 @@ def server(monkeypatch, tmp_path, recorded_run, own_folder):
         cancel=lambda _: JOB,
         resume=lambda *_: JOB,
     )
-    monkeypatch.setattr(remote.Server, "client", lambda *_: contextlib.nullcontext(client))
+    monkeypatch.setattr(Server, "client", lambda *_: contextlib.nullcontext(client))
 
 
 def test_every_command_with_json_is_tested():
