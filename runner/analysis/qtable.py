@@ -144,7 +144,7 @@ def tables_of(
         RecordingError: they are not recorded.
     """
     if step is not None and episode is not None:
-        raise ConfigError("found `step` and `episode`, which exclude each other: choose one.")
+        raise ConfigError("found a step and an episode, which exclude each other: choose one.")
     if episode is not None:
         step = step_of_episode(recording, episode)
     if not recording.has_tables:

@@ -342,9 +342,7 @@ def _step_at(recording: Recording, at: EpisodeRef | None) -> Records:
         ConfigError: none is given.
     """
     if at is None:
-        raise ConfigError(
-            "found no `state` or no `action`, expected both, or `at`, the step that they are taken from."
-        )
+        raise ConfigError("found no state or no action, expected both, or a step to take them from.")
     (block,) = at.steps_in(recording).rows(at.t, at.t + 1)
     recording.mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
     step: Records = block[0]

@@ -268,7 +268,7 @@ def test_the_command_prints_what_python_returns(cooperative):
     assert text.index("The steps that add or take most") < text.index("By reward")
     for words, message in (
         (["--state", "5000", "--action", "0"], "5000"),
-        (["--state", "5"], "expected both, or `at`, the step"),
+        (["--state", "5"], "found no state or no action, expected both, or a step to take them from"),
         (["--at", STEP, "--limit", "-1"], "--limit"),
     ):
         wrong = CliRunner().invoke(cli, ["why", cooperative.run_id, *words, *recordings])
