@@ -27,7 +27,6 @@ from runner.errors import RunnerError
 from runner.service import pages, views
 from runner.service.api import files, jobs, reading, replay, runs
 from runner.service.catalogue import Catalogue
-from runner.service.computed import load_sweep_libraries
 from runner.service.dependencies import CatalogueOf, SettingsOf
 from runner.service.errors import RequestError
 from runner.service.guard import Guard
@@ -49,7 +48,6 @@ from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
 from runner.service.tokens import COOKIE, SESSION_SECONDS, Sessions, Tokens
 from runner.service.uploads import Upload, Uploads
-from runner.sweep import sweeps_in
 from runner.util import __version__
 from runner.util.processes import OWN_ONLY
 
@@ -215,8 +213,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         app.state.sweep_processes = stack.enter_context(
             ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=None)
         )
-        if any(sweeps_in(folder) for folder in settings.recordings):
-            app.state.sweep_processes.submit(limits.work_seconds, load_sweep_libraries)
         logged = {name: getattr(settings, name) for name in ("host", "port", "needs_token", "workers")}
         LOG.info("started", extra={"recordings": list(map(str, settings.recordings)), **logged})
         yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -23,6 +24,7 @@ from runner.service.api.reading import Part, found_explanation
 from runner.service.catalogue import Catalogue
 from runner.service.computed import link
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
+from runner.service.errors import Busy
 from runner.service.pages.rendering import Page, message_of
 from runner.service.response_cache import ALWAYS
 from runner.sweep import folder_of, sweeps_in, tag_of
@@ -44,8 +46,10 @@ For each what computes it, and what the page says meanwhile.
 
 
 @router.get("")
-def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
-    """Show the sweeps."""
+def sweeps(
+    request: Request, settings: SettingsOf, catalogue: CatalogueOf, processes: SweepProcesses
+) -> Response:
+    """Show the sweeps, and prepare for the page of one."""
     rows: list[tuple[str, ...]] = []
     for folder in settings.recordings:
         for name in sweeps_in(folder):
@@ -57,6 +61,9 @@ def sweeps(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
             parameters = ", ".join(sweep.file.parameters)
             runs = f"{_count_runs(catalogue, name):,}"
             rows.append((name, sweep.file.strategy, parameters, sweep.objective.description, runs))
+    if rows:
+        with contextlib.suppress(Busy):
+            processes.submit(settings.limits.work_seconds, computed.load_sweep_libraries)
     headings = ("name", "strategy", "parameters", "objective", "runs")
     listed_sweeps = Grid(headings, rows, links=[f"/sweeps/{name}" for name, *_ in rows], left=headings[:4])
     names = [name for folder in settings.recordings for name in explanations_in(folder)]

@@ -27,8 +27,10 @@ from runner.recording.record_store import RecordStore
 from runner.recording.schema import LOG_TOPIC
 from runner.runs.resolve import find_run
 from runner.runs.run import RUN_FILE, Run
+from runner.service.computed import load_sweep_libraries
 from runner.service.processes import ProcessPool
 from runner.service.settings import ServiceSettings
+from runner.sweep import FILE, folder_of
 from tests.runner.loops.making import make, play
 from tests.waiting import until
 
@@ -489,6 +491,20 @@ def test_a_run_of_values_alone_has_their_curves_and_no_empty_pages(client, recor
     assert note.startswith(
         "Each line is one run, as reported. On logarithmic axes points at 0 or below are left out"
     )
+
+
+def test_the_libraries_of_sweeps_are_loaded_when_sweeps_are_listed(
+    connect, settings, recordings, monkeypatch
+):
+    submitted = []
+    monkeypatch.setattr(ProcessPool, "submit", lambda _, seconds, function: submitted.append(function))
+    folder = folder_of("small", recordings)
+    folder.mkdir(parents=True)
+    (folder / FILE).touch()
+    client = connect(settings)
+    assert submitted == []
+    assert "small" in client.get("/sweeps").text
+    assert submitted == [load_sweep_libraries]
 
 
 def test_every_axis_that_is_offered_can_be_chosen(client, recordings):
