@@ -16,7 +16,7 @@ from blake3 import blake3
 from numpy.typing import NDArray
 
 from runner.archive.columns import Shape, Table, numbers
-from runner.archive.layout import PHASES, Entry
+from runner.archive.layout import Entry
 from runner.errors import RecordingError, RunnerError
 from runner.recording import schema
 from runner.recording.layout import HEADER_BYTES, blank_records, message_record
@@ -40,7 +40,7 @@ def batch_of(
         ValueError: a value fits into no column.
     """
     n = len(records)
-    phases = PHASES if topic.phase in PHASES else (topic.phase,)
+    phases = schema.PHASES if topic.phase in schema.PHASES else (topic.phase,)
     reads: dict[str, Callable[[Records], pa.Array]] = {
         "run_id": lambda _: _constant(0, n, (shape.run_id,)),
         "phase": lambda _: _constant(phases.index(topic.phase), n, phases),
@@ -170,7 +170,7 @@ class Batches:
     @property
     def steps(self) -> int:
         """The number of steps that were yielded."""
-        return self._counts["/train/step"] + self._counts["/eval/step"]
+        return sum(self._counts[name] for name in schema.STEP_TOPICS)
 
     def of(self, table: Table) -> Iterator[pa.RecordBatch]:
         """Yield the rows of a table in the order in which they were recorded."""
@@ -197,7 +197,7 @@ class Batches:
     def records(self, topic: Topic, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the messages of a topic, or of some of its chunks, as records.
 
-        They are `WHOLE` ones if they vary in size.
+        Of messages that vary in size, only the times and the whole message records are set.
         """
         stored = self.chunks_of(topic)
         if stored is None:

@@ -32,7 +32,7 @@ from runner.recording import schema
 from runner.recording.description import RunDescription
 from runner.recording.extras import ExtraLayout
 from runner.recording.fields import Field
-from runner.recording.layout import NUMBERS, record_dtype
+from runner.recording.layout import DTYPE_OF, record_dtype
 from runner.recording.schema import MessageType, Topic
 from runner.recording.spaces import Leaf, Value, decode, encode_bytes, encode_text, leaves_of, row_dtype
 from runner.util.arrays import Array, RecordDType, Records
@@ -360,7 +360,7 @@ class Shape:
                 return field.row_dtype
             if field.dtype is not None:
                 return field.dtype
-            return object if field.repeated else NUMBERS.get(field.kind, object)
+            return object if field.repeated else DTYPE_OF.get(field.kind, object)
 
         head = [("log_time", "<u8"), ("publish_time", "<u8"), ("record", object)]
         return np.dtype([*head, *((field.name, held(field)) for field in message.fields)])

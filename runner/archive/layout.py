@@ -51,13 +51,12 @@ ACTIONS: Final = "actions.parquet"
 METADATA: Final = "metadata.json"
 MANIFEST: Final = "manifest.json"
 
-PHASES: Final = ("train", "eval")
 TEXT: Final = pa.dictionary(pa.int8(), pa.string())
 """Repeated text: a category in pandas and Polars, plain text in DuckDB."""
 
 
 TOPICS: Final = {
-    STEPS: ("/train/step", "/eval/step"),
+    STEPS: schema.STEP_TOPICS,
     EPISODES: ("/train/episode", "/eval/episode"),
     "train_metrics.parquet": ("/train/metrics",),
     "eval_metrics.parquet": ("/eval/metrics",),

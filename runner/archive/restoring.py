@@ -107,8 +107,7 @@ class _Restorer:
         self._compare()
         if self._file is not None:
             names = self._archive.metadata_names
-            result = self._archive.metadata("result") if "result" in names else None
-            self._file.finish("" if result is None else "result", result)
+            self._file.finish(self._archive.metadata("result") if "result" in names else None)
 
     def _restore_learning(self, table: Table) -> None:
         """Restore the steps of a job, and the snapshots that they make."""
@@ -184,8 +183,8 @@ class _Restorer:
     def _send_chunk(self, topic: Topic, records: memoryview, times: Unsigned, offsets: Unsigned) -> None:
         self._pipeline.raise_failure()
         self._counts[topic.name] += len(times)
-        if topic.name in ("/train/step", "/eval/step"):
-            self._report(self._counts["/train/step"] + self._counts["/eval/step"])
+        if topic.name in schema.STEP_TOPICS:
+            self._report(sum(self._counts[name] for name in schema.STEP_TOPICS))
         self._pending.acquire()
         self._pipeline.send(topic, records, times, offsets, done=self._pending.release)
 

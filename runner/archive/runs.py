@@ -22,6 +22,7 @@ from runner.recording.integrity import may_be_cut, survey
 from runner.recording.marks import read_marks
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of
+from runner.recording.schema import STEP_TOPICS
 from runner.runs.checkpoints import Store
 from runner.runs.importing import merge_marks
 from runner.runs.resolve import run_of_id
@@ -49,7 +50,7 @@ class Archived:
     def steps(self) -> int:
         """Number of the steps in the archive."""
         topics = self.manifest.topics
-        return sum(topics[name].size for name in ("/train/step", "/eval/step") if name in topics)
+        return sum(topics[name].size for name in STEP_TOPICS if name in topics)
 
     def as_json(self) -> Json:
         """Return it as JSON, without its place."""

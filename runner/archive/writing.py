@@ -153,7 +153,7 @@ class _ArchiveWriter:
         """Compare the messages with the digests in the recording's result."""
         result = self._recording.result
         stated = result.topic_digests
-        left_out = set() if result.steps_recorded else {"/train/step", "/eval/step"}
+        left_out = set() if result.steps_recorded else set(schema.STEP_TOPICS)
         compared = (stated.keys() | topics.keys()) & schema.DIGESTED - left_out if stated else set()
         for name in sorted(compared):
             found = topics[name].blake3 if name in topics else "nothing"

@@ -411,9 +411,10 @@ class _Branches:
         phase = self._at.phase
         t = self._at.t
         limit = self._mdp.step_limit - t if self._mdp.step_limit else MAX_STEPS
+        topics = schema.topics_of(phase)
         blocks = [
             blank_records(topic, recording.layout.message(topic), count).view(np.recarray)
-            for topic, count in zip(schema.PHASES[phase], (limit, 1), strict=True)
+            for topic, count in ((topics.steps, limit), (topics.episodes, 1))
         ]
         steps: Records = blocks[0][: self._playing.play(action, *blocks)]
         times = self._step["log_time"] + np.arange(len(steps), dtype=np.uint64) * schema.STEP_NANOSECONDS

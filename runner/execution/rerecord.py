@@ -194,7 +194,7 @@ def _rerecord_job(run: Run, fresh: Path, report: Report, stop: Stop, trust: bool
         if (digest := combined_digest(digests)) != expected:
             raise Diverged("the recording", "content digest", digest, expected)
 
-    trained = [topic.name for topic in schema.TOPICS]
+    trained = [topic.name for topic in schema.JOB_TOPICS]
     rewrite(run.recording, fresh, _with_all_steps, {"rerecord": provenance()}, trained, retrain)
 
 

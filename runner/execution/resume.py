@@ -260,7 +260,7 @@ class _ResumedSession(Session):
         recording = self._recording
         if self._reference.exhausted:
             return summary
-        counts = {topic.name: recording.table(topic).count() for topic in schema.TOPICS}
+        counts = {topic.name: recording.table(topic).count() for topic in schema.JOB_TOPICS}
         evaluations = recording.eval.all_metrics()
         return summary | {
             "content_digest": None,

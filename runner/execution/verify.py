@@ -310,7 +310,7 @@ def _retrain(recording: Recording, job: Job, installed: bool, report: Report, tr
         return _with_difference(verification, error)
     reference = Reference(recording, complete)
     recorder = recorder_for(job, learner, None, reference)
-    variable = set(schema.TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
+    variable = set(schema.JOB_TOPICS) - set(schema.BLOCK_TOPICS) - {schema.LOG_TOPIC}
     recorded = {topic.name: recording.table(topic).count() for topic in variable}
 
     def all_compared() -> bool:

@@ -83,11 +83,10 @@ def _new_file(path: str, text: str) -> str:
     head = f"diff --git {name.replace('b/', 'a/', 1)} {name}\nnew file mode 100644\n"
     if not text:
         return head
-    lines = text.split("\n")
-    ending = "" if lines[-1] == "" else "\n\\ No newline at end of file\n"
-    lines = lines[:-1] if lines[-1] == "" else lines
-    body = "\n".join(f"+{line}" for line in lines)
-    return f"{head}--- /dev/null\n+++ {name}\n@@ -0,0 +1,{len(lines)} @@\n{body}{ending or chr(10)}"
+    lines = text.removesuffix("\n").split("\n")
+    body = "".join(f"+{line}\n" for line in lines)
+    ending = "" if text.endswith("\n") else "\\ No newline at end of file\n"
+    return f"{head}--- /dev/null\n+++ {name}\n@@ -0,0 +1,{len(lines)} @@\n{body}{ending}"
 
 
 def patch_parts(patch: str) -> dict[str, str]:

@@ -39,9 +39,9 @@ _MAX_WAITING: Final = 4 << 20
 _WINDOW: Final = 64
 """How many lines above the last one the cursor can still reach."""
 _FIRST_SECONDS: Final = 2.0
-"""A line without an end is recorded when it is this old, such as a progress bar,"""
+"""A line without an end, such as a progress bar, is recorded when it is this old."""
 _AGAIN_SECONDS: Final = 10.0
-"""and a line that changed after it was recorded, when it is this long ago."""
+"""A line that changed after it was recorded is recorded again this long after it."""
 _MAX_MESSAGE: Final = 1 << 16
 
 _PIECE: Final = re.compile(

@@ -201,9 +201,14 @@ class RunDescription:
         Raises:
             RecordingError: it is damaged.
         """
-        return self._maker(MAKER_RECORD)
+        return self.named_maker(MAKER_RECORD)
 
-    def _maker(self, name: str) -> EnvironmentMaker | None:
+    def named_maker(self, name: str) -> EnvironmentMaker | None:
+        """Return the maker in a metadata record of this name; None if there is none.
+
+        Raises:
+            RecordingError: it is damaged.
+        """
         if name not in self._records.metadata_names:
             return None
         return parse_maker(self._json(name), str(self.path))

@@ -123,14 +123,18 @@ class Field:
         """The constant bytes before a value of one size: its tag, and its length if it has one."""
         size = self.stored_dtype.itemsize
         if self.parts is not None or self.repeated or self.kind == Pb.TYPE_BYTES:
-            return self.heads[True] + varint(size)
+            return self.head + varint(size)
         return varint(self.number << 3 | _WIRE_TYPES[size])
 
     @cached_property
-    def heads(self) -> tuple[bytes, bytes]:
-        """What precedes the length of a value: of a text that is no UTF-8, and of any other value."""
-        number = self.number + _RAW if self.kind == Pb.TYPE_STRING else self.number
-        return varint(number << 3 | _DELIMITED), varint(self.number << 3 | _DELIMITED)
+    def head(self) -> bytes:
+        """What precedes the length of a value that has one."""
+        return varint(self.number << 3 | _DELIMITED)
+
+    @cached_property
+    def raw_head(self) -> bytes:
+        """The same for a text that is not valid UTF-8."""
+        return self.raw.head if self.kind == Pb.TYPE_STRING else self.head
 
     def put_constants(self, stored: Array, at: int) -> None:
         """Set the constant bytes within a stored value, which begins at `at` in an array of bytes."""
@@ -161,13 +165,13 @@ class Field:
         if self.parts is None:
             end = at + 4 + int.from_bytes(value[at : at + 4], "little")
             data = value[at + 4 : end]
-            return self.heads[_is_utf8(data)] + varint(len(data)) + data, end
+            return self._head_of(data) + varint(len(data)) + data, end
         pieces = []
         for part in self.parts:
             piece, at = part.encoded(value, at)
             pieces.append(piece)
         data = b"".join(pieces)
-        return self.heads[True] + varint(len(data)) + data, at
+        return self.head + varint(len(data)) + data, at
 
     def decoded(self, message: bytes, at: int) -> tuple[bytes, int]:
         """Return the value of this field, which begins at `at` in a message, and where the field ends.
@@ -189,15 +193,14 @@ class Field:
                     raise self._refused()
                 return values.tobytes(), end
             return data, end
-        heads = self.heads
         if self.parts is None:
-            is_utf8 = message.startswith(heads[True], at)
-            start, end = self._span(message, at, heads[is_utf8])
+            head = self.head if message.startswith(self.head, at) else self.raw_head
+            start, end = self._span(message, at, head)
             data = message[start:end]
-            if heads[_is_utf8(data)] != heads[is_utf8]:
+            if self._head_of(data) != head:
                 raise self._refused()
             return encode_bytes(data), end
-        at, end = self._span(message, at, heads[True])
+        at, end = self._span(message, at, self.head)
         pieces = []
         for part in self.parts:
             piece, at = part.decoded(message, at)
@@ -205,6 +208,13 @@ class Field:
         if at != end:
             raise self._refused()
         return b"".join(pieces), end
+
+    def _head_of(self, data: bytes) -> bytes:
+        try:
+            data.decode()
+        except UnicodeDecodeError:
+            return self.raw_head
+        return self.head
 
     def _span(self, message: bytes, at: int, head: bytes) -> tuple[int, int]:
         """Return where the bytes of a value with its length begin, and where they end."""
@@ -232,14 +242,6 @@ def varint(number: int) -> bytes:
         low.append(number & 0x7F | 0x80)
         number >>= 7
     return bytes([*low, number])
-
-
-def _is_utf8(text: bytes) -> bool:
-    try:
-        text.decode()
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def space_field(

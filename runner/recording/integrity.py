@@ -7,8 +7,6 @@ footer are made again from the data and compared byte by byte.
 from __future__ import annotations
 
 import contextlib
-import itertools
-import operator
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -71,8 +69,8 @@ def check_integrity(path: Path, report: Report = lambda *_: None) -> None:
     if len(found) < len(expected) and expected.startswith(found):
         raise CutOff(f"{path}: the file ends at {contents.size}, in its summary; `dualtaxi repair` mends it.")
     if found != expected:
-        same = itertools.takewhile(bool, map(operator.eq, found, expected))
-        at = sum(same)
+        pairs = enumerate(zip(found, expected, strict=False))
+        at = next((k for k, (was, should) in pairs if was != should), len(expected))
         what = "the checksum of the data section" if at < RECORD_HEAD.size + 4 else "the summary or footer"
         if at >= len(expected):
             what = "the end of the file: there are bytes after it"

@@ -42,6 +42,11 @@ class Labels:
     """In alphabetical order, without duplicates."""
     note: str = ""
 
+    def as_json(self) -> Json:
+        """Return the contents of the file; empty labels are left out."""
+        values = {"name": self.name, "tags": list(self.tags), "note": self.note}
+        return {key: value for key, value in values.items() if value}
+
 
 def read_labels(folder: Path) -> Labels:
     """Return the labels of the run in a folder; invalid ones are ignored."""
@@ -51,7 +56,7 @@ def read_labels(folder: Path) -> Labels:
         return Labels()
 
 
-def are_readable(folder: Path) -> bool:
+def are_labels_readable(folder: Path) -> bool:
     """Return whether the labels of the run in a folder can be read: a damaged file may contain `keep`."""
     try:
         return isinstance(read_object(folder / LABELS_FILE, MAX_LABELS_BYTES).get("tags", []), list)
@@ -88,7 +93,7 @@ def change_labels(folder: Path, change: Callable[[Labels], Labels]) -> Labels:
         if len(after.note) > MAX_NOTE:
             raise RunnerError(f"note: found {len(after.note):,} characters, expected at most {MAX_NOTE:,}.")
         if after != before:
-            write_object(folder / LABELS_FILE, as_json(after))
+            write_object(folder / LABELS_FILE, after.as_json())
         return after
 
 
@@ -110,12 +115,6 @@ def file_lock(path: Path) -> Iterator[None]:
             raise StorageError(
                 f"{lock}: another process has held it for {LOCK_SECONDS:.0f} s; try again."
             ) from error
-
-
-def as_json(labels: Labels) -> Json:
-    """Return labels as the contents of their file; empty ones are left out."""
-    values = {"name": labels.name, "tags": list(labels.tags), "note": labels.note}
-    return {key: value for key, value in values.items() if value}
 
 
 def is_tag(text: object) -> bool:

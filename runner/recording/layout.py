@@ -32,14 +32,14 @@ from runner.util.values import Json, is_whole
 
 _MAX_STATES: Final = 2**32
 """The most states and the most actions that steps over states number."""
-NUMBERS: Final[Mapping[int, str]] = {
+DTYPE_OF: Final[Mapping[int, str]] = {
     Pb.TYPE_DOUBLE: "<f8",
     Pb.TYPE_SFIXED64: "<i8",
     Pb.TYPE_FIXED64: "<u8",
     Pb.TYPE_FIXED32: "<u4",
     Pb.TYPE_BOOL: "?",
 }
-"""The dtypes of numbers by their types."""
+"""The dtype of each type of numbers in Protobuf."""
 MAGIC: Final = b"\x89MCAP0\r\n"
 """The first and the last bytes of an MCAP file; `mcap.writer`, which has them too, takes 20 ms to load."""
 HEADER: Final = [
@@ -151,7 +151,7 @@ def _sized(message: MessageType, sizes: Mapping[str, int]) -> MessageType:
     """Return a message with the dtypes of its numbers; `sizes` has the lengths of repeated ones."""
     fields = []
     for field in message.fields:
-        number = None if field.is_value else NUMBERS.get(field.kind)
+        number = None if field.is_value else DTYPE_OF.get(field.kind)
         shape = (sizes.get(field.name),) if field.repeated else ()
         fields.append(field if number is None else replace(field, dtype=np.dtype((number, shape))))
     return replace(message, fields=tuple(fields))

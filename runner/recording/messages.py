@@ -20,7 +20,7 @@ from runner.recording import schema
 from runner.recording.fields import Field, varint
 from runner.recording.layout import HEADER_BYTES, blank_records, constant_bytes, row_dtype
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
-from runner.recording.spaces import NUMBERS
+from runner.recording.spaces import RECORDED_DTYPE
 from runner.util.arrays import Array, Floats, Records
 from runner.util.jsonable import is_exact, restored
 from runner.util.values import Json, JsonView
@@ -387,7 +387,7 @@ def decode_array(payload: bytes) -> Snapshot:
     shape = tuple(fields["shape"])
     kind = fields["dtype"]
     data = fields["data"]
-    if not NUMBERS.fullmatch(kind) or math.prod(shape) * np.dtype(kind).itemsize != len(data):
+    if not RECORDED_DTYPE.fullmatch(kind) or math.prod(shape) * np.dtype(kind).itemsize != len(data):
         raise RecordingError(f"found an array of shape {shape}, dtype {kind!r} and {len(data)} bytes")
     values = np.frombuffer(data, kind).reshape(shape)
     return Snapshot(fields["name"], fields["phase"], fields["step"], fields["episode"], values)

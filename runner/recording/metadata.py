@@ -365,7 +365,7 @@ def write_result(
 ) -> None:
     """Write how the run ended, the index and the summary; `synced` is as for `RecordingFile.finish`."""
     with writing(file):
-        file.finish("result", _json_entry({"status": status, **result}), synced=synced)
+        file.finish(_json_entry({"status": status, **result}), synced=synced)
 
 
 def _json_entry(value: Mapping[str, object]) -> dict[str, str]:

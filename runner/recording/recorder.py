@@ -219,15 +219,15 @@ class Recorder:
             Diverged: a record differs from the one that the recording already holds.
         """
         self._pipeline.raise_failure()
-        step_topic, episode_topic = schema.PHASES[phase]
+        topics = schema.topics_of(phase)
         other = self.position - self.steps[phase]
         if steps:
             first = self.position + 1
-            self.take(step_topic, np.arange(first, first + steps, dtype=np.uint64))
+            self.take(topics.steps, np.arange(first, first + steps, dtype=np.uint64))
             self.advance(phase, steps)
         if episodes:
-            last_steps = self._filled(episode_topic, episodes)["last_step"]
-            self.take(episode_topic, last_steps.astype(np.uint64) + np.uint64(other + 1))
+            last_steps = self._filled(topics.episodes, episodes)["last_step"]
+            self.take(topics.episodes, last_steps.astype(np.uint64) + np.uint64(other + 1))
         if time.monotonic() - self._last_flush > FLUSH_SECONDS:
             self.flush()
 

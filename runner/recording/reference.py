@@ -8,28 +8,20 @@ recording is made by its own job alone, the packed data of equal chunks are take
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from runner.errors import Diverged
-from runner.recording import schema
-from runner.recording.messages import Logged, Message, decode
-from runner.recording.schema import BLOCK_TOPICS, Topic
-from runner.util.arrays import Records
-from runner.util.differences import differing_rows, first_difference
-
-if TYPE_CHECKING:
-    from runner.recording.reader import Recording
-
-
 from dataclasses import dataclass
 from typing import Self
 
-from runner.errors import RecordingError
+import numpy as np
+
+from runner.errors import Diverged, RecordingError
+from runner.recording import schema
+from runner.recording.messages import Logged, Message, decode
 from runner.recording.reader import Recording
 from runner.recording.records import ChunkEntry, chunk_head, decompress
+from runner.recording.schema import BLOCK_TOPICS, Topic
 from runner.recording.topic_chunks import ChunkSpan
+from runner.util.arrays import Records
+from runner.util.differences import differing_rows, first_difference
 
 
 class Reference:
@@ -53,7 +45,7 @@ class Reference:
         for topic in BLOCK_TOPICS:
             self._remaining[topic] = recording.table(topic).count()
             self._blocks[topic] = recording.table(topic).blocks()
-        for topic in set(schema.TOPICS) - set(BLOCK_TOPICS) - {schema.LOG_TOPIC}:
+        for topic in set(schema.JOB_TOPICS) - set(BLOCK_TOPICS) - {schema.LOG_TOPIC}:
             self._messages[topic] = recording.table(topic).messages()
         self._logged = set(recording.table(schema.LOG_TOPIC).messages())
 

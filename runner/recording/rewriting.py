@@ -84,7 +84,7 @@ def rewrite(
         add(file)
         for name, added in (more or {}).items():
             file.add_metadata(name, added)
-        file.finish("" if result is None else "result", result)
+        file.finish(result)
 
 
 def copy(path: Path, transform: Callable[[Record], Record | None], into: RecordingFile) -> None:

@@ -323,7 +323,7 @@ EVAL_METRICS_TOPIC = Topic("/eval/metrics", 6, EVAL_METRICS, "eval")
 Q_TABLE_TOPIC = Topic("/q_table", 7, Q_TABLE)
 LOG_TOPIC = Topic("/log", 8, LOG, digested=False)
 OPTIMALITY_TOPIC = Topic("/eval/optimality", 23, OPTIMALITY, "eval")
-TOPICS: Final = (
+JOB_TOPICS: Final = (
     TRAIN_STEP,
     EVAL_STEP,
     TRAIN_EPISODE,
@@ -334,7 +334,7 @@ TOPICS: Final = (
     LOG_TOPIC,
     OPTIMALITY_TOPIC,
 )
-"""The topics of what the runner itself learned, which a job determines."""
+"""The topics of a job, without those of its machine: their content follows from the job."""
 
 TRAIN_RESET, EVAL_RESET = _both("reset", 13, RESET)
 TRAIN_INFO, EVAL_INFO = _both("info", 17, INFO)
@@ -382,7 +382,7 @@ _LOOP_TOPICS: Final = (
     IMAGE_TOPIC,
 )
 KINDS: Final = {
-    "job": (*TOPICS, *MACHINE_TOPICS),
+    "job": (*JOB_TOPICS, *MACHINE_TOPICS),
     "loop": (*_LOOP_TOPICS, *MACHINE_TOPICS),
     "game": (*_LOOP_TOPICS, *MACHINE_TOPICS),
 }
@@ -424,8 +424,7 @@ ROW_TOPICS: Final = (*BLOCK_TOPICS, TRAIN_RESET, EVAL_RESET)
 
 STEP_TOPICS: Final = (TRAIN_STEP.name, EVAL_STEP.name)
 """The names of the topics that a run may leave out."""
-PHASES: Final = {"train": (TRAIN_STEP, TRAIN_EPISODE), "eval": (EVAL_STEP, EVAL_EPISODE)}
-"""The step and the episode topic of each phase of a job."""
+PHASES: Final = ("train", "eval")
 PHASE_NAMES: Final = {"train": "training", "eval": "evaluation"}
 """The phases as texts name them."""
 

@@ -33,8 +33,8 @@ MAX_VALUE_BYTES: Final = 16 << 20
 """The most that one value of a space of fixed width may take."""
 _MAX_DEPTH: Final = 16
 _MAX_PARTS: Final = 4096
-NUMBERS: Final = re.compile(r"(?:\|[biu]1|<[iu][248]|<f[248])")
-"""The dtypes that stand in a recording."""
+RECORDED_DTYPE: Final = re.compile(r"(?:\|[biu]1|<[iu][248]|<f[248])")
+"""Matches the names of the dtypes that numbers have in a recording."""
 _LENGTH: Final = struct.Struct("<I")
 
 Description = Mapping[str, Any]
@@ -163,7 +163,7 @@ def item_dtype(description: Mapping[str, object]) -> DType | None:
 
 def _array_dtype(description: Mapping[str, object], shape: object) -> DType:
     kind, dtype = description["type"], description["dtype"]
-    if not isinstance(kind, str) or not isinstance(dtype, str) or not NUMBERS.fullmatch(dtype):
+    if not isinstance(kind, str) or not isinstance(dtype, str) or not RECORDED_DTYPE.fullmatch(dtype):
         raise ValueError(f"{kind} of {dtype}")
     if not isinstance(shape, list) or not all(is_whole(n, 0, MAX_VALUE_BYTES) for n in shape):
         raise ValueError(f"shape {shape}")

@@ -244,8 +244,8 @@ COLUMNS: Final = (
     "log_time",
 )
 """The fields of a step that are kept, in the order of a message."""
-NUMBERS: Final = ("environment", "episode", "t", "log_time")
-"""Those that are stored as differences."""
+_AS_DIFFERENCES: Final = ("environment", "episode", "t", "log_time")
+"""The fields that are stored as differences from what the step before lets expect."""
 MARK: Final = np.dtype([("row", "<u4"), ("digest", f"V{DIGEST_BYTES}")])
 _MAX_BLOCK_BYTES: Final = 64 << 20
 _MAX_STEP: Final = 1 << 62
@@ -315,7 +315,7 @@ def packed(rows: Records, n: int) -> Message:
     for name in rows.dtype.names or ():
         if name in COLUMNS:
             values = np.ascontiguousarray(rows[name])
-            if name in NUMBERS:
+            if name in _AS_DIFFERENCES:
                 values[n:] -= _following(rows, name, n)
             columns.append(values.view(np.uint8).reshape(len(rows), -1).T.tobytes())
     last = np.zeros(len(rows), np.bool_)  # of an episode, in the block
@@ -362,7 +362,7 @@ def unpacked(fields: Message, dtype: RecordDType, n: int, where: str) -> Records
         size = dtype[name].itemsize
         planes = np.frombuffer(data, np.uint8, count * size, at).reshape(size, count)
         values = np.ascontiguousarray(planes.T).view(dtype[name].base).reshape(count, *dtype[name].shape)
-        if name in NUMBERS:
+        if name in _AS_DIFFERENCES:
             values = _summed(values, rows, name, n)
         rows[name] = values
         at += count * size

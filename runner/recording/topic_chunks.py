@@ -122,7 +122,7 @@ class TopicChunks:
         blocks = list(self.blocks(start, stop))
         return np.concatenate(blocks) if blocks else np.empty(0, self.row_dtype)
 
-    def chosen(self, numbers: Ints) -> Records:
+    def selected(self, numbers: Ints) -> Records:
         """Return the messages of these numbers, in their order; they must be there, and have one size."""
         ascending, order = np.unique(numbers, return_inverse=True)
         firsts, ends = self.chunk_numbers
@@ -210,13 +210,13 @@ class TopicChunks:
             ends[after] += stop - start
         return firsts, ends
 
-    def _chosen(self, chunks: Sequence[int] | None) -> Sequence[int]:
+    def _or_all(self, chunks: Sequence[int] | None) -> Sequence[int]:
         """Return the numbers of these chunks, or of all."""
         return range(len(self)) if chunks is None else chunks
 
     def _overlapping(self, times: range, chunks: Sequence[int] | None = None) -> list[int]:
         """Return the chunks, of these or of all, that may have messages of these times."""
-        numbers = np.array(self._chosen(chunks), np.intp)
+        numbers = np.array(self._or_all(chunks), np.intp)
         start, stop = (np.uint64(max(time, 0)) for time in (times.start, times.stop))
         spans = self.file.index.chunks.columns[self.places[numbers]]
         overlapping: list[int] = numbers[(spans["end_time"] >= start) & (spans["start_time"] < stop)].tolist()
@@ -264,11 +264,11 @@ class TopicChunks:
 
     def records(self, chunks: Sequence[int] | None = None) -> Iterator[bytes]:
         """Yield the message records of each of these chunks, by default of all, as they are in the file."""
-        return self.file.chunks(map(self.entry, self._chosen(chunks)))
+        return self.file.chunks(map(self.entry, self._or_all(chunks)))
 
     def stored(self, chunks: Sequence[int] | None = None) -> Iterator[Records]:
         """Yield the messages of each chunk as they are stored: message records, which must have one size."""
-        return map(self._stored, self._chosen(chunks), self.records(chunks))
+        return map(self._stored, self._or_all(chunks), self.records(chunks))
 
     def _stored(self, k: int, data: bytes) -> Records:
         self.chunk_numbers  # noqa: B018 - refuses chunks that are no multiple of the records' size
@@ -287,7 +287,7 @@ class TopicChunks:
         """
         if times is not None:
             chunks = self._overlapping(times, chunks)
-        for k in self._chosen(chunks):
+        for k in self._or_all(chunks):
             entry = self.entry(k)
             data = self.file.chunk(entry)
             channel, log_times, offsets = checked_messages(data, self.file.where(entry))

@@ -152,13 +152,11 @@ class RecordingFile:
         self._stream.truncate(self.size)
         self._stream.seek(self.size)
 
-    def finish(
-        self, name: str = "", entries: Mapping[str, str] | None = None, *, synced: bool = True
-    ) -> None:
-        """Write a last metadata record, if one is named, summary and footer, and sync the file.
+    def finish(self, result: Mapping[str, str] | None = None, *, synced: bool = True) -> None:
+        """Write the metadata record `result`, if it is given, summary and footer, and sync the file.
 
         Args:
-            name: of the record; empty for none.
+            result: the entries of the record.
             synced: False leaves syncing the file to the caller.
 
         Raises:
@@ -168,8 +166,8 @@ class RecordingFile:
         end = self.size
         metadata = dict(self._index.metadata)
         try:
-            if name:
-                self.add_metadata(name, entries or {})
+            if result is not None:
+                self.add_metadata("result", result)
             self._append(self._index.tail(self._crc))
             if synced:
                 self.sync()

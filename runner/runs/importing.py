@@ -18,7 +18,7 @@ from typing import Final
 
 from runner.errors import RecordingError, RunnerError, StorageError
 from runner.recording.description import recorded_facts
-from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, as_json, change_labels, labels_from
+from runner.recording.labels import LABELS_FILE, MAX_TAGS, Labels, change_labels, labels_from
 from runner.recording.marks import MARKS_FILE, Marks, change_marks, marks_from, read_marks
 from runner.recording.reader import Recording, open_recording
 from runner.recording.rewriting import content_of, continues, rewrite
@@ -65,7 +65,7 @@ def import_record(run: Run) -> Json:
     summary = {key: run.summary[key] for key in ("seconds", "error", "bytes") if key in run.summary}
     record: Json = {"status": run.status, "name": run.file.name, "summary": summary}
     marks = Marks() if run.stands_alone else read_marks(run.folder)
-    record |= {"labels": as_json(run.labels)} | ({"marks": marks.as_json()} if marks != Marks() else {})
+    record |= {"labels": run.labels.as_json()} | ({"marks": marks.as_json()} if marks != Marks() else {})
     return record | ({"proof": run.file.proof} if run.file.proof else {})
 
 
@@ -125,7 +125,7 @@ def import_recording(
             return Imported(run, digest, already, anonymous)
         write_object(folder / RUN_FILE, facts)
         if labels != Labels():
-            write_object(folder / LABELS_FILE, as_json(labels))
+            write_object(folder / LABELS_FILE, labels.as_json())
         if marks != Marks():
             write_object(folder / MARKS_FILE, marks.as_json())
         for path in (*folder.iterdir(), folder):

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
-from runner.recording.labels import LABELS_FILE, Labels, as_json, change_labels, read_labels
+from runner.recording.labels import LABELS_FILE, Labels, change_labels, read_labels
 from runner.recording.run_file import (
     MAX_RUN_FILE_BYTES,
     RUN_ID,
@@ -336,7 +336,7 @@ def new_run(
             **more,
         }
         if labels is not None:  # before the run is listed, so that it always has them
-            write_object(folder / LABELS_FILE, as_json(labels))
+            write_object(folder / LABELS_FILE, labels.as_json())
         write_object(folder / RUN_FILE, facts)
     return Run(folder, facts)
 

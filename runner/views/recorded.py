@@ -69,7 +69,7 @@ def episodes(
         columns = episode_columns(recording, phase, min(rows.start, total), min(rows.stop, total))
     else:
         numbers = in_order(recording, phase, order)[rows.start : rows.stop]
-        columns = columns_of_episodes(recording, recording.phase(phase).episodes.chosen(numbers))
+        columns = columns_of_episodes(recording, recording.phase(phase).episodes.selected(numbers))
     shown = [name for name in columns if name not in _HIDDEN]
     if recording.environment["penalty_below"] is None:
         shown.remove("penalties")

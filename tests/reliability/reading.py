@@ -59,7 +59,7 @@ def read_everything(path: Path) -> bool:
     except RunnerError:
         return False
     with recording:
-        for part in (read_description, read_environment, *(reader_of(topic) for topic in schema.TOPICS)):
+        for part in (read_description, read_environment, *(reader_of(topic) for topic in schema.JOB_TOPICS)):
             with contextlib.suppress(RunnerError):
                 part(recording)
         for part in (read_measures, read_episodes, read_snapshots):

@@ -348,13 +348,13 @@ def our_messages(path: Path) -> dict[str, bytes]:
                 struct.pack("<QI", time, len(payload)) + payload
                 for time, payload in recording.table(topic).messages()
             )
-            for topic in schema.TOPICS
+            for topic in schema.JOB_TOPICS
         }
 
 
 def official_messages(path: Path) -> dict[str, bytes]:
     """Return the same, as the official reader does, every checksum compared."""
-    found = {topic.name: bytearray() for topic in schema.TOPICS}
+    found = {topic.name: bytearray() for topic in schema.JOB_TOPICS}
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
         for _, channel, message in reader.iter_messages(log_time_order=False):

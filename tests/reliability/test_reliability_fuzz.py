@@ -86,7 +86,7 @@ def test_a_hostile_file_is_repaired_or_refused(seed, name, recordings, path):
         return
     assert not path.with_suffix(".repairing").exists()
     with open_recording(path) as recording:
-        for topic in schema.TOPICS:
+        for topic in schema.JOB_TOPICS:
             recording.table(topic).count()
 
 

@@ -44,7 +44,7 @@ def altered(source: Path, target: Path, topic: Topic | None, change: Change, **m
         for one in recording.topics:
             turn = change if one is topic else lambda messages: messages
             _write(file, one, *_records(recording, one, turn))
-        file.finish("result", entries["result"])
+        file.finish(entries["result"])
     return target
 
 

@@ -161,8 +161,7 @@ def evaluation_divergences(a: Recording, b: Recording) -> Iterator[Divergence]:
 def unbroken(recording: Recording) -> tuple[int, int]:
     """Return how many steps and episodes of training precede the first that were lost, if any."""
     counts = []
-    for topic in schema.PHASES["train"]:
-        table = recording.table(topic)
+    for table in (recording.train.steps, recording.train.episodes):
         lost = [start for start, _ in table.lost]
         counts.append(min([table.count() if table else 0, *lost]))
     steps, episodes = counts

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from runner.errors import RunnerError, StorageError
-from runner.recording.labels import KEEP, LABELS_FILE, are_readable
+from runner.recording.labels import KEEP, LABELS_FILE, are_labels_readable
 from runner.recording.run_file import EvaluationMetrics
 from runner.runs.catalogue.columns import IndexRow, moment
 from runner.runs.catalogue.database import Sql
@@ -261,7 +261,7 @@ def _protected(run: Run) -> str:
 
 
 def _unreadable(folder: Path) -> str:
-    if not are_readable(folder):
+    if not are_labels_readable(folder):
         return f"{folder / LABELS_FILE} cannot be read, and may say {KEEP}; repair it, or remove that file"
     return ""
 

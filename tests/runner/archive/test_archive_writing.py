@@ -34,8 +34,8 @@ def test_the_steps_are_there_in_the_order_taken_under_the_names_of_the_recording
     assert position[0] == 1
     assert set(table["run_id"].to_pylist()) == {run.run_id}
     with open_recording(run.recording) as recording:
-        for phase, (topic, _) in schema.PHASES.items():
-            steps = recording.table(topic).array()
+        for phase in schema.PHASES:
+            steps = recording.phase(phase).steps.array()
             mine = table.filter(pa.compute.equal(table["phase"], phase))
             for name in ("step", "episode", "t", "state", "action", "next_state", "terminated", "truncated"):
                 np.testing.assert_array_equal(mine[name].to_numpy(), steps[name])

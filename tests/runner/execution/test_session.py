@@ -134,7 +134,7 @@ def test_run_json_says_what_was_done(tmp_path):
     assert stored["owner"]["pid"] == os.getpid()
     summary = stored["summary"]
     with open_recording(run.recording) as recording:
-        for topic in schema.TOPICS:
+        for topic in schema.JOB_TOPICS:
             assert summary["messages"][topic.name] == recording.table(topic).count()
         last = recording.eval.all_metrics()[-1]
         assert summary["train_steps"] == recording.train.steps.count() == last["step"]
@@ -228,7 +228,7 @@ def test_a_stopped_run_is_interrupted_and_closed_properly(asked, tmp_path):
     with open_recording(run.recording) as recording, open_recording(whole.recording) as complete:
         assert recording.file.finished
         assert recording.result["status"] == recorded_facts(recording)["status"] == "interrupted"
-        for topic in set(schema.TOPICS) - {schema.LOG_TOPIC}:
+        for topic in set(schema.JOB_TOPICS) - {schema.LOG_TOPIC}:
             messages = list(recording.table(topic).messages())
             assert messages == list(complete.table(topic).messages())[: len(messages)], topic.name
         assert sum(recording.table(topic).count() for topic in schema.BLOCK_TOPICS) < sum(

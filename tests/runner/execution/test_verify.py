@@ -138,7 +138,7 @@ def test_one_cell_of_a_snapshot(run, tmp_path, number):
 
 @pytest.mark.parametrize(
     "topic",
-    sorted(set(schema.TOPICS) - {schema.LOG_TOPIC}, key=lambda topic: topic.channel),
+    sorted(set(schema.JOB_TOPICS) - {schema.LOG_TOPIC}, key=lambda topic: topic.channel),
     ids=lambda topic: topic.name,
 )
 @pytest.mark.parametrize("change", [lambda m: m[:-1], lambda m: m[:0]], ids=["one missing", "all missing"])
@@ -148,7 +148,7 @@ def test_missing_messages(run, tmp_path, topic, change):
     assert found.difference.found == "none"
 
 
-@pytest.mark.parametrize("topic", schema.TOPICS[4:7], ids=lambda topic: topic.name)
+@pytest.mark.parametrize("topic", schema.JOB_TOPICS[4:7], ids=lambda topic: topic.name)
 def test_messages_too_many(run, tmp_path, topic):
     found = verify(altered(run.recording, tmp_path / "x.mcap", topic, lambda m: [*m, m[-1]]))
     assert found.difference.topic == topic.name
@@ -249,7 +249,7 @@ def altered_without_result(source, target, change):
     data.write_bytes(source.read_bytes())
     contents = survey(data, keep_result=True)
     with RecordingFile(data, contents=contents) as file:
-        file.finish("result", {"json": "{}"})
+        file.finish({"json": "{}"})
     return altered(data, target, schema.TRAIN_METRICS_TOPIC, change)
 
 

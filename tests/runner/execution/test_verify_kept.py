@@ -37,7 +37,7 @@ def test_they_are_what_their_jobs_give(name, rerun):
 
 
 def test_they_have_every_kind_of_message(name):
-    assert set(EXPECTED[name]["messages"]) == {topic.name for topic in schema.TOPICS}
+    assert set(EXPECTED[name]["messages"]) == {topic.name for topic in schema.JOB_TOPICS}
 
 
 def test_each_state_has_its_history(name):

@@ -61,7 +61,7 @@ def described_as(source, target, change):
             data = source.read_bytes()[entry.offset :][: entry.length]
             chunk = read_record(RawRecord.of(data, entry.offset, data[9:]))
             file.add_chunk(encode_chunk(chunk.topic, chunk.records, chunk.times, chunk.offsets, Packing()))
-        file.finish("result", recording.file.metadata("result"))
+        file.finish(recording.file.metadata("result"))
     return target
 
 

@@ -258,7 +258,7 @@ def test_the_layout_for_foxglove_names_what_a_recording_has(taxis):
 
     walk(layout["layout"])
     assert panels == set(layout["configById"])
-    topics = {topic.name: topic for topic in schema.TOPICS}
+    topics = {topic.name: topic for topic in schema.JOB_TOPICS}
     with open_recording(taxis.recording) as recording:
         for panel in layout["configById"].values():
             for path in panel.get("paths", []):

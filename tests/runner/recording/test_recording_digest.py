@@ -120,7 +120,7 @@ def test_leaving_the_steps_out_leaves_only_them_out(taxis, tmp_path):
     assert run.summary["messages"] == taxis.summary["messages"], "what was done is counted all the same"
     with open_recording(run.recording) as bare, open_recording(taxis.recording) as full:
         assert bare.train.steps.count() == bare.eval.steps.count() == 0
-        for topic in set(schema.TOPICS) - {schema.TRAIN_STEP, schema.EVAL_STEP}:
+        for topic in set(schema.JOB_TOPICS) - {schema.TRAIN_STEP, schema.EVAL_STEP}:
             assert list(bare.table(topic).messages()) == list(full.table(topic).messages())
     _, topics = digest_of(run.recording)
     assert topics == {

@@ -56,7 +56,7 @@ def plain(value):
 
 def test_the_official_reader_gives_every_message_as_ours_does(run):
     messages = official_messages(run.recording)
-    assert set(messages) == {"/clock", *(topic.name for topic in schema.TOPICS)}
+    assert set(messages) == {"/clock", *(topic.name for topic in schema.JOB_TOPICS)}
     with open_recording(run.recording) as recording:
         for topic in schema.BLOCK_TOPICS:
             theirs = messages[topic.name]
@@ -183,7 +183,7 @@ def test_rerun_finds_nothing_wrong(experiment, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=quiet)
     assert done.returncode == 0, done.stdout + done.stderr
     rows = [line.split() for line in done.stdout.splitlines() if "/" in line and ".mcap" not in line]
-    assert {row[3] for row in rows} == {"/clock", *(topic.name for topic in schema.TOPICS)}
+    assert {row[3] for row in rows} == {"/clock", *(topic.name for topic in schema.JOB_TOPICS)}
     assert {row[0] for row in rows} == {"ok"}
 
 

@@ -46,11 +46,11 @@ def test_by_time(recording, topic):
 
 @pytest.mark.parametrize("phase", ["train", "eval"])
 def test_by_episode(recording, phase):
-    topic, episodes = schema.PHASES[phase]
-    records, ended = whole(recording, topic), recording.table(episodes).count()
+    topics = schema.topics_of(phase)
+    records, ended = whole(recording, topics.steps), recording.table(topics.episodes).count()
     for start in (0, 1, ended // 2, ended - 1, ended, ended + 5):
         for stop in (0, 1, ended // 2, ended, ended + 5, None):
-            found = joined(recording, topic, recording.phase(phase).steps_of_episodes(start, stop))
+            found = joined(recording, topics.steps, recording.phase(phase).steps_of_episodes(start, stop))
             behind = 10**9 if stop is None else stop
             expected = records[(records["episode"] >= start) & (records["episode"] < behind)]
             assert found.tobytes() == expected.tobytes()
