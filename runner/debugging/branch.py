@@ -29,7 +29,7 @@ from runner.loops.env import record_alone
 from runner.loops.policies import Policy, from_policy, policy_named
 from runner.recording.reader import Recording, open_recording
 from runner.recording.spaces import Value
-from runner.replay.engine import BLOCK_SECONDS, Replay
+from runner.replay.engine import BLOCK_SECONDS, Rerun
 from runner.replay.environment import episode_at
 from runner.replay.makers import stream_from_child, why_not_rerun
 from runner.replay.steppers import Stepper
@@ -269,7 +269,7 @@ def _record_branch(path: Path, folder: Path, task: EpisodeBranch) -> None:
         if reason := why_not_rerun(recording, task.trust):
             raise CannotRedo(reason)
         player = _Player(recording, folder, task)
-        make = partial(Replay, recording, task.trust, 0.0, report_progress, False)
+        make = partial(Rerun, recording, task.trust, 0.0, report_progress, False)
         with episode_at(recording, player.phase, player.episode, task.at.t, make, player.begin):
             stopped = player.play()
     report_progress((player.rec.run.run_id, player.origin, stopped, player.is_recorded_action))

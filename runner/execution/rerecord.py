@@ -28,7 +28,7 @@ from runner.recording.recorder import Recorder
 from runner.recording.rewriting import rewrite
 from runner.recording.steps import ACTION_TOPICS, after_step, is_taken
 from runner.recording.writer import RecordingFile
-from runner.replay.engine import Replay
+from runner.replay.engine import Rerun
 from runner.replay.makers import stream_from_child, why_not_rerun
 from runner.replay.recorded import Piece, pieces
 from runner.replay.steps import blank_steps, first_of, last_step, put_states, whole_records
@@ -258,15 +258,15 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
     packing = recorded_packing(recording.config)
     recorder = Recorder(file, recording.layout, packing, observer=Observer(file.path.parent))
     try:
-        with closing(Replay(recording, trust)) as replay:
+        with closing(Rerun(recording, trust)) as rerun:
             states = {phase: np.full(recording.environments, -1, np.int64) for phase in schema.PHASES}
             for piece in pieces(recording, schema.PHASES):
-                records = _whole_steps(recording, replay, piece, states[piece.phase])
+                records = _whole_steps(recording, rerun, piece, states[piece.phase])
                 positions = records["log_time"] // schema.STEP_NANOSECONDS
                 topic = topics[piece.phase]
                 names = (field.name for field in recording.layout.message(topic).fields)
                 recorder.put(topic, {name: records[name] for name in names}, positions)
-                report_progress(replay.taken)
+                report_progress(rerun.taken)
         digests = recorder.drain()
     except BaseException:
         recorder.abandon()
@@ -277,17 +277,17 @@ def _add_steps(recording: Recording, file: RecordingFile, trust: bool) -> None:
             raise Diverged(name, "digest", digests.get(name), expected)
 
 
-def _whole_steps(recording: Recording, replay: Replay, piece: Piece, states: Ints) -> Records:
+def _whole_steps(recording: Recording, rerun: Rerun, piece: Piece, states: Ints) -> Records:
     """Return the whole records of the steps of a piece; `states` are as for `put_states`."""
     records = blank_steps(recording, piece.phase, piece.rows)
-    for environment in replay.environments:
-        for steps in replay.steps(piece, environment, draws=False):
+    for environment in rerun.environments:
+        for steps in rerun.steps(piece, environment, draws=False):
             records[steps.recorded["step"] - piece.first] = whole_records(recording, steps)
-        if replay.skipped:
-            rows, _ = replay.recorded_steps(piece, environment)
-            of_environment = f" of environment {environment}" if len(replay.environments) > 1 else ""
+        if rerun.skipped:
+            rows, _ = rerun.recorded_steps(piece, environment)
+            of_environment = f" of environment {environment}" if len(rerun.environments) > 1 else ""
             raise CannotRedo(
-                f"{counted(replay.skipped, 'step')} of {schema.PHASE_NAMES[piece.phase]}{of_environment} "
+                f"{counted(rerun.skipped, 'step')} of {schema.PHASE_NAMES[piece.phase]}{of_environment} "
                 f"cannot be rerun, from its episode {rows['episode'][0]:,} on: the reset had no seed, and "
                 "the state of the random generators before it was not recorded. Whole steps are recorded of "
                 f"all episodes or of none; `dualtaxi verify {recording.run_id}` reruns the others."

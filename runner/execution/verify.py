@@ -567,12 +567,12 @@ def _rerun(path: Path, found: Verification, sample: int | None, trust: bool) -> 
 
 
 def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verification:
-    from runner.replay.engine import Replay  # loads Gymnasium
+    from runner.replay.engine import Rerun  # loads Gymnasium
 
     total = {phase: recording.phase(phase).steps.total() for phase in schema.PHASES}
     left = total.copy()
-    with closing(Replay(recording, trust, found.tolerance, report_progress)) as replay:
-        for steps in replay.all():
+    with closing(Rerun(recording, trust, found.tolerance, report_progress)) as rerun:
+        for steps in rerun.all():
             if len(steps):
                 after = total[steps.phase] - 1 - int(steps.recorded["step"][-1])
                 left[steps.phase] = min(left[steps.phase], after)
@@ -583,7 +583,7 @@ def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verifi
                 difference=steps.difference,
             )
         ended = sum(recording.phase(phase).episodes.count() for phase in schema.PHASES)
-        found = replace(found, left_out=replay.skipped, unfinished=max(0, found.episodes - ended))
+        found = replace(found, left_out=rerun.skipped, unfinished=max(0, found.episodes - ended))
     if found.difference is None and "content_digest" not in recording.result:
         found = replace(found, cut_off=sum(left.values()))
     if found.difference is None and not found.steps:

@@ -42,7 +42,7 @@ _MAX_PICTURE_BYTES: Final = 8 << 20
 """The most bytes of the pictures in a block of several steps."""
 _MAX_TEXT: Final = 200
 _Key = tuple[str, int]
-_Steps = tuple[Records, list[PlacedReset]]
+"""Phase and number of an environment; without the phase where training and evaluation share it."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +107,8 @@ class RerunSteps:
         return self
 
 
-class Replay:
-    """A replay of a recording, from its beginning or from a reset; runs foreign code in this process.
+class Rerun:
+    """A rerun of a recording, from its beginning or from a reset; runs foreign code in this process.
 
     Args:
         trust: whether what the recording names may be imported, see `runner.replay.trust`.
@@ -218,7 +218,7 @@ class Replay:
                 if steps.difference is not None:
                     return
 
-    def recorded_steps(self, piece: Piece, environment: int) -> _Steps:
+    def recorded_steps(self, piece: Piece, environment: int) -> tuple[Records, list[PlacedReset]]:
         """Return the steps of one environment, or of `ALL`, and its resets with the step that each precedes.
 
         Steps at which a vector only reset the environment are left out: the reset stands for them.

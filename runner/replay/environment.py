@@ -27,7 +27,7 @@ from runner.recording import schema
 from runner.recording.reader import Recording, open_recording
 from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
-from runner.replay.engine import Replay, RerunSteps
+from runner.replay.engine import Rerun, RerunSteps
 from runner.replay.makers import ALL, environments_of, silence, stream_from_child, why_not_rerun
 from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
 from runner.replay.steppers import Stepper
@@ -71,10 +71,10 @@ def rerun(
     """
     if make is None and (reason := why_not_rerun(recording, trust)):
         raise CannotRedo(reason)
-    begin = partial(Replay, recording, trust, tolerance, report, render, make)
+    begin = partial(Rerun, recording, trust, tolerance, report, render, make)
     if episodes is None:
-        with closing(begin()) as replay:
-            for steps in replay.all():
+        with closing(begin()) as attempt:
+            for steps in attempt.all():
                 if phase in (None, steps.phase) or steps.difference is not None:
                     yield steps
         return
@@ -154,18 +154,18 @@ class _Target:
 
 
 def rerun_episode(
-    recording: Recording, phase: str, number: int, make: Callable[[], Replay]
+    recording: Recording, phase: str, number: int, make: Callable[[], Rerun]
 ) -> Iterator[RerunSteps]:
     """Yield the steps of one episode, begun as late as possible.
 
     Args:
-        make: returns a new replay.
+        make: returns a new rerun.
     """
     target = _target(recording, phase, number)
     for start in _starts(recording, target):
         try:
-            with closing(make()) as replay:
-                yield from _held(_episode(recording, replay, target, start), is_last=start is None)
+            with closing(make()) as attempt:
+                yield from _held(_episode(recording, attempt, target, start), is_last=start is None)
             return
         except _Astray:
             continue
@@ -173,7 +173,7 @@ def rerun_episode(
 
 @contextmanager
 def episode_at(
-    recording: Recording, phase: str, number: int, t: int, make: Callable[[], Replay], on_reset: OnReset
+    recording: Recording, phase: str, number: int, t: int, make: Callable[[], Rerun], on_reset: OnReset
 ) -> Iterator[None]:
     """Bring an environment to a step of an episode, by the recorded resets and actions; close it afterwards.
 
@@ -199,24 +199,24 @@ def episode_at(
     time = _step_time(recorded.table, turns.start) - STEP_NANOSECONDS
     until = replace(target, stop_time=max(time, target.reset.time) + 1)
     start = _right_start(recording, target, make)
-    with closing(make()) as replay:
-        stepper = replay.stepper(phase, environment)
+    with closing(make()) as attempt:
+        stepper = attempt.stepper(phase, environment)
         actions = (
             action
             for piece in pieces(recording, [phase], time, target.stop_time)
-            for action in stepper.actions(replay.recorded_steps(piece, environment)[0])
+            for action in stepper.actions(attempt.recorded_steps(piece, environment)[0])
         )
-        for steps in _episode(recording, replay, until, start, lambda: on_reset(stepper, actions)):
+        for steps in _episode(recording, attempt, until, start, lambda: on_reset(stepper, actions)):
             steps.require_equal()
         yield
 
 
-def _right_start(recording: Recording, target: _Target, make: Callable[[], Replay]) -> RecordedReset | None:
+def _right_start(recording: Recording, target: _Target, make: Callable[[], Rerun]) -> RecordedReset | None:
     """Return the reset from which to begin, so that the episode's first steps agree."""
     for start in filter(None, _starts(recording, target)):
         try:
-            with closing(make()) as replay:
-                next(_held(_episode(recording, replay, target, start), is_last=False), None)
+            with closing(make()) as attempt:
+                next(_held(_episode(recording, attempt, target, start), is_last=False), None)
             return start
         except _Astray:
             continue
@@ -261,7 +261,7 @@ def _starts(recording: Recording, target: _Target) -> Iterator[RecordedReset | N
 
 def _episode(
     recording: Recording,
-    replay: Replay,
+    attempt: Rerun,
     target: _Target,
     start: RecordedReset | None,
     on_reset: Callable[[], None] = lambda: None,
@@ -276,15 +276,15 @@ def _episode(
         CannotRedo: the state of the random generators at its beginning is not known.
     """
     reset = target.reset
-    is_whole = ALL in replay.environments
+    is_whole = ALL in attempt.environments
     is_begun = False
     environment = ALL if is_whole else reset.environment
-    replay.drawn = reset.environment
+    attempt.drawn = reset.environment
     for piece, is_target in _approach(recording, target, start, is_whole):
         if is_target and not is_begun:
             on_reset()
             is_begun = True
-        for steps in replay.steps(piece, environment, is_target and replay.render, start):
+        for steps in attempt.steps(piece, environment, is_target and attempt.render, start):
             if is_target and steps.environment == reset.environment:
                 yield replace(
                     steps, starts=[begun for begun in steps.starts if begun.reset.number >= reset.number]
@@ -294,7 +294,7 @@ def _episode(
             elif steps.difference is not None:
                 yield replace(steps, recorded=steps.recorded[:0], got=steps.got[:0], starts=(), frames=())
                 return
-        if is_target and not replay.is_known(reset.phase, environment):
+        if is_target and not attempt.is_known(reset.phase, environment):
             raise CannotRedo(
                 f"{reset.phase} episode {target.number} began with a reset without a seed, and the state of "
                 "the random generators before it was not recorded."
