@@ -64,7 +64,7 @@ _T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
-class Wrapper:
+class WrapperSpec:
     """The parts of Gymnasium's `WrapperSpec` that a recording gives."""
 
     entry_point: str
@@ -80,7 +80,7 @@ class EnvironmentSpec:
     """None of a vector that has an entry point of its own."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     max_episode_steps: Annotated[int, Meta(ge=1, le=2**62)] | None = None
-    additional_wrappers: tuple[Wrapper, ...] = ()
+    additional_wrappers: tuple[WrapperSpec, ...] = ()
     """From the innermost out."""
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class GameSpec:
 
     entry_point: str
     kwargs: Mapping[str, Any] = field(default_factory=dict)
-    wrappers: tuple[Wrapper, ...] = ()
+    wrappers: tuple[WrapperSpec, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what names no function."""
@@ -121,7 +121,7 @@ def modules_of(maker: EnvironmentMaker) -> list[str]:
 
 
 def parsed(kind: type[_T], text: str) -> _T:
-    """Return the specification in a JSON text: an `EnvironmentSpec`, a `GameSpec` or a tuple of `Wrapper`s.
+    """Return the specification in a JSON text: an `EnvironmentSpec`, a `GameSpec` or `WrapperSpec`s.
 
     Raises:
         CannotRedo: it is too long, or a part is missing or of the wrong type.
@@ -134,9 +134,9 @@ def parsed(kind: type[_T], text: str) -> _T:
         raise CannotRedo(str(error)) from error
 
 
-def vector_wrappers(vector: VectorMaker) -> list[Wrapper]:
+def vector_wrappers(vector: VectorMaker) -> list[WrapperSpec]:
     """Return the wrappers around a vector that change what it returns, from the innermost out."""
-    wrappers = parsed(tuple[Wrapper, ...], vector.wrapper_specs or "[]")
+    wrappers = parsed(tuple[WrapperSpec, ...], vector.wrapper_specs or "[]")
     return [wrapper for wrapper in wrappers if not is_left_out(wrapper.entry_point)]
 
 
@@ -187,7 +187,8 @@ def make_environment(maker: EnvironmentMaker, trust: bool, render: bool = False)
         if maker.make and trust:
             env = _made_by_function(maker.make, render)
         else:
-            env = _MADE[maker.kind](maker, trust, render)
+            make = _made_game if maker.kind == "pettingzoo" else _made
+            env = make(maker, trust, render)
         return as_parallel(env)
 
 
@@ -364,14 +365,6 @@ def _made_game(maker: EnvironmentMaker, trust: bool, render: bool) -> Any:
     return game
 
 
-_MADE: Final[Mapping[str, Callable[[EnvironmentMaker, bool, bool], Any]]] = {
-    "gymnasium": _made,
-    "vector": _made,
-    "pettingzoo": _made_game,
-}
-"""Kind of an environment, of which a vector has several -> the function that makes it."""
-
-
 def _made_by_function(name: str, render: bool) -> Any:
     """Return what the function `module:function` of the user returns."""
     make = _attribute(name)
@@ -390,7 +383,7 @@ def _made_by_function(name: str, render: bool) -> Any:
     return env
 
 
-def _wrapper(spec: Wrapper, base: type, trust: bool) -> Any:
+def _wrapper(spec: WrapperSpec, base: type, trust: bool) -> Any:
     """Return the class of a wrapper.
 
     Raises:
@@ -402,6 +395,59 @@ def _wrapper(spec: Wrapper, base: type, trust: bool) -> Any:
     if not (isinstance(wrapper, type) and issubclass(wrapper, base)):
         raise CannotRedo(f"{spec.entry_point} is not a wrapper of Gymnasium.")
     return wrapper
+
+
+# --- whether a recording can be rerun -----------------------------------------------------------------
+
+
+def why_not_rerun(recording: Recording, trust: bool = False) -> str:
+    """Return why the recorded actions cannot be repeated in the environment; empty if it can be tried."""
+    if not recording.has_actions:
+        return "No steps were recorded."
+    if recording.lost:
+        return "A part of the recording was lost, and what follows depends on it."
+    first, reason = 0, ""
+    for shard in recording.shards:
+        phases = [
+            phase for phase, n in zip(schema.PHASES, (shard.train_steps, shard.eval_steps), strict=True) if n
+        ]
+        for maker in (recording.phase(phase).maker_of(first) for phase in phases):
+            if maker is not None and is_whole_vector(maker):
+                return (
+                    "A process stepped a vector that cannot be taken apart. As several processes recorded "
+                    "the run, its environments are recorded one by one."
+                )
+            reason = reason or _why_not_made_of(recording, maker, trust)
+        first += shard.environments
+    return reason or _why_not_made_of(recording, recording.maker, trust)
+
+
+def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust: bool) -> str:
+    try:
+        with trusting(recording.path, maker, trust) as is_trusted:
+            return why_not_made(maker, is_trusted)
+    except CannotRedo as error:
+        return str(error)
+
+
+def why_uncertain(recording: Recording, trust: bool) -> str:
+    """Return why a difference shows nothing, as some arguments are not known; empty if all are."""
+    for phase in recording.phases:
+        for given in phase.reset_options():
+            if not given.is_exact:
+                return (
+                    f"The options of {phase.title} reset {given.reset:,} could not be recorded exactly; with "
+                    f"{shortened(given.json, _MAX_OPTIONS)} the environment begins in another way."
+                )
+    firsts = itertools.accumulate((shard.environments for shard in recording.shards), initial=0)
+    makers = [recording.phase(phase).maker_of(first) for first in firsts for phase in schema.PHASES]
+    known = [maker for maker in makers if maker is not None and maker.assumed]
+    made = [maker for maker in known if not (maker.make and (trust or own_mark(recording.path, maker)))]
+    names = ", ".join(dict.fromkeys(name for maker in made for name in maker.assumed))
+    return names and (
+        f"The arguments of {names} could not be recorded, and with those that were assumed it is another "
+        'environment. Runs recorded with a function that makes it, make="module:function", can be verified.'
+    )
 
 
 # --- in a child process -------------------------------------------------------------------------------
@@ -479,53 +525,3 @@ def _without_display() -> None:
 
 def _short(error: BaseException) -> str:
     return " ".join(str(error).split())[:500]
-
-
-def why_not_rerun(recording: Recording, trust: bool = False) -> str:
-    """Return why the recorded actions cannot be repeated in the environment; empty if it can be tried."""
-    if not recording.has_actions:
-        return "No steps were recorded."
-    if recording.lost:
-        return "A part of the recording was lost, and what follows depends on it."
-    first, reason = 0, ""
-    for shard in recording.shards:
-        phases = [
-            phase for phase, n in zip(schema.PHASES, (shard.train_steps, shard.eval_steps), strict=True) if n
-        ]
-        for maker in (recording.phase(phase).maker_of(first) for phase in phases):
-            if maker is not None and is_whole_vector(maker):
-                return (
-                    "A process stepped a vector that cannot be taken apart. As several processes recorded "
-                    "the run, its environments are recorded one by one."
-                )
-            reason = reason or _why_not_made_of(recording, maker, trust)
-        first += shard.environments
-    return reason or _why_not_made_of(recording, recording.maker, trust)
-
-
-def _why_not_made_of(recording: Recording, maker: EnvironmentMaker | None, trust: bool) -> str:
-    try:
-        with trusting(recording.path, maker, trust) as is_trusted:
-            return why_not_made(maker, is_trusted)
-    except CannotRedo as error:
-        return str(error)
-
-
-def why_uncertain(recording: Recording, trust: bool) -> str:
-    """Return why a difference shows nothing, as some arguments are not known; empty if all are."""
-    for phase in recording.phases:
-        for given in phase.reset_options():
-            if not given.is_exact:
-                return (
-                    f"The options of {phase.title} reset {given.reset:,} could not be recorded exactly; with "
-                    f"{shortened(given.json, _MAX_OPTIONS)} the environment begins in another way."
-                )
-    firsts = itertools.accumulate((shard.environments for shard in recording.shards), initial=0)
-    makers = [recording.phase(phase).maker_of(first) for first in firsts for phase in schema.PHASES]
-    known = [maker for maker in makers if maker is not None and maker.assumed]
-    made = [maker for maker in known if not (maker.make and (trust or own_mark(recording.path, maker)))]
-    names = ", ".join(dict.fromkeys(name for maker in made for name in maker.assumed))
-    return names and (
-        f"The arguments of {names} could not be recorded, and with those that were assumed it is another "
-        'environment. Runs recorded with a function that makes it, make="module:function", can be verified.'
-    )

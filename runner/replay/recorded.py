@@ -63,7 +63,10 @@ class RecordedReset(NamedTuple):
     def is_known(self) -> bool:
         """Whether its episode can be repeated without those before it, but for what outlives a reset."""
         state = self.state
-        return self.seed is not None or (state is not None and not is_empty(state))
+        has_state = state is not None and (
+            state.np_random_seed is not None or state.bit_generator is not None or state.ale_state != b""
+        )
+        return self.seed is not None or has_state
 
     @property
     def arguments(self) -> Json:
@@ -85,11 +88,6 @@ class RecordedReset(NamedTuple):
         """Return whether a rerun can begin here; with `start`, whether this is that reset."""
         is_start = start is None or (self.phase, self.number) == (start.phase, start.number)
         return self.is_known and is_start
-
-
-def is_empty(state: ResetState) -> bool:
-    """Return whether a state holds nothing that a reset could depend on."""
-    return state.np_random_seed is None and state.bit_generator is None and not state.ale_state
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,14 +15,12 @@ from runner.recording import schema
 from runner.recording.messages import Message, frame_place
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.spaces import Value, least_number
+from runner.recording.topic_chunks import FOREVER
 from runner.replay.recorded import RecordedReset, reset_of
 from runner.util.arrays import Ints, Records
 
 if TYPE_CHECKING:
     from runner.replay.engine import RerunSteps  # loads Gymnasium
-
-_END_OF_TIME: Final = 2**62
-"""Later than any message, in nanoseconds."""
 
 
 def step_of_episode(recording: Recording, episode: int) -> int:
@@ -209,7 +207,7 @@ def recorded_frames(
     begin = earliest - len(turns) * schema.STEP_NANOSECONDS if reset is None else reset.time
     frames = (
         (int(frame["log_time"]), frame_place(frame)[1], frame)
-        for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), _END_OF_TIME))
+        for frame in recording.phase(phase).frames.decoded(times=range(max(0, begin), FOREVER))
         if frame_place(frame)[0] == recorded.place
     )
     frame = None

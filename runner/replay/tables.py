@@ -308,7 +308,7 @@ class DerivedTables(Generic[S]):
         self._next = next(self._snapshots, None)
 
 
-# --- checkpoints in the cache -------------------------------------------------------------------------
+# --- tables in the cache --------------------------------------------------------------------------------
 
 CHECKPOINT_STEPS: Final = 1 << 20
 """Training steps between checkpoints: replayed in well under half a second."""
@@ -316,8 +316,8 @@ MAX_CACHE_BYTES: Final = 2 * 10**9
 """The most that all checkpoints of all runs take; beyond it the least recently used are removed."""
 
 
-class Checkpoints:
-    """The checkpoints of one recording.
+class TableCache:
+    """The tables of one recording at some steps, its checkpoints, in the user's cache.
 
     Args:
         recording: the run; unless it is finished, there are no checkpoints, as it may still change.
@@ -425,7 +425,7 @@ class TableReplay(StepReplay):
         super().__init__(recording.config, recording.mdp, recording.seed or 0, str(recording.path))
         self._recording = recording
         self._recorded = recording.train.steps.count()
-        self._checkpoints = Checkpoints(recording)
+        self._cache = TableCache(recording)
         self._origin: int | None = None
         """The step from which the recording alone moved the tables; None if they were set by hand."""
         self._load(*self._nearest(step))
@@ -494,7 +494,7 @@ class TableReplay(StepReplay):
             raise RecordingError(f"{self._where}: found Q-tables of shape {shapes}, expected {expected}.")
         if step - nearest[0] <= CHECKPOINT_STEPS:
             return nearest
-        at, tables = self._checkpoints.nearest(step, [table.shape for table in self.learner.snapshot()])
+        at, tables = self._cache.nearest(step, [table.shape for table in self.learner.snapshot()])
         return (at, name_tables(tables, self.learner.kinds)) if at > nearest[0] else nearest
 
     def advance(self, stop: int, rows: Floats = NO_ROWS, trace: Trace = NO_TRACE) -> None:
@@ -525,8 +525,8 @@ class TableReplay(StepReplay):
                     yield part
                     is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
                     if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
-                        self._checkpoints.save(self.step, self.learner.snapshot())
-        self._checkpoints.prune()
+                        self._cache.save(self.step, self.learner.snapshot())
+        self._cache.prune()
         if self.step < stop:
             raise self._lost(stop)
 
