@@ -153,7 +153,7 @@ def tables_of(
     step = last_step(recording) if step is None else step
     number = None if state is None else state_of(mdp, state)  # before the tables are replayed
     replay = TableReplay(recording, step)
-    tables = [summarize(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
+    tables = [_summary(agent, q) for agent, q in zip(replay.agents, replay.tables, strict=True)]
     description: TablesDescription = {"run_id": recording.run_id, "step": replay.step, "tables": tables}
     if number is not None:
         history = history_of(recording, number, replay.step)
@@ -201,7 +201,7 @@ def _recorded(recording: Recording, step: int | None, state: str | None) -> QTab
     description: TablesDescription = {
         "run_id": recording.run_id,
         "step": step,
-        "tables": [{**summarize(name, q), "snapshot_step": latest[name].step} for name, q in tables.items()],
+        "tables": [{**_summary(name, q), "snapshot_step": latest[name].step} for name, q in tables.items()],
     }
     if state is not None:
         state_count, action_count = _shape(recording)
@@ -262,7 +262,7 @@ def one_array(tables: Sequence[Floats]) -> Floats:
     return whole
 
 
-def summarize(agent: str, q: Floats) -> TableSummary:
+def _summary(agent: str, q: Floats) -> TableSummary:
     """Return size, fill and range of a learner's table [states, actions]."""
     zeros = int(q.size - np.count_nonzero(q))
     return {

@@ -26,6 +26,22 @@ EXPLANATION: Final = (
     "twenty such, one is wrong on average. Those under 'together' hold all at once, over all pairs and "
     f"metrics compared (t intervals of trimmed means; from {FEWEST_TOGETHER} seeds on)."
 )
+AGGREGATES: Final[tuple[tuple[str, Callable[[AlgorithmResult], Estimate]], ...]] = (
+    ("IQM", lambda result: result.iqm),
+    ("median", lambda result: result.median),
+    ("mean", lambda result: result.mean),
+    ("optimality gap", lambda result: result.optimality_gap),
+)
+TASKS_EXPLANATION: Final = (
+    "IQM: mean of the middle half of all runs of all environments. Median and mean: over the mean scores of "
+    "the environments. Optimality gap: by how much scores fall short of 1; lower is better. P: the chance "
+    "that a run of A scores higher than one of B, the mean over environments, equal ones counted half. In "
+    "brackets: 95 % percentile intervals of a bootstrap that resamples the seeds of each environment "
+    "(Agarwal et al. 2021)."
+)
+
+
+# --- groups of runs -----------------------------------------------------------------------------------
 
 
 def sections(comparison: Comparison) -> list[Section]:
@@ -96,7 +112,7 @@ def _metric(metric: MetricResult) -> Section:
         grids.append(Grid(headings, [_pair(pair, together) for pair in metric.pairs]))
     if len(metric.thresholds) > 1:
         sign = "at most" if metric.higher_is_better is False else "at least"
-        grids.append(profile_grid(metric.groups, metric.thresholds, sign))
+        grids.append(_profile_grid(metric.groups, metric.thresholds, sign))
     sentences = [f"{metric.name}, in {metric.unit}; {better[metric.higher_is_better]}."]
     sentences += [f"Note: {note}." for note in (*metric.notes, *unpaired(metric.pairs))]
     return Section(metric.title + line, sentences, grids)
@@ -132,51 +148,7 @@ def _pair(pair: PairResult, together: bool) -> tuple[str, ...]:
     )
 
 
-def profile_grid(
-    results: Sequence[GroupResult] | Sequence[AlgorithmResult], thresholds: Sequence[float], sign: str
-) -> Grid:
-    """Return a few points of performance profiles; the sign is `at least` or `at most`."""
-    at = spread_over(len(thresholds))
-    rows = [(result.label, *(f"{100 * result.profile[k]:.0f} %" for k in at)) for result in results]
-    return Grid((f"share of runs {sign}", *(number(thresholds[k]) for k in at)), rows)
-
-
-def spread_over(count: int) -> list[int]:
-    """Return the indices of a few of `count` points, evenly spread from the first to the last."""
-    points: list[int] = np.unique(np.linspace(0, count - 1, _MAX_LEVELS).round().astype(int)).tolist()
-    return points
-
-
-def number(value: float, signed: bool = False) -> str:
-    """Return a number with three or more digits that count; a level that is not reached is infinite."""
-    if math.isnan(value):
-        return "–"
-    if math.isinf(value):
-        return ("+∞" if value > 0 else "-∞") if signed else "never"
-    digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 100 else 2
-    return f"{value:{'+' if signed else ''},.{digits}f}"
-
-
-def interval(estimate: Estimate, signed: bool = False) -> str:
-    """Return an interval: `[1.2, 3.4]`."""
-    if math.isnan(estimate.low):
-        return "–"
-    return f"[{number(estimate.low, signed)}, {number(estimate.high, signed)}]"
-
-
-AGGREGATES: Final[tuple[tuple[str, Callable[[AlgorithmResult], Estimate]], ...]] = (
-    ("IQM", lambda result: result.iqm),
-    ("median", lambda result: result.median),
-    ("mean", lambda result: result.mean),
-    ("optimality gap", lambda result: result.optimality_gap),
-)
-TASKS_EXPLANATION: Final = (
-    "IQM: mean of the middle half of all runs of all environments. Median and mean: over the mean scores of "
-    "the environments. Optimality gap: by how much scores fall short of 1; lower is better. P: the chance "
-    "that a run of A scores higher than one of B, the mean over environments, equal ones counted half. In "
-    "brackets: 95 % percentile intervals of a bootstrap that resamples the seeds of each environment "
-    "(Agarwal et al. 2021)."
-)
+# --- algorithms over environments ---------------------------------------------------------------------
 
 
 def task_sections(comparison: TaskComparison) -> list[Section]:
@@ -206,13 +178,13 @@ def task_sections(comparison: TaskComparison) -> list[Section]:
         Section(
             f"Normalised scores: {comparison.title}",
             [f"{comparison.metric}, {comparison.moment}; normalised by {comparison.normalised_by}."],
-            grids(comparison),
+            _task_grids(comparison),
         ),
         Section("How to read this", [TASKS_EXPLANATION]),
     ]
 
 
-def grids(comparison: TaskComparison) -> list[Grid]:
+def _task_grids(comparison: TaskComparison) -> list[Grid]:
     """Return the aggregates, the probabilities of improvement, profiles and curves as tables."""
     headings = [heading for name, _ in AGGREGATES for heading in (name, "95 %")]
     rows = [
@@ -231,10 +203,45 @@ def grids(comparison: TaskComparison) -> list[Grid]:
         ]
         all_grids.append(Grid(("A", "B", "P(A higher)", "95 %"), pairs))
     if len(comparison.thresholds) > 1:
-        all_grids.append(profile_grid(comparison.algorithms, comparison.thresholds, "at least"))
+        all_grids.append(_profile_grid(comparison.algorithms, comparison.thresholds, "at least"))
     if len(comparison.positions) > 1:
-        at = spread_over(len(comparison.positions))
+        at = _spread_over(len(comparison.positions))
         curves = [(result.label, *(number(result.curve[k]) for k in at)) for result in comparison.algorithms]
         places = (f"{comparison.positions[k]:,.6g}" for k in at)
         all_grids.append(Grid((f"IQM after {comparison.axis}", *places), curves))
     return all_grids
+
+
+# --- parts of both ------------------------------------------------------------------------------------
+
+
+def _profile_grid(
+    results: Sequence[GroupResult] | Sequence[AlgorithmResult], thresholds: Sequence[float], sign: str
+) -> Grid:
+    """Return a few points of performance profiles; the sign is `at least` or `at most`."""
+    at = _spread_over(len(thresholds))
+    rows = [(result.label, *(f"{100 * result.profile[k]:.0f} %" for k in at)) for result in results]
+    return Grid((f"share of runs {sign}", *(number(thresholds[k]) for k in at)), rows)
+
+
+def _spread_over(count: int) -> list[int]:
+    """Return the indices of a few of `count` points, evenly spread from the first to the last."""
+    points: list[int] = np.unique(np.linspace(0, count - 1, _MAX_LEVELS).round().astype(int)).tolist()
+    return points
+
+
+def number(value: float, signed: bool = False) -> str:
+    """Return a number with three or more digits that count; a level that is not reached is infinite."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return ("+∞" if value > 0 else "-∞") if signed else "never"
+    digits = 0 if abs(value) >= 1000 else 1 if abs(value) >= 100 else 2
+    return f"{value:{'+' if signed else ''},.{digits}f}"
+
+
+def interval(estimate: Estimate, signed: bool = False) -> str:
+    """Return an interval: `[1.2, 3.4]`."""
+    if math.isnan(estimate.low):
+        return "–"
+    return f"[{number(estimate.low, signed)}, {number(estimate.high, signed)}]"

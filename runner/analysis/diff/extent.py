@@ -30,13 +30,23 @@ from runner.recording.reader import Recording
 from runner.util.arrays import Floats, Ints, Records
 
 T = TypeVar("T")
-
 _MAX_STATES: Final = 5
 """States that are named."""
+_MAX_CELLS: Final = 5
+"""Cells with the largest differences that are listed."""
 _BATCH_EPISODES: Final = 4096
 _BATCH_STEPS: Final = 1 << 15
 _ALIGNED: Final = FIELDS[2:]
 """The fields compared of steps of the same time in the same episode."""
+_COMPARED: Final = (
+    *(metric.name for metric in METRICS),
+    "training.mean_length",
+    "training.percent_filled",
+    "training.mean_return",
+)
+
+
+# --- training -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -218,8 +228,7 @@ def _without_fields(steps: Records) -> Records:
     return steps.view(f"V{steps.itemsize}")
 
 
-_MAX_CELLS: Final = 5
-"""Cells with the largest differences that are listed."""
+# --- Q-tables -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -315,12 +324,7 @@ def own_actions_in_words(mdp: Mdp, table: int, width: int) -> list[str]:
     return names[table] if names else [f"action {j}" for j in range(width)]
 
 
-_COMPARED: Final = (
-    *(metric.name for metric in METRICS),
-    "training.mean_length",
-    "training.percent_filled",
-    "training.mean_return",
-)
+# --- metrics ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
