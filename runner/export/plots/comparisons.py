@@ -40,6 +40,7 @@ _MEASURES: Final = (
     ("mean", "mean difference", 1),
     ("greedy_share", "other greedy action, %", 100),
 )
+"""Fields of a `TableDiff`, their labels and the factors of their axes."""
 _SCORE: Final = "normalised score"
 _LETTERS: Final = 150
 """Letters of a note on a line of the sheet."""
@@ -47,7 +48,9 @@ _NAMES: Final = 205.0
 """Where charts begin, right of the names of settings."""
 _WIDTH: Final = 590.0
 _ROW: Final = 20.0
+"""Width of a chart of mixtures, and height of a bar's row, in points."""
 _MAX_NAME: Final = 38
+"""Letters of a setting's name."""
 
 
 # --- groups of runs -----------------------------------------------------------------------------------

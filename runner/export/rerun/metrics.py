@@ -19,7 +19,6 @@ from runner.export.rerun.tracks import (
     OVERVIEW,
     PLOTS,
     Colour,
-    Floats,
     Times,
     Track,
     TrackView,
@@ -31,7 +30,7 @@ from runner.recording import schema
 from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
-from runner.util.arrays import Array
+from runner.util.arrays import Array, Floats
 
 SCHEDULES: Final = ("epsilon", "step_size", "discount")
 EVENTS: Final = TrackView(

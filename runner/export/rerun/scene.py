@@ -23,7 +23,6 @@ from runner.environments.mdp import Mdp, SceneDescription
 from runner.environments.naming import action_names, numbered_actions, spoken, states_in_words
 from runner.export.rerun.tracks import (
     GREY,
-    Floats,
     Points,
     Track,
     TrackView,
@@ -32,7 +31,7 @@ from runner.export.rerun.tracks import (
     pairs,
     repeated,
 )
-from runner.util.arrays import Ints, Records
+from runner.util.arrays import Floats, Ints, Records
 
 _SPACING: Final = 0.34
 """Between movers in one cell, so that both are visible."""

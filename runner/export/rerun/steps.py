@@ -25,7 +25,6 @@ from runner.export.rerun.metrics import EVENTS, log_track, phase_colours, series
 from runner.export.rerun.scene import GridLabels, Placements, Scene, crossing_lines
 from runner.export.rerun.tracks import (
     GREY,
-    Floats,
     Points,
     Times,
     Track,
@@ -42,7 +41,7 @@ from runner.export.rerun.tracks import (
 from runner.learning.kernel import StateProbe
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay, are_within, known_steps
-from runner.util.arrays import Flags, Ints, Ints32, Records
+from runner.util.arrays import Flags, Floats, Ints, Ints32, Records
 
 TRAIL_STEPS: Final = 5
 TITLE_Y: Final = -0.62

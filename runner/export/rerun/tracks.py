@@ -33,7 +33,6 @@ MAX_QUEUED: Final = 40 * MAX_ROWS
 _STRIP: Final = rr.components.LineStrip2D.arrow_type()
 Colour = tuple[int, ...]
 GREY: Final[Colour] = palette.rgb(palette.MIDTONE)
-Floats = NDArray[np.float64]
 Points = NDArray[np.float32]
 """[..., 2]: x and y."""
 Times = dict[str, Array]
