@@ -481,7 +481,7 @@ class Content:
                 parts = [len(value).to_bytes(4, "little") + value for value in values.tolist()]
                 data = b"".join(parts)
             else:
-                dtype = self._layout.rows(topic)[name]
+                dtype = self._layout.row_dtype(topic)[name]
                 data = np.ascontiguousarray(values, dtype.base).tobytes()
             self.digests[topic.name, name].update(data)
 

@@ -100,7 +100,7 @@ class Layout:
         """Return the dtype of a topic's message records in the file; None if they vary in size."""
         return record_dtype(self.message(topic))
 
-    def rows(self, topic: Topic) -> RecordDType:
+    def row_dtype(self, topic: Topic) -> RecordDType:
         """Return the dtype in which the messages of one of `schema.ROW_TOPICS` are put down and read."""
         return row_dtype(self.message(topic))
 

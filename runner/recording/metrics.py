@@ -147,7 +147,13 @@ TRAINING_METRICS: Final = (
         "lower_to_goal",
         field="mean_length",
     ),
-    Metric("training.mean_return", "Return of training episodes", "summed reward, mean", "higher", True),
+    Metric(
+        "training.mean_return",
+        "Return of training episodes",
+        "summed reward, mean",
+        "higher",
+        per_agent=True,
+    ),
     Metric("training.mean_reward", "Reward in training", "per step, running mean", "higher"),
     Metric(
         "training.percent_filled",

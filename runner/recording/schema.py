@@ -449,8 +449,18 @@ class PhaseTopics:
 def topics_of(phase: str) -> PhaseTopics:
     """Return the topics of a phase."""
     topics = {topic.name.rpartition("/")[2]: topic for topic in ALL_TOPICS if topic.phase == phase}
-    names = "step actions episode reset reset_options reset_state info frame extra metrics"
-    return PhaseTopics(*(topics[name] for name in names.split()))
+    return PhaseTopics(
+        steps=topics["step"],
+        actions=topics["actions"],
+        episodes=topics["episode"],
+        resets=topics["reset"],
+        reset_options=topics["reset_options"],
+        reset_states=topics["reset_state"],
+        infos=topics["info"],
+        frames=topics["frame"],
+        extras=topics["extra"],
+        metrics=topics["metrics"],
+    )
 
 
 NUMBERED_BY: Final = {STEP: "step", EPISODE: "episode", RESET: "reset"}

@@ -99,8 +99,8 @@ class Stepper:
         self._after = "next_state" if self._has_states else "next_observation"
         topics = recording.train.topics
         agents = recording.agents
-        steps = recording.layout.rows(topics.steps)
-        resets = recording.layout.rows(topics.resets)
+        steps = recording.layout.row_dtype(topics.steps)
+        resets = recording.layout.row_dtype(topics.resets)
         ends = [("rewards", "<f8", (len(agents),)), ("terminated", "?"), ("truncated", "?")]
         masks = [(f"agents_{name}", "<u4") for name in _ENDS[1:] if len(agents) > 1]
         self._ends_dtype = np.dtype(ends)

@@ -100,7 +100,7 @@ def whole_steps(recording: Recording, phase: str, episode: int) -> Records:
         RecordingError: actions of the episode were lost, or it is too long for an array.
     """
     steps = recording.phase(phase).episode(episode)
-    if len(steps) * recording.layout.rows(steps.table.topic).itemsize > MAX_EPISODE_BYTES:
+    if len(steps) * recording.layout.row_dtype(steps.table.topic).itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
             f"{recording.path}: {phase} episode {episode} has {len(steps):,} steps, too many to rerun for "
             f"an array; `dualtaxi rerecord {recording.run_id}` records them."
@@ -118,7 +118,7 @@ def _whole_steps(path: Path, _changed: int, phase: str, episode: int) -> Records
             raise RecordingError(
                 f"{path}: steps of {schema.PHASE_NAMES[phase]} episode {episode:,} were lost."
             )
-        parts = [np.empty(0, recording.layout.rows(recorded.table.topic))]
+        parts = [np.empty(0, recording.layout.row_dtype(recorded.table.topic))]
         states = np.zeros(1, np.int64)
         for steps in rerun_in_child(path, phase, [episode]):
             parts.append(whole_records(recording, steps))
@@ -131,7 +131,7 @@ def _whole_steps(path: Path, _changed: int, phase: str, episode: int) -> Records
 def blank_steps(recording: Recording, phase: str, rows: Records) -> Records:
     """Return whole records of recorded actions, without states, observations and rewards."""
     topic = recording.phase(phase).steps.topic
-    records = np.zeros(len(rows), recording.layout.rows(topic))
+    records = np.zeros(len(rows), recording.layout.row_dtype(topic))
     for name in rows.dtype.names or ():
         if name != "digest":
             records[name] = rows[name]

@@ -166,9 +166,8 @@ class CodeCollector:
         """Return the provenance in `run.json`, with the commit if it is known."""
         provenance = run.facts.get("provenance")  # of a resumed run, whose file may hold anything
         own = provenance.items() if isinstance(provenance, dict) else ()
-        return {key: text for key, text in own if isinstance(text, str)} | {
-            key: self.entries[key] for key in ("git",) if key in self.entries
-        }
+        git = {"git": self.entries["git"]} if "git" in self.entries else {}
+        return {key: text for key, text in own if isinstance(text, str)} | git
 
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.

@@ -95,7 +95,7 @@ def mark_of(folder: Path, name: str = MARK_FILE) -> TrustMark:
         seal = values.pop("seal")
         key = _key(False)
         if key is not None and hmac.compare_digest(str(seal).encode(), _seal(values, key).encode()):
-            lists = {name: tuple(values[name]) for name in ("environments", "folders")}
+            lists = {key: tuple(values[key]) for key in ("environments", "folders")}
             return TrustMark(**(values | lists))
     return TrustMark()
 

@@ -51,7 +51,7 @@ _LEFT_OVER: Final = re.compile(
     r"|\.[0-9a-f]{8}\.(run|labels|marks|trust)\.json|(run|labels)\.[0-9a-f]{8}\.tmp"
 )
 _COLUMNS: Final = ("root", "entry", "id", "name", "status", "tags", "digest")
-"""The columns of the index that are needed of a run."""
+"""The columns of the index that `usage_of` needs of a run."""
 _KEY: Final = re.compile(r"-[0-9a-f]+(\.\w+)+$")
 """The end of a cached file's name, after the ids."""
 

@@ -333,7 +333,7 @@ def test_messages_of_varying_size_that_no_recorder_writes_are_refused(change):
     )
     layout = layout_of("loop", 1, 0, json.dumps({"observation": text, "action": number}))
     message = layout.message(schema.TRAIN_STEP)
-    rows = np.zeros(1, layout.rows(schema.TRAIN_STEP))
+    rows = np.zeros(1, layout.row_dtype(schema.TRAIN_STEP))
     rows["action"][0], rows["next_observation"][0] = bytes(8), b"\3\0\0\0abc"
     (payload,) = encode_rows(message, rows)
     (back,) = decode_rows(message, [(0, payload)])
@@ -365,7 +365,7 @@ def test_a_number_that_is_cut_in_a_message_of_varying_size_is_refused():
     text, number = {"type": "Text", "max_length": 9}, {"type": "Box", "dtype": "<f8", "shape": [2]}
     layout = layout_of("loop", 1, 0, json.dumps({"observation": number, "action": text}))
     message = layout.message(schema.TRAIN_STEP)
-    rows = np.zeros(1, layout.rows(schema.TRAIN_STEP))
+    rows = np.zeros(1, layout.row_dtype(schema.TRAIN_STEP))
     rows["action"][0], rows["next_observation"][0] = b"\1\0\0\0a", bytes(16)
     (payload,) = encode_rows(message, rows)
     for size in range(len(payload)):
