@@ -33,7 +33,7 @@ _MAX_POSITION: Final = 2**63 // STEP_NANOSECONDS
 def batch_of(
     table: Table, topic: Topic, records: Records, shape: Shape, names: Sequence[str] | None = None
 ) -> pa.RecordBatch:
-    """Return the columns of message records; all of them, or those of some names.
+    """Return the columns of message records; all of them, or some by name.
 
     Raises:
         RecordingError: a message cannot be decoded.
@@ -121,7 +121,7 @@ def _decoded(topic: Topic, records: Records, shape: Shape) -> Records:
 
 
 def _encode(topic: Topic, records: Records, shape: Shape) -> None:
-    """Set the messages of records to those of their fields."""
+    """Encode the fields of records, and set their messages."""
     columns = {field.name: records[field.name].tolist() for field in shape.messages[topic].fields}
     for name in columns:
         if (space := shape.space(topic, name)) is not None:
@@ -239,7 +239,7 @@ class Batches:
         """Return the columns of message records, which turn back into exactly these records.
 
         Args:
-            number: that of the first message.
+            number: the number of the first message.
 
         Raises:
             RecordingError: they do not: a message has what no recorder writes.

@@ -283,7 +283,7 @@ class Table:
     name: str
     """Its file."""
     topics: tuple[Topic, ...]
-    """The topics of its messages: one, or those of training and of evaluation."""
+    """The topics of its messages: one, or one of training and one of evaluation."""
     messages: tuple[ArchiveColumn, ...]
     """The columns of the messages, besides run, phase and position."""
     gives_tables: bool = False
@@ -340,10 +340,10 @@ class Shape:
             topic: dtype if (dtype := record_dtype(message)) is not None else self._dtype(topic, message)
             for topic, message in self.messages.items()
         }
-        """The dtype of each topic's records: message records, or those of `_dtype`."""
+        """The dtype of each topic's records: as in the file, or as `_dtype` returns it."""
 
     def topics_of(self, table: Table) -> list[Topic]:
-        """Return the topics whose records a table holds: of extras, those of each layout."""
+        """Return the topics whose records a table holds; for extras, a topic for each layout."""
         return [topic for topic, _ in self._extras] if table.name == layout.EXTRAS else [*table.topics]
 
     def space(self, topic: Topic, field: str) -> SpaceColumns | None:

@@ -182,7 +182,7 @@ class Archive(RunDescription):
 
 
 def check_table(file: pq.ParquetFile, where: str, size: int, columns: pa.Schema, rows: int) -> None:
-    """Check what a table declares, before any of it is unpacked; `size` is that of its file.
+    """Check what a table declares, before any of it is unpacked; its file has `size` bytes.
 
     Raises:
         RecordingError: it has other columns or rows, or is made to exhaust the disk.

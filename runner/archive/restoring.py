@@ -142,7 +142,7 @@ class _Restorer:
         """Yield the rows of each topic.
 
         Raises:
-            RecordingError: there is a phase other than those of the topics.
+            RecordingError: there is a phase that none of the topics has.
         """
         if len(table.topics) == 1:
             yield table.topics[0], batch

@@ -42,9 +42,9 @@ class Findings:
     """Steps whose reward the environment's table excludes."""
     first_off_table: int = 0
     begun_by_reset: int = 0
-    """Episodes after one that terminated or was truncated which began with a reset."""
+    """Episodes that a reset began after the episode before had terminated or was truncated."""
     begun_without: int = 0
-    """Such episodes which began without one."""
+    """Episodes that began without a reset after such an end."""
     first_without: int = 0
     """The first step of the first of these."""
     last_time: int = 0
@@ -150,7 +150,7 @@ class _PhaseCheck:
         self._mdp = recording.mdp if recording.tabular and self._is_whole else None
         self._episodes = EpisodeLog(self._n, self._learners, self._mdp, recording.layout.has_turns)
         self._environments = np.arange(self._n)
-        """The environments of the last round: those of shards follow one another."""
+        """The environments of the last round; the environments of shards follow one another."""
         self._over = np.zeros(self._n, np.bool_)
         """Whether the last step of each environment terminated or truncated its episode."""
         self._state = np.full(self._n, -1, np.int64)

@@ -230,7 +230,7 @@ class RunDescription:
 
     @cached_property
     def spaces(self) -> Json:
-        """The descriptions of the `observation` and the `action` space; of a job those of its tables."""
+        """The descriptions of the `observation` and `action` spaces; a job has the spaces of its tables."""
         if self.layout.spaces:
             return spaces_of(self.run, str(self.path))
         number = {"type": "Discrete", "start": 0, "dtype": "<i8", "shape": []}
@@ -239,7 +239,7 @@ class RunDescription:
 
     @property
     def environments(self) -> int:
-        """How many environments step at once; 1 also for those of shards, whose steps follow one another."""
+        """How many environments step at once; 1 for shards too, whose steps follow one another."""
         return int(self.run.get("environments", "1"))
 
     @cached_property
@@ -284,5 +284,5 @@ def recorded_facts(run: RunDescription) -> Json:
 
 
 def environment_count(run: RunDescription) -> int:
-    """Return how many environments resets name: those of all shards, or those that took turns."""
+    """Return how many environments resets name, summed over the shards if there are any."""
     return sum(shard.environments for shard in run.shards) or run.environments

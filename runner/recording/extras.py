@@ -39,7 +39,7 @@ from runner.util.arrays import Array, DType, Ints, MaskedArray, Records, zeros
 from runner.util.values import is_whole
 
 MAX_NAMES: Final = 256
-"""The most names of extras in a recording; those of each agent count."""
+"""The most names of extras in a recording; the names of each agent count."""
 MAX_NAME_LENGTH: Final = 200
 MAX_EXTRA_BYTES: Final = 1 << 20
 """The most bytes of a step's extras."""
@@ -57,7 +57,7 @@ class ExtraLayout:
     number: int
     """Counted from 0; its channels and schema follow from it."""
     start_time: int
-    """Nanoseconds: that of the first step that has them."""
+    """Log time in nanoseconds of the first step with these names."""
     columns: Mapping[str, Description]
     """The description of each name's values, as `spaces` has them: a `Box`, an `Array`, or a `Text`."""
 

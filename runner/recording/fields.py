@@ -128,7 +128,7 @@ class Field:
 
     @cached_property
     def head(self) -> bytes:
-        """What precedes the length of a value that has one."""
+        """What precedes the length of a value."""
         return varint(self.number << 3 | _DELIMITED)
 
     @cached_property
@@ -144,7 +144,7 @@ class Field:
             part.put_constants(stored, start)
 
     def are_exact(self, values: Array, stored: Array) -> bool:
-        """Return whether numbers, read from those that are stored in more bytes, are the stored ones."""
+        """Return whether numbers that are stored in more bytes were read without loss."""
         if self.parts is not None:
             inside: tuple[Any, Any] = values, stored
             return all(part.are_exact(*(column[part.name] for column in inside)) for part in self.parts)

@@ -123,7 +123,7 @@ def value_of(space: Space, text: str) -> object:
 
 
 class RecordedSpace(Generic[SpaceT]):
-    """A space as it is recorded; here one that Gymnasium knows nothing more of: its values become text.
+    """A space as it is recorded. The base class is for spaces unknown to Gymnasium: values become text.
 
     The text of a string is the string, of other values JSON, or their `repr`.
 

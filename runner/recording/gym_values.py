@@ -59,7 +59,7 @@ class LeafValues:
         self._on_rounded = on_rounded
         self.name = what + "".join(f"[{key!r}]" for key in keys)
         self.blank = encode_text("") if space.dtype is None else bytes(space.dtype.itemsize)
-        """The bytes of the value of an agent that has none."""
+        """The bytes that stand for the value of an agent without a value."""
         if space.dtype is None:
             return
         self.base = np.dtype(space.dtype.base.str)
@@ -411,7 +411,7 @@ def only_number(value: object, what: str, kinds: str = "iubf", expected: str = "
 
     Args:
         kinds: the kinds of dtypes that it may have.
-        expected: what it is, for the error.
+        expected: what was expected, for the error.
 
     Raises:
         RecordingError: it is something else.

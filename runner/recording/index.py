@@ -178,7 +178,7 @@ class Index:
     channel_records: bytes = b""
 
     def check_unpacked_size(self, path: str) -> None:
-        """Refuse a file whose chunks declare far more bytes than those of any recording of its size.
+        """Refuse a file whose chunks declare far more bytes than any recording of its size holds.
 
         Raises:
             RecordingError: they do.
@@ -375,7 +375,7 @@ def read_index(stream: BinaryIO, path: str) -> Index:
 
 
 def check_beginning(stream: BinaryIO) -> int:
-    """Refuse a file that is not an MCAP file, or that of another program; return where its header ends.
+    """Refuse a file of another program, or that is no MCAP file; return where its header ends.
 
     Raises:
         CutOff: its header is cut off or damaged.

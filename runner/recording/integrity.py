@@ -35,7 +35,7 @@ from runner.util.packing import MAX_CHUNK_BYTES
 
 
 def refuse_foreign(path: Path) -> None:
-    """Refuse a file of another program, or one that is not an MCAP file.
+    """Refuse a file of another program, or that is no MCAP file.
 
     Raises:
         RecordingError: it is such a file, or cannot be read.
@@ -199,7 +199,7 @@ def _take_records(stream: BinaryIO, contents: Index, keep_result: bool, report: 
 
 
 def _check_times(chunk: ReadChunk) -> None:
-    """Check that the times of a chunk are those of its messages."""
+    """Compare the times that a chunk declares with the times of its messages."""
     found = chunk.entry.start_time, chunk.entry.end_time
     expected = int(chunk.times[0]), int(chunk.times[-1])
     if found != expected:

@@ -209,7 +209,7 @@ def rows_of(message: MessageType, records: Records) -> Records:
 def blank_records(topic: Topic, message: MessageType, n: int) -> Records:
     """Return n message records of a topic with every constant byte set and every value 0.
 
-    Rows of messages that vary in size are not those of a file, and have no constant bytes.
+    Messages that vary in size are encoded when they are written: their rows have no constant bytes.
     """
     dtype = record_dtype(message)
     if dtype is None:

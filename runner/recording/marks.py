@@ -5,7 +5,7 @@
                                          "removed": ["3f2a9c01b7de"]}
 
 A mark is identified by a hash of its content. Marks of two people are merged: the union of both, without
-those that either of them removed. The file is replaced atomically, under a lock.
+what either of them removed. The file is replaced atomically, under a lock.
 """
 
 from __future__ import annotations
@@ -75,14 +75,14 @@ class Mark:
 
 @dataclass(frozen=True)
 class Marks:
-    """The marks of a run, and the ids of those that were removed."""
+    """The marks of a run, and the ids of removed marks."""
 
     marks: tuple[Mark, ...] = ()
     """In the order of their steps."""
     removed: frozenset[str] = frozenset()
 
     def merged(self, more: Iterable[Mark], removed: Iterable[str] = ()) -> Marks:
-        """Return these marks and more, without those that were removed on either side."""
+        """Return these marks and more, without the marks that either side removed."""
         gone = self.removed.union(removed)
         by_id = {mark.id: mark for mark in (*self.marks, *more) if mark.id not in gone}
         order = sorted(by_id.values(), key=lambda mark: (mark.phase, mark.episode, mark.t, mark.created))

@@ -1,4 +1,4 @@
-"""Messages as protobuf: their descriptors and classes, and those of variable size encoded and decoded."""
+"""Messages as protobuf: descriptors and classes; messages of variable size, encoded and decoded."""
 
 from __future__ import annotations
 
@@ -120,13 +120,13 @@ def encode(message: MessageType, values: Mapping[str, object]) -> bytes:
 
 @lru_cache(64)
 def _numbers_of(message: MessageType) -> MessageType:
-    """Return a message with the fields alone that come before its values of varying size."""
+    """Return the message type without its values of varying size, which come last."""
     fields = tuple(field for field in message.fields if not field.is_value)
     return replace(message, fields=fields, varies=False)
 
 
 def encode_rows(message: MessageType, rows: Records) -> list[bytes]:
-    """Return a message for each row; those of varying size."""
+    """Return the payload of each row, for messages of varying size."""
     numbers = _numbers_of(message)
     records = blank_records(schema.LOG_TOPIC, numbers, len(rows))
     for field in numbers.fields:
@@ -459,7 +459,7 @@ class ResetOptions(NamedTuple):
     large_seed: int | None = None
     """The seed, if it has more than 64 bits."""
     resets: int = 1
-    """How many consecutive resets have the options: those of one call, which resets several environments."""
+    """How many consecutive resets have the options: one call may reset several environments."""
 
     @property
     def options(self) -> dict[str, object] | None:
@@ -469,7 +469,7 @@ class ResetOptions(NamedTuple):
 
     @property
     def is_exact(self) -> bool:
-        """Whether the options are those that the environment got."""
+        """Whether the environment got exactly these options."""
         return is_exact(self.json) and (not self.json or self.options is not None)
 
     def to_payload(self) -> bytes:

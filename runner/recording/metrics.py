@@ -58,7 +58,7 @@ class EvaluationMetric(Metric):
     of_trials: Callable[[Records], NDArray[Any]]
     """Returns the value of each trial, [trials] or [trials, agents], from its `Episode` records."""
     combine: Callable[[NDArray[Any]], Any] = _mean
-    """Returns one value for those of all trials: a number, or [agents]."""
+    """Combines the values of all trials: to a number, or [agents]."""
 
     @property
     def key(self) -> str:

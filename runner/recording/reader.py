@@ -132,7 +132,7 @@ class Recording(RunDescription):
 
     @cached_property
     def _places(self) -> Mapping[Topic, NDArray[np.intp]]:
-        """The numbers of the chunks of the file that hold each topic; of extras, those of all layouts."""
+        """The numbers of the chunks that hold each topic; for extras, the chunks of all layouts."""
         channels = self.file.channels % schema.LAYOUT_STRIDE
         return {topic: np.flatnonzero(channels == topic.channel) for topic in schema.ALL_TOPICS}
 
@@ -219,7 +219,7 @@ class Recording(RunDescription):
                 raise
 
     def snapshots(self, step: int = 0, tables: int = 0) -> Iterator[QTable]:
-        """Yield the snapshots in order, without those that are older than needed for `step`.
+        """Yield the snapshots in order, from the oldest that is needed for `step`.
 
         All tables of the last moment at or before `step` are included, and of the moment before it.
 

@@ -137,7 +137,7 @@ class Recorder:
         return self._file.size if self._file is not None else 0
 
     def set_layout(self, layout: Layout) -> None:
-        """Change the messages of the run, before there are any of those that change."""
+        """Change the types of messages of which none was recorded yet."""
         for topic, lane in self._lanes.items():
             message = layout.message(topic)
             if lane.message.fields != message.fields:

@@ -116,7 +116,7 @@ class ChunkEntry(NamedTuple):
 
 @dataclass(frozen=True)
 class Chunk:
-    """An encoded chunk: its MCAP records, and its entry without its place and that of its index."""
+    """An encoded chunk: its MCAP records, and its entry, in which the places are still missing."""
 
     record: bytes
     index: bytes
@@ -528,7 +528,7 @@ def metadata_record(name: str, entries: Mapping[str, str]) -> bytes:
 
 @lru_cache(16)
 def _pairs(entries: tuple[tuple[str, str], ...]) -> bytes:
-    """Return the entries of a metadata record; those that list packages are the same in the next run."""
+    """Return the entries of a metadata record; cached, because the next run has the same packages."""
     return b"".join(prefixed(text) for pair in entries for text in pair)
 
 

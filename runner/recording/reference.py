@@ -1,4 +1,4 @@
-"""The messages of another recording: compared with those that a run gives, or their packed chunks used again.
+"""The messages of another recording: compared with the messages of a run, or used again as packed chunks.
 
 A job determines its content, so doing it again gives the recorded messages, byte for byte, and then those
 that are still missing. This is how a run is resumed, and how a recording is verified. Where the other

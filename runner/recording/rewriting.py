@@ -101,7 +101,7 @@ def copy(path: Path, transform: Callable[[Record], Record | None], into: Recordi
 def content_of(path: Path) -> str:
     """Return the content digest of a recording, after checking every checksum and every message.
 
-    If the recording states a digest, it must be the same; of a killed run, it is that of the whole chunks.
+    If the recording states a digest, it must be the same. The digest of a killed run covers its whole chunks.
 
     Raises:
         RecordingError: it is damaged, or states another digest than its messages have.

@@ -55,7 +55,7 @@ class EvaluationMetrics:
     """Training episodes before it."""
     trials: int | None = None
     values: Mapping[str, float | None] = field(default_factory=dict)
-    """Value by name of a metric; the sum over agents of one that each agent has."""
+    """Value by name of a metric; a metric of each agent is summed over the agents."""
 
     @classmethod
     def of(cls, record: JsonView) -> EvaluationMetrics:

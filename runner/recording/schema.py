@@ -60,7 +60,7 @@ _FIXED64, _MESSAGE, _ENUM = Pb.TYPE_FIXED64, Pb.TYPE_MESSAGE, Pb.TYPE_ENUM
 
 
 def _fields(first: int = 1, /, **kinds: int | list[int]) -> tuple[Field, ...]:
-    """Return fields numbered from `first` on, in this order; a kind in a list is that of a repeated field."""
+    """Return fields numbered from `first` on, in this order; a kind in a list makes a repeated field."""
     return tuple(
         Field(number, name, kind[0], repeated=True) if isinstance(kind, list) else Field(number, name, kind)
         for number, (name, kind) in enumerate(kinds.items(), first)
@@ -334,7 +334,7 @@ JOB_TOPICS: Final = (
     LOG_TOPIC,
     OPTIMALITY_TOPIC,
 )
-"""The topics of a job, without those of its machine: their content follows from the job."""
+"""The topics of a job, without the topics of its machine."""
 
 TRAIN_RESET, EVAL_RESET = _both("reset", 13, RESET)
 TRAIN_INFO, EVAL_INFO = _both("info", 17, INFO)
@@ -393,9 +393,9 @@ ALL_TOPICS: Final = tuple(
 MAX_LAYOUTS: Final = 256
 """The most layouts of extras in a recording."""
 LAYOUT_STRIDE: Final = 100
-"""What the ids of channels and schema of a layout of extras differ by from those of the one before."""
+"""The distance between the ids of channels and schemas of two consecutive layouts of extras."""
 TOPIC_OF: Final = {topic.channel: topic for topic in ALL_TOPICS}
-"""Channel -> its topic; those of extras have a channel for each layout."""
+"""Channel -> its topic; topics of extras have a channel for each layout."""
 TOPIC_OF.update(
     (channel, replace(topic, channel=channel))
     for topic in (TRAIN_EXTRA, EVAL_EXTRA)

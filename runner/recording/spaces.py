@@ -45,7 +45,7 @@ Value = Any
 
 @dataclass(frozen=True)
 class Leaf:
-    """A part of a space that has no parts: where it is, and what stands there."""
+    """A part of a space without parts of its own: its path, and the dtype of its values."""
 
     path: tuple[str, ...]
     """Keys of `Dict`s and numbers of `Tuple`s, from the outermost in."""
@@ -86,7 +86,7 @@ def row_dtype(description: Description) -> DType:
 
 
 def least_number(description: Mapping[str, object]) -> int:
-    """Return the least number of a `Discrete` space; 0 where its description has none that is possible."""
+    """Return the least number of a `Discrete` space; 0 if its description states no valid one."""
     start = description.get("start")
     return start if is_whole(start, -(2**62), 2**62) else 0
 

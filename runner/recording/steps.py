@@ -254,7 +254,7 @@ _MAX_STEP: Final = 1 << 62
 def kept_dtype(step: RecordDType) -> RecordDType:
     """Return the dtype of steps of which the actions were recorded.
 
-    `digest` is that of the episode up to this step, or all zeros where none was recorded.
+    `digest` covers the episode up to this step; it is all zeros where none was recorded.
 
     Args:
         step: the dtype of whole records.

@@ -32,7 +32,7 @@ class ChunkSpan(NamedTuple):
 
     first: int
     stop: int
-    """The number after that of its last message."""
+    """One more than the number of its last message."""
     entry: ChunkEntry
 
 
@@ -81,7 +81,7 @@ class TopicChunks:
         return self.file.index.chunks[int(self.places[k])]
 
     def count(self) -> int:
-        """Return the number after that of the last message, or how many there are if they have none."""
+        """Return how many messages there are; lost messages before the last count if they are numbered."""
         if self.dtype is not None:
             _, ends = self.chunk_numbers
             return int(ends[-1]) if len(ends) else 0

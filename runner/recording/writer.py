@@ -87,7 +87,7 @@ class RecordingFile:
             raise
 
     def begin(self, beginning: Beginning) -> None:
-        """Append schemas and channels, at first those of the run."""
+        """Append schemas and channels; the schemas and channels of the run come first."""
         self._append(beginning.schema_records + beginning.channel_records)
         self._index.declare(beginning)
 

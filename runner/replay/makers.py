@@ -77,7 +77,7 @@ class EnvironmentSpec:
 
     id: str
     entry_point: str | None = None
-    """None of a vector that has an entry point of its own."""
+    """None for a vector with an entry point of its own."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     max_episode_steps: Annotated[int, Meta(ge=1, le=2**62)] | None = None
     additional_wrappers: tuple[WrapperSpec, ...] = ()

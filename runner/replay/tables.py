@@ -580,7 +580,7 @@ def known_steps(recording: Recording) -> list[tuple[int, int]]:
 
 
 def are_within(spans: Sequence[tuple[int, int]], steps: Ints) -> Flags:
-    """Return which steps are within ranges such as those of `known_steps`."""
+    """Return which steps are within ranges, as `known_steps` returns them."""
     edges = [edge for first, last in spans for edge in (first, last + 1)]
     is_inside: Flags = np.searchsorted(edges, steps, side="right") % 2 == 1
     return is_inside

@@ -24,7 +24,7 @@ SECRET_NAMES: Final = (
     "cookie",
     "authorization",
 )
-"""A name that contains one of these, in any case, is that of a secret; `tokenizer` is not."""
+"""A name that contains one of these, in any case, names a secret; `tokenizer` does not."""
 _MIN_VARIABLE: Final = 12
 """The shortest value of an environment variable that is looked for; shorter ones are words."""
 _NAME: Final = re.compile("|".join(SECRET_NAMES).replace("token", "token(?!i[sz])"), re.IGNORECASE)
@@ -41,7 +41,7 @@ _FILE: Final = re.compile(
 SETTINGS_FILES: Final = (".toml", ".yaml", ".yml", ".json", ".cfg", ".ini", ".xml")
 """Ends of the names of settings files, which hold secrets if they have the name of one: `api-key.json`."""
 _HARMLESS: Final = re.compile(r"\d{1,5}|\d?\.\d{1,5}|true|false|none|null", re.IGNORECASE)
-"""Values that stay, such as that of `--max-tokens 512`, unless the name has `pass`."""
+"""Values that stay, such as 512 in `--max-tokens 512`, unless the name has `pass`."""
 _BUT_TOKEN: Final = (
     "secret|passw(?:or)?d|passphrase|credential|authorization|cookie|"
     "(?:api|access|private|auth|account|signing|encryption)[_-]?key"

@@ -56,11 +56,11 @@ PREVIEW: Final = "upload"
 STOP_FILE: Final = "stop"
 """Its presence requests that the loop stops."""
 SHARDS_FOLDER: Final = "shards"
-"""The folder, in that of a run, of what processes that joined it record until the run is over."""
+"""The subfolder of a run for what joined processes record until the run is over."""
 UNFOLDED_FOLDER: Final = "unfolded"
-"""The folder, in that of a run, of those shards whose content is not all in the run's recording."""
+"""The subfolder of a run for shards whose content is not all in the run's recording."""
 UNLISTED: Final = Path(".explain", "runs")
-"""The folder, in that of recordings, of runs that are found by their ids alone: those of explanations."""
+"""The subfolder of recordings for the runs of explanations, which are found by their ids alone."""
 _MADE_BY: Final = ("host", "git", "dualtaxi")
 RECORDINGS_VARIABLE: Final = "DUALTAXI_RECORDINGS"
 
@@ -380,7 +380,7 @@ def require_over(run: Run) -> None:
 
 
 def require_trained(run: Run, is_trained: bool, refusal: str) -> None:
-    """Refuse a run that was not trained here, or one that was.
+    """Refuse a run of the wrong kind: trained here, or recorded from a loop.
 
     Args:
         is_trained: whether the run must have been trained here; else it must be a loop.
@@ -398,7 +398,7 @@ def made_by(provenance: Mapping[str, str]) -> dict[str, str]:
 
 
 def recordings_folder(chosen: str | os.PathLike[str] | None = None) -> Path:
-    """Return the recordings folder: the chosen one, else that of the variable, else ./recordings."""
+    """Return the recordings folder: the chosen one, else $DUALTAXI_RECORDINGS, else ./recordings."""
     return Path(chosen or os.environ.get(RECORDINGS_VARIABLE) or "recordings")
 
 

@@ -82,7 +82,7 @@ def mark(folder: Path, environment: EnvironmentMaker | JsonView | None) -> None:
 
 
 def merge_marks(folder: Path, others: list[Path]) -> None:
-    """Add to a run's mark what the marks in other folders state; those that do not hold state nothing."""
+    """Add to a run's mark what the marks in other folders state; invalid marks state nothing."""
     marks = [mark_of(place) for place in (folder, *others)]
     if any(mark.environments for mark in marks) and (key := _key(False)) is not None:
         _write(folder, marks, key)
@@ -119,7 +119,7 @@ def copy_mark(folder: Path, restored: Path) -> None:
 
 @contextlib.contextmanager
 def marking_nothing(is_strange: bool) -> Iterator[None]:
-    """Leave runs without a mark that the block begins, if they are made from one that is not trusted."""
+    """Leave runs that the block begins without a mark, if they are made from an untrusted run."""
     global _marks_nothing  # noqa: PLW0603 - recorders begin far below the block
     before, _marks_nothing = _marks_nothing, _marks_nothing or is_strange
     try:
@@ -177,7 +177,7 @@ def _seal(values: Mapping[str, object], key: bytes) -> str:
 
 
 def _write(folder: Path, marks: list[TrustMark], key: bytes) -> None:
-    """Replace a run's mark by one that states what these state; the first script among them counts."""
+    """Replace a run's mark by the union of these; the first script among them counts."""
     script = next((mark for mark in marks if mark.script), TrustMark())
     values: dict[str, object] = {
         "environments": list(dict.fromkeys(digest for mark in marks for digest in mark.environments)),

@@ -266,7 +266,7 @@ def renew(seen: int | None) -> None:
 
 
 def identity() -> int | None:
-    """Return what tells the file of the index from one that replaces it; None if there is no index."""
+    """Return the identity of the index file, which changes when it is replaced; None if there is no index."""
     with contextlib.suppress(OSError):
         return index_path().stat().st_ino
     return None
@@ -296,7 +296,7 @@ def pragma(database: sqlite3.Connection, name: str) -> int:
 
 @contextlib.contextmanager
 def transaction(database: sqlite3.Connection, kind: Literal["DEFERRED", "IMMEDIATE"]) -> Iterator[None]:
-    """Make the block a transaction, or a part of the one that has begun."""
+    """Make the block a transaction, or a part of the transaction in progress."""
     if database.in_transaction:
         yield
         return
@@ -306,7 +306,7 @@ def transaction(database: sqlite3.Connection, kind: Literal["DEFERRED", "IMMEDIA
 
 
 def write_rows(database: sqlite3.Connection, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write whole rows, replacing those of the same folders; within a transaction."""
+    """Write whole rows, replacing rows of the same folders; within a transaction."""
     places = ", ".join(f":{name}" for name in STORED)
     database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({places})", map(_storable, rows))
 
