@@ -24,8 +24,7 @@ from blake3 import blake3
 from benchmarks.figures import Figure, figure, seconds
 from benchmarks.processes import run, run_command
 from benchmarks.serving import Service, serving
-from runner.client.client import Client
-from runner.client.transfer import append_upload, put_upload
+from runner.client.client import Client, append_upload, put_upload
 from runner.execution.verify import verify
 from runner.runs.resolve import find_run
 from runner.runs.run import Run

@@ -4,20 +4,14 @@ from __future__ import annotations
 
 import functools
 import json
-import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import Any, Final, Literal
 
 from pydantic import TypeAdapter
 
-from runner.client.connection import FIRST_PAUSE, ServerUnavailable
 from runner.errors import RunnerError
 from runner.util.values import Json, JsonView
-
-if TYPE_CHECKING:
-    from runner.client.connection import Connection
 
 JobState = Literal["queued", "running", "interrupted", "finished", "failed", "cancelled"]
 OVER: Final = ("finished", "failed", "cancelled")
@@ -255,35 +249,6 @@ class JobsPage:
     offset: int
     limit: int
     queue: QueueStatus
-
-
-def watch(client: Connection, number: int) -> Iterator[JobEvent]:
-    """Yield the events of a job until it is over; continue when a connection breaks.
-
-    Args:
-        client: a connection to the server.
-        number: the job's number.
-
-    Raises:
-        ServerError: there is no such job, or the server refuses.
-        ServerUnavailable: the server did not respond in time.
-    """
-    last = ""
-    backoff = client.backoff()
-    while True:
-        try:
-            with client.stream(f"/jobs/{number}/events", {"Last-Event-ID": last}) as response:
-                backoff.reset()
-                if response.status_code == HTTPStatus.NO_CONTENT:
-                    return
-                for event in parse_events(response.iter_lines()):
-                    last = event.id or last
-                    yield event
-            if client.request_record(JobStatus, "GET", f"/jobs/{number}").is_over:
-                return
-            time.sleep(FIRST_PAUSE)
-        except ServerUnavailable as error:
-            backoff.wait(error)
 
 
 def parse_events(lines: Iterable[str]) -> Iterator[JobEvent]:

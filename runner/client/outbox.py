@@ -18,9 +18,15 @@ from typing import Final, NamedTuple
 
 from platformdirs import user_state_path
 
-from runner.client.client import Client
-from runner.client.connection import Report, ServerUnavailable, find_token
-from runner.client.transfer import UploadStatus, append_upload, put_upload
+from runner.client.client import (
+    Client,
+    Report,
+    ServerUnavailable,
+    UploadStatus,
+    append_upload,
+    find_token,
+    put_upload,
+)
 from runner.errors import RunnerError
 from runner.runs.checkpoints import Store
 from runner.runs.run import SHARDS_FOLDER, Run, list_runs, locked

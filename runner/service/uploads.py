@@ -37,7 +37,7 @@ from typing import Annotated, Final
 from filelock import FileLock
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
-from runner.client.transfer import UploadStatus
+from runner.client.client import UploadStatus
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.recording.marks import marks_from
 from runner.recording.reader import open_recording

@@ -236,7 +236,7 @@ def server_options(
     ),
 ) -> Server:
     """Return the server."""
-    from runner.client.connection import find_token
+    from runner.client.client import find_token
 
     return Server(url, find_token(token, token_file))
 

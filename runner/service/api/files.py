@@ -17,7 +17,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from runner.analysis.episodes import TYPICAL, EpisodeRef
-from runner.client.transfer import UploadState, UploadStatus
+from runner.client.client import UploadState, UploadStatus
 from runner.errors import ConfigError, RunNotFound
 from runner.export.film import FORMATS
 from runner.export.plugin import installed_export

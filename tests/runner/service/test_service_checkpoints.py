@@ -12,9 +12,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.client.client import Client
-from runner.client.connection import ServerError
-from runner.client.transfer import put_upload
+from runner.client.client import Client, ServerError, put_upload
 from runner.runs.checkpoints import Store
 
 pytestmark = pytest.mark.usefixtures("outbox")

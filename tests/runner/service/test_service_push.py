@@ -19,10 +19,17 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.client import transfer as client_module
-from runner.client.client import Client
-from runner.client.connection import Backoff, ServerError, ServerUnavailable, checked_url, find_token
-from runner.client.transfer import append_upload, put_upload
+from runner.client import client as client_module
+from runner.client.client import (
+    Backoff,
+    Client,
+    ServerError,
+    ServerUnavailable,
+    append_upload,
+    checked_url,
+    find_token,
+    put_upload,
+)
 from runner.export.mcap import export_mcap
 from runner.recording.labels import change_labels
 from runner.runs.resolve import find_run
@@ -170,7 +177,7 @@ def test_a_token_is_found_and_never_printed(own_server, run, recordings, tmp_pat
 
 def test_pauses_are_logged_and_as_long_as_the_server_asks(monkeypatch):
     slept, messages = [], []
-    monkeypatch.setattr("runner.client.connection.time.sleep", slept.append)
+    monkeypatch.setattr("runner.client.client.time.sleep", slept.append)
     locked = ServerUnavailable("token: too many wrong ones; try again in 40 s.", 429, 40)
     backoff = Backoff(60, messages.append)
     backoff.wait(locked)

@@ -12,8 +12,7 @@ from served import Served
 from submitted import ENDLESS, ICY
 
 from runner.cli import cli
-from runner.client.client import Client
-from runner.client.connection import ServerError
+from runner.client.client import Client, ServerError
 from runner.client.jobs import BestTrial, JobEvent, LogEvent, SweepProgress, parse_events
 from runner.errors import RunnerError
 from runner.runs.run import list_runs
