@@ -40,7 +40,7 @@ class ExitCode(IntEnum):
         return member
 
     OK = 0, "success"
-    DIFFERENT = 1, "a difference or a problem was found, a disk is full, or a server does not respond"
+    DIFFERENT = 1, "a difference, a problem, a full disk, or a server that does not respond"
     USAGE = 2, "wrong usage or input"
     INTERRUPTED = 130, "interrupted"
 

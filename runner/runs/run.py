@@ -528,11 +528,14 @@ def listed_run(folder: Path, run_id: str) -> Run:
     """Return the run in a folder, which had this id when the folder was listed.
 
     Raises:
-        RunNotFound: it was removed in the meantime.
+        RunNotFound: it was removed in the meantime, or both of its files are damaged.
     """
     run = run_in(folder)
     if run is None:
-        raise RunNotFound(f"run {run_id} was removed just now.")
+        raise RunNotFound(
+            f"run {run_id} was removed just now, or {folder} has neither a readable {RUN_FILE} nor "
+            f"{RECORDING_FILE}."
+        )
     return run
 
 

@@ -8,10 +8,11 @@ import sqlite3
 
 import pytest
 
+from runner.errors import RunNotFound
 from runner.recording.labels import LABELS_FILE, Labels, read_labels
 from runner.runs.catalogue.database import index_path
 from runner.runs.catalogue.index import look
-from runner.runs.run import RUN_FILE, create_run, list_runs
+from runner.runs.run import RUN_FILE, create_run, list_runs, listed_run
 from tests.runner.runs.listed import CONFIG, ids, rows
 
 
@@ -85,6 +86,14 @@ def test_a_run_of_which_little_is_known_is_listed_as_damaged(folder, content):
     (folder / "a" / RUN_FILE).write_bytes(content)
     assert [(row["id"], row["status"]) for row in rows(folder)[0]] == [("a", "damaged")]
     assert look([folder], lambda index: len(index.problems())) == 1
+
+
+def test_a_run_without_a_readable_file_is_not_said_to_be_removed_for_certain(folder):
+    run = create_run(folder, CONFIG, 1)
+    (run.folder / RUN_FILE).write_text("{")
+    run.recording.write_bytes(b"")
+    with pytest.raises(RunNotFound, match=r"removed just now, or .* has neither a readable run\.json nor"):
+        listed_run(run.folder, run.run_id)
 
 
 def test_odd_values_do_no_harm(folder):
