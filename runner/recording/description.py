@@ -201,14 +201,9 @@ class RunDescription:
         Raises:
             RecordingError: it is damaged.
         """
-        return self.named_maker(MAKER_RECORD)
+        return self._maker(MAKER_RECORD)
 
-    def named_maker(self, name: str) -> EnvironmentMaker | None:
-        """Return the maker in a metadata record of this name; None if there is none.
-
-        Raises:
-            RecordingError: it is damaged.
-        """
+    def _maker(self, name: str) -> EnvironmentMaker | None:
         if name not in self._records.metadata_names:
             return None
         return parse_maker(self._json(name), str(self.path))

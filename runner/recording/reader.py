@@ -461,13 +461,13 @@ class Phase:
         for shard in self._recording.shards:
             start, stop = stop, stop + shard.environments
             if start <= environment < stop:
-                shard_maker = self._recording.named_maker(f"{SHARD_MAKER}/{shard.name}")
+                shard_maker = self._recording._maker(f"{SHARD_MAKER}/{shard.name}")
         return shard_maker or self.own_maker or self._recording.maker
 
     @property
     def own_maker(self) -> EnvironmentMaker | None:
         """How the environment of this phase was made if it was recorded into the run of another."""
-        return self._recording.named_maker(f"{MAKER_RECORD}/{self.name}")
+        return self._recording._maker(f"{MAKER_RECORD}/{self.name}")
 
     def action_names(self, agent: str = "") -> tuple[str, ...]:
         """Return the names of the discrete actions, the least action's first; empty if unknown.
