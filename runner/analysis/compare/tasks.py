@@ -224,7 +224,7 @@ def _common_tasks(by_label: Mapping[str, Mapping[str, Floats]], notes: list[str]
             f"{label}: {listed(list(by_task)) or 'none'}" for label, by_task in by_label.items()
         )
         raise RunnerError(
-            f"normalise: found no environment that all have a value in ({listing}), expected one at least; "
+            f"normalise: found no environment in which every group has a value ({listing}); "
             "group the runs otherwise, such as by name."
         )
     if left_out := [task for task in all_tasks if task not in tasks]:

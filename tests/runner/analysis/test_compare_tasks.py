@@ -135,7 +135,7 @@ def test_environments_that_not_all_have_are_left_out_and_named():
     result = compared(runs_of(values))
     assert list(result.tasks) == ["Cart"]
     assert any("not every group has a value there: Lake, Hill" in note for note in result.notes)
-    with pytest.raises(RunnerError, match=r"no environment that all have a value in \(a: Lake; b: Hill\)"):
+    with pytest.raises(RunnerError, match=r"in which every group has a value \(a: Lake; b: Hill\)"):
         compared(runs_of({"a": {"Lake": [1, 2]}, "b": {"Hill": [110, 120]}}))
 
 

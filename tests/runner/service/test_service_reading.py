@@ -229,7 +229,7 @@ def test_runs_are_compared_over_environments(recordings, client):
     address = client.get("/compare/tasks", **asked).headers["location"]
     assert address == f"/compare?run={'&run='.join(ids)}#environments", "opened alone, it is no page"
     apart = client.get("/compare/tasks", params={"run": [ids[1], ids[6]]}).text
-    assert apart.startswith('<p class="hint">Found no environment that all have a value in (')
+    assert apart.startswith('<p class="hint">Found no environment in which every group has a value (')
     assert 'data-later="/compare/tasks?' in client.get("/compare", params={"run": ids}).text
     assert "data-later" not in client.get("/compare", params={"run": ids[:2]}).text
     refused = client.get(
