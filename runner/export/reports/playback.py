@@ -562,7 +562,7 @@ def _frame_times(after: Ints) -> list[int]:
 
 def _outcome_in_words(length: int, ended: str, total: float | None) -> str:
     """Return length, end and return of an episode as text; a return of None is unknown."""
-    rewards = "" if total is None else f" Rewards sum to {total:g}."
+    rewards = "" if total is None else f" Rewards sum to {total:,g}."
     return f"{counted(length, 'step')}, {ENDINGS[ended]}.{rewards}"
 
 
