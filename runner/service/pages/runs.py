@@ -49,7 +49,7 @@ USUAL: Final = (
     "bytes",
     "age",
 )
-FOLDED: Final = ("id", "seed", "tag", "episodes")
+FOLDED: Final = ("id", "seed", "tag", "episodes", "mean_length", "bytes", "age")
 """Columns that a narrow screen leaves out, unless the columns were chosen."""
 ROWS: Final = 50
 _FALLING: Final = (ColumnKind.NUMBER, ColumnKind.SIZE, ColumnKind.DATE)

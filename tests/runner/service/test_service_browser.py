@@ -363,6 +363,23 @@ def test_a_step_is_opened_in_rerun(page, folder):
     browser.switch_to.default_content()
 
 
+SHIFTED = """
+const done = arguments[0];
+new PerformanceObserver((list) => done(list.getEntries().reduce((sum, { value }) => sum + value, 0)))
+  .observe({ type: "layout-shift", buffered: true });
+setTimeout(done, 500, 0);
+"""
+"""Returns by how much what is in sight of a page has moved, as a browser measures it; 0.1 is too much."""
+
+
+@pytest.mark.parametrize("address", ["/runs/first", "/runs/first/replay", "/compare?run=first&run=second"])
+def test_nothing_in_sight_moves_while_parts_of_a_page_arrive(page, address):
+    browser = page(address)
+    wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".u-over, .choice li"))
+    wait(browser, lambda: not browser.find_elements(By.CSS_SELECTOR, "[aria-busy]"))
+    assert browser.execute_async_script(SHIFTED) < 0.02
+
+
 @pytest.mark.parametrize("width", [400, 1400])
 def test_nothing_sticks_out_of_any_page(page, browser, width):
     size = {"width": width, "height": 800, "deviceScaleFactor": 1, "mobile": width < 600}

@@ -20,11 +20,12 @@ export const isTaken = (event) =>
   event.altKey ||
   event.target.matches("input:not([type=checkbox], [type=range]), textarea, select");
 
-// A part that takes long replaces its placeholder; one over the axis of charts reads every step, so only when it is seen.
+// A part that takes long replaces its placeholder; one over the axis of charts reads every step, so only when near.
 async function load(place) {
   const address = new URL(place.dataset.later, location.href),
     axis = new URLSearchParams(location.search).get("axis");
   if (axis && "overAxis" in place.dataset) address.searchParams.set("axis", axis);
+  place.setAttribute("aria-busy", true);
   try {
     place.innerHTML = await (await request(address)).text(); // rendered, and escaped, by the server
   } catch (error) {
@@ -35,13 +36,14 @@ async function load(place) {
   place.removeAttribute("aria-busy");
 }
 
-const seen = new IntersectionObserver((entries) => {
+function look(entries) {
   for (const { isIntersecting, target } of entries)
     if (isIntersecting) {
       seen.unobserve(target);
       load(target);
     }
-});
+}
+const seen = new IntersectionObserver(look, { rootMargin: "100%" });
 const overAxis = () => document.querySelectorAll("[data-over-axis]").forEach((place) => seen.observe(place));
 document.querySelectorAll("[data-later]:not([data-over-axis])").forEach(load);
 document.addEventListener("change", ({ target }) => target.name === "axis" && overAxis());

@@ -11,7 +11,12 @@ export async function open(root, at = 0, moved) {
   const part = async (k) => (await json(`${root.dataset.source}?start=${Math.max(0, k - BEFORE)}`)).episode;
   root.setAttribute("aria-busy", "true");
   const pictures = picturesOf(root, at);
-  const episode = await part(at).finally(() => root.removeAttribute("aria-busy"));
+  const episode = await part(at)
+    .catch((error) => {
+      root.querySelector(".description").textContent = error.message;
+      throw error;
+    })
+    .finally(() => root.removeAttribute("aria-busy"));
   const replay = new Replay(root, { load: part, moved, pictures });
   await replay.begin(episode, at);
   return replay;
@@ -68,7 +73,7 @@ function picturesOf(root, at) {
     if (blocks.size) {
       while (stop % BLOCK && !addressOf(stop)) stop++;
       // Where later pictures are known, the user steps back.
-      while (stop % BLOCK && stop - start < 16 && start % BLOCK && !addressOf(start - 1)) start--;
+      while (addressOf(stop) && stop - start < 16 && start % BLOCK && !addressOf(start - 1)) start--;
     }
     const own = { next: start, stop, control: new AbortController() };
     reading = own;

@@ -3,14 +3,9 @@ import { keepAddress, listen, open } from "./player.js";
 
 const box = document.querySelector("[data-together]");
 
-const opened = [...document.querySelectorAll("[data-source]")].map(async (root) => {
-  const description = root.querySelector(".description");
-  description.textContent = "Loading …";
-  return open(root).catch((error) => {
-    description.textContent = error.message;
-  });
-});
-const replays = (await Promise.all(opened)).filter(Boolean);
+const roots = [...document.querySelectorAll("[data-source]")],
+  opened = await Promise.allSettled(roots.map((root) => open(root))),
+  replays = opened.map(({ value }) => value).filter(Boolean); // others show why not
 
 const bar = new Scrubber(box, "all", (k) => {
   for (const replay of replays) replay.bar.show(k - replay.root.dataset.offset);
