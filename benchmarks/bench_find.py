@@ -16,7 +16,7 @@ from benchmarks.bench_cold_start import command
 from benchmarks.figures import Figure, figure
 from benchmarks.processes import run
 from benchmarks.serving import percentile, response_times, serving
-from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
+from runner.util.files import CACHE_VARIABLE, CACHED_EPISODES, cache_folder
 
 RUNS, EPISODES_OF_RUN, CLIENTS = 1_000, 5_000, 20
 EXPRESSIONS = (
@@ -55,7 +55,7 @@ def measure(quick: bool) -> list[Figure]:
 
 def _write_many_episodes() -> None:
     """Replace the rows of each index by many, drawn from them."""
-    for number, path in enumerate(sorted((cache_folder() / EPISODES).glob("*.parquet"))):
+    for number, path in enumerate(sorted((cache_folder() / CACHED_EPISODES).glob("*.parquet"))):
         table = pq.read_table(path)
         chosen = np.random.default_rng(number).integers(len(table), size=EPISODES_OF_RUN)
         rows = table.take(chosen)

@@ -190,7 +190,7 @@ def run_parallel(
                 pending.append(threads.submit(do, job))
                 if len(pending) == 2 * workers and (run := pending.popleft().result()):
                     yield run
-            yield from (run for each in pending if (run := each.result()))
+            yield from filter(None, (future.result() for future in pending))
         finally:
             is_abandoned.set()
 

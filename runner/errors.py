@@ -8,8 +8,9 @@ without a traceback and exits with `exit_code`.
     ├── EnvironmentNotUsable an environment is unknown, or has no transition table
     ├── CannotRedo           a loop's environment cannot be made again here, or not drawn
     ├── RecordingError       a recording is damaged, of another program, or of an unknown version
+    │   ├── OtherVersion     a recording has another version of the format
     │   ├── NotInRecording   a recording has no such episode, evaluation, trial or step
-    │   └── CutOff           a recording ends in the middle, as that of a killed process does
+    │   └── CutOff           a recording ends in the middle, as after a killed process
     ├── Diverged             a recording differs from what its job produces
     ├── RunNotFound          no run, or more than one, matches a name
     ├── StorageError         a file or folder cannot be written, or the disk is full
@@ -89,7 +90,7 @@ class NotInRecording(RecordingError):
 
 
 class CutOff(RecordingError):
-    """A recording ends in the middle, as the recording of a killed process does; all before is whole."""
+    """A recording ends in the middle, as after a killed process; everything before is whole."""
 
 
 class Diverged(RunnerError):
@@ -138,7 +139,7 @@ class MissingExtra(RunnerError):
 
 
 def full_message(error: BaseException) -> str:
-    """Return the message of an error with the notes that were added to it, a line each."""
+    """Return the message of an error and the notes added to it, a line each."""
     return "\n".join([str(error), *getattr(error, "__notes__", [])])
 
 
@@ -154,5 +155,5 @@ def shortened(text: str, limit: int) -> str:
 
 
 def truncated_message(error: BaseException | str) -> str:
-    """Return the message of an error that is stored with a run, truncated if it is very long."""
+    """Return the message of an error, at most `MAX_MESSAGE` characters of it, to store with a run."""
     return shortened(str(error), MAX_MESSAGE)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 from runner.errors import RecordingError, StorageError
 from runner.runs.run import RUN_FILE, Run
 from runner.runs.trust_marks import copy_mark
-from runner.util.files import CACHE_VARIABLE, RESTORED, cache_folder, remove_oldest, storage_errors
+from runner.util.files import CACHE_VARIABLE, CACHED_RECORDINGS, cache_folder, remove_oldest, storage_errors
 from runner.util.humanize import size
 from runner.util.processes import ChildProcess, OutOfMemory, ProcessDied, Report, Tell, report_progress
 
@@ -56,7 +56,7 @@ def at_hand(run: Run, log: Tell = lambda _: None, report: Report = lambda _: Non
     digest = run.archive.digest
     if len(digest) != 64 or not digest.isalnum():
         raise RecordingError(f"{run.folder / RUN_FILE}: found archive digest {digest!r}, expected a BLAKE3.")
-    cached = cache_folder() / RESTORED / f"{run.run_id}-{digest[:16]}.mcap"
+    cached = cache_folder() / CACHED_RECORDINGS / f"{run.run_id}-{digest[:16]}.mcap"
     with storage_errors(cached, f"set {CACHE_VARIABLE} to another folder"):
         cached.parent.mkdir(parents=True, exist_ok=True)
         try:

@@ -2,9 +2,9 @@
 
 @click.command("qtable", cls=Command)
 def qtable_command(
-    run_name: str = argument(metavar="RUN"),
-    step: int | None = option("--step", type=INDEX, help="After N training steps."),
-) -> None:
+run_name: str = argument(metavar="RUN"),
+step: int | None = option("--step", type=INDEX, help="After N training steps."),
+) -> None: ...
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import click
 from runner.errors import nearest
 from runner.util.extras import plugin_names
 
-_MAX_SHORT_HELP = 200
+_MAX_SHORT_HELP: Final = 200
 _FORMS: Final = {
     "quiet": ("-q", "--quiet", "Print ids only."),
     "csv": ("--csv", "Print CSV."),

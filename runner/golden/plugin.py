@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 FOLDER = "golden"
 """The folder of golden runs, next to the file of the test."""
 _PROPERTY = "golden"
-"""The name of the property of a test's report that has what the test tells."""
+"""The property of a test's report that holds what the test has to tell."""
+_UPDATE = "If the change is intended, keep the new one by `pytest --golden-update` and commit it."
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -222,6 +223,3 @@ class Golden:
             pytest.fail(
                 f"there is no golden run {file}; record it by `pytest --golden-update`.", pytrace=False
             )
-
-
-_UPDATE = "If the change is intended, keep the new one by `pytest --golden-update` and commit it."

@@ -36,7 +36,7 @@ from runner.query.views import SelectedRuns
 from runner.recording.reader import Recording, open_recording
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.run import RECORDING_FILE, RUN_FILE, listed_run
-from runner.util.files import EPISODES, cache_folder, remove_oldest, replacing, storage_errors
+from runner.util.files import CACHED_EPISODES, cache_folder, remove_oldest, replacing, storage_errors
 
 if TYPE_CHECKING:
     from runner.query.chunks import Relation
@@ -66,7 +66,7 @@ class EpisodeIndex:
     """The files of the index, made by DuckDB."""
 
     def __init__(self, database: Database) -> None:
-        self.folder = cache_folder() / EPISODES
+        self.folder = cache_folder() / CACHED_EPISODES
         self._database = database
         with storage_errors(self.folder):
             (self.folder / "packs").mkdir(parents=True, exist_ok=True)

@@ -40,7 +40,7 @@ from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 from runner.util.arrays import Array, Flags, Floats, Ints, Records
-from runner.util.files import TABLES, cache_folder, replacing
+from runner.util.files import CACHED_TABLES, cache_folder, replacing
 from runner.util.values import JsonView
 
 S = TypeVar("S")
@@ -324,7 +324,7 @@ class TableCache:
     """
 
     def __init__(self, recording: Recording) -> None:
-        self._folder = cache_folder() / TABLES
+        self._folder = cache_folder() / CACHED_TABLES
         run_id = re.sub(r"[^\w-]", "_", recording.run_id)[:80]  # whatever the file says, a plain name
         self._prefix = f"{run_id}-{_key(recording)}" if recording.file.finished else ""
         self._saved = False

@@ -17,15 +17,15 @@ from runner.errors import StorageError
 from runner.util.values import Json, JsonView, without_surrogates
 
 CACHE_VARIABLE: Final = "XDG_CACHE_HOME"
-EXPORTS: Final = "rerun"
+CACHED_EXPORTS: Final = "rerun"
 """The folder of the cache with exports for the Rerun viewer; their names begin with the ids of their runs."""
 RUN_SEPARATOR: Final = "+"
 """Separates the ids of several runs in the name of an export; no id contains it."""
-RESTORED: Final = "restored"
+CACHED_RECORDINGS: Final = "restored"
 """The folder of the cache with recordings restored from archives; their names begin with the run's id."""
-TABLES: Final = "tables"
+CACHED_TABLES: Final = "tables"
 """The folder of the cache with Q-tables along long runs; their names begin with the run's id."""
-EPISODES: Final = "episodes"
+CACHED_EPISODES: Final = "episodes"
 """The folder of the cache with the index of episodes; the names of its files begin with the run's id."""
 _BINARY: Final = getattr(os, "O_BINARY", 0)
 """On Windows, leaves line ends as they are."""

@@ -32,14 +32,18 @@ from runner.util.humanize import size
 
 _RESERVE_BYTES: Final = 64 << 20
 """Memory counts as used up if no block of this size is left."""
+_RESTARTS: Final = 3
+"""How often a fork server that was killed is replaced as a process starts."""
+_RESTART_SECONDS: Final = 0.1
+"""Time in which the system learns that a fork server was killed."""
 OWN_ONLY: Final = "DUALTAXI_OWN_ONLY"
-"""The variable of a process, and of its children, that make only what their user recorded; if not empty."""
+"""Environment variable: if not empty, a process and its children make only what their user recorded."""
 _SAFE_PATH: Final = "PYTHONSAFEPATH"
 _HASH_SEED: Final = "PYTHONHASHSEED"
 Report = Callable[[int], None]
-"""Takes how much was done so far, such as a number of steps."""
+"""Takes the amount done so far, such as a number of steps."""
 Tell = Callable[[str], None]
-"""Called with a line of text for the user, or with the name of the next stage."""
+"""Takes a line of text for the user, or the name of the next stage."""
 Stop = Callable[[], bool]
 """Returns whether to stop."""
 Args = ParamSpec("Args")
@@ -66,10 +70,6 @@ class NeverBegun(ProcessDied):
     """The process ended before it began a call, which another process can do."""
 
 
-_RESTARTS: Final = 3
-"""How often a fork server that was killed is replaced as a process starts."""
-_RESTART_SECONDS: Final = 0.1
-"""Time in which the system learns that a fork server was killed."""
 _pipe_to_parent: Any = None
 _must_end = False
 _starting: Final = threading.Lock()
@@ -81,7 +81,7 @@ def report_progress(value: object) -> None:
 
 
 def end_after_call() -> None:
-    """Have a child process end after its call, which leaves traces in it that the next one must not meet."""
+    """End this child process after its call, which leaves traces that the next call must not meet."""
     global _must_end  # noqa: PLW0603 - of the whole process
     _must_end = True
 
@@ -383,7 +383,7 @@ def _serve(pipe: Any, memory_bytes: int, variables: Mapping[str, str], keep_seco
 
 
 def _any_of_user(modules: Iterable[str]) -> bool:
-    """Return whether any of these modules is neither this package's nor installed."""
+    """Return whether any of these modules belongs to the user: neither to this project nor installed."""
     files = [
         getattr(sys.modules[name], "__file__", None)
         for name in modules

@@ -73,7 +73,7 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def is_utf8(text: str) -> bool:
-    """Return whether a text can be encoded in UTF-8; one decoded from Latin-1, for example, cannot."""
+    """Return whether a text can be encoded in UTF-8; a file name that was decoded with surrogates cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -82,7 +82,7 @@ def is_utf8(text: str) -> bool:
 
 
 def as_utf8(text: str) -> str:
-    r"""Return a text that can be encoded in UTF-8; other bytes become escapes such as `\\xe9`."""
+    r"""Return a text that can be encoded in UTF-8; other bytes become escapes such as `\xe9`."""
     return text.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 

@@ -1,1 +1,1 @@
-"""A module a command; each has it as `command` and imports at its top only what is light."""
+"""The commands, a module for each subject: `NAME_command` is the command NAME, and imports heavy packages."""

@@ -22,7 +22,7 @@ from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.util import __version__, files
 from runner.util.extras import missing
-from runner.util.files import CACHE_VARIABLE, EXPORTS, RUN_SEPARATOR, storage_errors
+from runner.util.files import CACHE_VARIABLE, CACHED_EXPORTS, RUN_SEPARATOR, storage_errors
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient
@@ -199,7 +199,7 @@ def cached_export(
 
     Rerun, which takes a second to load, is loaded only to make an export. `stage` is as for `export`.
     """
-    folder = files.cache_folder() / EXPORTS
+    folder = files.cache_folder() / CACHED_EXPORTS
     path = folder / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_cache_key(runs, request)}.rrd"
     if path.exists():
         path.touch()

@@ -29,7 +29,7 @@ from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
 from runner.runs.checkpoints import Store
 from runner.runs.run import Run, listed_run, locked
-from runner.util.files import EPISODES, cache_folder
+from runner.util.files import CACHED_EPISODES, cache_folder
 from runner.util.humanize import listed
 
 _STRAY_SECONDS: Final = 60
@@ -180,7 +180,7 @@ def clean(root: Path, removed: Collection[str] = ()) -> None:
         removed: the ids of the runs that were removed.
     """
     if removed:
-        for index in (cache_folder() / EPISODES).glob("*.parquet"):
+        for index in (cache_folder() / CACHED_EPISODES).glob("*.parquet"):
             if index.name.partition("-")[0] in removed:
                 index.unlink(missing_ok=True)
     for stray in strays(root):

@@ -21,7 +21,14 @@ from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.checkpoints import Store
 from runner.runs.run import RECORDING_FILE, RUN_FILE, RUN_LOCK, UNLISTED
 from runner.runs.trust_marks import MARK_FILE
-from runner.util.files import EPISODES, EXPORTS, RESTORED, RUN_SEPARATOR, TABLES, cache_folder
+from runner.util.files import (
+    CACHED_EPISODES,
+    CACHED_EXPORTS,
+    CACHED_RECORDINGS,
+    CACHED_TABLES,
+    RUN_SEPARATOR,
+    cache_folder,
+)
 
 REMOVED: Final = ".removed-"
 """The prefix of a run's folder from the moment it is removed until its files are deleted."""
@@ -108,7 +115,7 @@ def cached(part: str) -> Counter[str]:
     """Return the bytes cached for each run, by its id; what is for several counts for the first.
 
     Args:
-        part: the folder in the cache: `EXPORTS`, `TABLES`, `EPISODES` or `RESTORED`.
+        part: the folder in the cache, such as `CACHED_EXPORTS`.
     """
     by_run: Counter[str] = Counter()
     with contextlib.suppress(OSError), os.scandir(cache_folder() / part) as entries:
@@ -180,8 +187,8 @@ def usage_of(
     Args:
         read: calls some work with the index and returns its result, as `look` does.
     """
-    exports = cached(EXPORTS) + cached(TABLES) + cached(EPISODES)
-    restored = cached(RESTORED)
+    exports = cached(CACHED_EXPORTS) + cached(CACHED_TABLES) + cached(CACHED_EPISODES)
+    restored = cached(CACHED_RECORDINGS)
     rows = read(lambda index: index.with_same_as(index.select(chosen, columns=_COLUMNS)))
     checkpoints = {root: Store(Path(root)).sizes() for root in {row["root"] for row in rows}}
     sums = Sums()

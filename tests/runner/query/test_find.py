@@ -26,7 +26,7 @@ from runner.query.conditions import EpisodeParser
 from runner.query.views import SelectedRuns
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
-from runner.util.files import CACHE_VARIABLE, EPISODES, cache_folder
+from runner.util.files import CACHE_VARIABLE, CACHED_EPISODES, cache_folder
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
 
@@ -259,16 +259,16 @@ def test_a_recording_that_changed_is_read_again(tmp_path):
     assert runner.find("length > 0", tmp_path / "a", phase="train").count == 20
     shutil.copy(second.recording, first.recording)
     assert runner.find("length > 0", tmp_path / "a", phase="train").count == 40
-    assert len(list((cache_folder() / EPISODES).glob(f"{first.run_id}-*"))) == 1
+    assert len(list((cache_folder() / CACHED_EPISODES).glob(f"{first.run_id}-*"))) == 1
 
 
 def test_removing_a_run_removes_its_index(tmp_path):
     run = make_run(tmp_path, LAKE)
     assert runner.find("length > 0", tmp_path).count
-    assert list((cache_folder() / EPISODES).glob(f"{run.run_id}-*"))
+    assert list((cache_folder() / CACHED_EPISODES).glob(f"{run.run_id}-*"))
     result = CliRunner().invoke(cli, ["rm", run.run_id, "--yes", "--recordings", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    assert not list((cache_folder() / EPISODES).glob(f"{run.run_id}-*"))
+    assert not list((cache_folder() / CACHED_EPISODES).glob(f"{run.run_id}-*"))
 
 
 def test_an_archived_run_has_the_same_hits(tmp_path):
@@ -316,7 +316,7 @@ def test_names_that_need_quoting_do_no_harm(tmp_path):
 
 def test_one_episode_in_a_million(tmp_path, folder):
     runner.find("length > 0", folder, runs="pole")
-    source, *_ = (cache_folder() / EPISODES).glob(f"{find_run('pole', folder).run_id}-*")
+    source, *_ = (cache_folder() / CACHED_EPISODES).glob(f"{find_run('pole', folder).run_id}-*")
     table, n = pq.read_table(source), 50_000
     run = find_run("pole", folder)
     made = []
@@ -327,7 +327,7 @@ def test_one_episode_in_a_million(tmp_path, folder):
         (place / "run.json").write_text(json.dumps(facts))
         made.append(place)
     runner.find("length > 0", tmp_path)
-    files = sorted((cache_folder() / EPISODES).glob("run00*"))
+    files = sorted((cache_folder() / CACHED_EPISODES).glob("run00*"))
     assert len(files) == 20
     rows = table.take(np.random.default_rng(0).integers(len(table), size=n))
     rows = rows.set_column(rows.column_names.index("episode"), "episode", pa.array(np.arange(n)))
@@ -365,7 +365,7 @@ def test_the_command(folder):
 
 def test_a_damaged_index_is_made_again(folder):
     before = runner.find("length > 20", folder)
-    for file in (cache_folder() / EPISODES).glob("*.parquet"):
+    for file in (cache_folder() / CACHED_EPISODES).glob("*.parquet"):
         file.write_bytes(file.read_bytes()[:40] + b"?")
     with pytest.raises(RunnerError, match="the next search makes it again"):
         runner.find("length > 20", folder)
@@ -387,9 +387,9 @@ def test_the_cache_may_be_in_a_folder_with_signs_of_patterns(folder, tmp_path, m
 
 def place_damaged_file(folder, monkeypatch, name):
     """Place a damaged file where a pack has it and a run's index; return the hits before, and the file."""
-    shutil.rmtree(cache_folder() / EPISODES, ignore_errors=True)
+    shutil.rmtree(cache_folder() / CACHED_EPISODES, ignore_errors=True)
     before = runner.find("length > 20", folder, runs="pole")
-    (file,) = (cache_folder() / EPISODES).glob(f"{before.hits[0].run_id}-*")
+    (file,) = (cache_folder() / CACHED_EPISODES).glob(f"{before.hits[0].run_id}-*")
     damaged = file.with_name(f"{name}-{'1' * 32}{file.stem[-16:]}.parquet")
     damaged.write_bytes(b"?")
     os.utime(damaged, (0, 0))
@@ -481,7 +481,7 @@ def test_a_pack_that_another_search_removes_is_made_again(folder, monkeypatch):
         return chosen
 
     monkeypatch.setattr(episode_index.EpisodeIndex, "packed", packed_once)
-    indexes = {path: path.stat().st_mtime_ns for path in (cache_folder() / EPISODES).glob("*.parquet")}
+    indexes = {path: path.stat().st_mtime_ns for path in (cache_folder() / CACHED_EPISODES).glob("*.parquet")}
     assert runner.find("length > 20", folder) == before
     assert {path: path.stat().st_mtime_ns for path in indexes} == indexes
     assert removed
@@ -631,7 +631,7 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
         shutil.copytree(run.folder, place)
         facts = json.loads((place / "run.json").read_text()) | {"run_id": place.name, "name": f"pole{k % 2}"}
         (place / "run.json").write_text(json.dumps(facts))
-    shutil.rmtree(cache_folder() / EPISODES, ignore_errors=True)  # no test may have searched before
+    shutil.rmtree(cache_folder() / CACHED_EPISODES, ignore_errors=True)  # no test may have searched before
     monkeypatch.setattr(episode_index, "_LEAST", 2)
     expressions = ("length > 20 and any(action == 1)", "then(action == 1, action == 0, within=1)")
 
@@ -647,7 +647,7 @@ def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch)
         monkeypatch.setattr(episode_index, "_PACKED", size)
         for _ in range(2):
             assert hits() == loose
-    assert list((cache_folder() / EPISODES / "packs").iterdir())
+    assert list((cache_folder() / CACHED_EPISODES / "packs").iterdir())
     shutil.rmtree(tmp_path / "run00011")
     assert [found.runs for found in hits()] == [13, 13, 6]
 

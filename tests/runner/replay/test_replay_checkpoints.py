@@ -13,7 +13,7 @@ from runner.recording.reader import open_recording
 from runner.replay import tables
 from runner.replay.tables import TableReplay, tables_at
 from runner.runs.catalogue.usage import cached
-from runner.util.files import TABLES, cache_folder
+from runner.util.files import CACHED_TABLES, cache_folder
 from tests.runner.altering import without_chunk
 from tests.runner.recording.making import LAKE, TAXIS, make_run
 
@@ -50,7 +50,7 @@ def applied(monkeypatch):
 
 
 def files():
-    return sorted((cache_folder() / TABLES).glob("*"))
+    return sorted((cache_folder() / CACHED_TABLES).glob("*"))
 
 
 def as_bytes(held):
@@ -73,7 +73,7 @@ def test_the_second_replay_takes_few_steps_and_gives_the_same(tmp_path, applied,
             replay.advance(step)
             assert found == as_bytes(replay.named_tables)
         assert as_bytes(TableReplay(recording, last - 1).named_tables) == first
-    assert cached(TABLES)[run.run_id] == sum(file.stat().st_size for file in files()) > 0
+    assert cached(CACHED_TABLES)[run.run_id] == sum(file.stat().st_size for file in files()) > 0
 
 
 def test_snapshots_that_are_near_need_no_checkpoints(tmp_path):

@@ -6,7 +6,7 @@ from runner.recording.labels import Labels, change_labels
 from runner.runs.catalogue import usage as usages
 from runner.runs.catalogue.index import look
 from runner.runs.run import create_run
-from runner.util.files import EXPORTS, RESTORED
+from runner.util.files import CACHED_EXPORTS, CACHED_RECORDINGS
 from tests.runner.runs.listed import ALL, CONFIG
 
 
@@ -35,7 +35,7 @@ def test_the_largest_runs_come_first_and_the_sums_are_those_of_all(folder, tmp_p
     (runs[3].folder / "recording.damaged-1.mcap").write_bytes(bytes(50))
     for seed in (3, 5):
         change_labels(runs[seed].folder, lambda _: Labels(tags=("keep", "other")))
-    exports = tmp_path / "cache" / "dualtaxi" / EXPORTS
+    exports = tmp_path / "cache" / "dualtaxi" / CACHED_EXPORTS
     exports.mkdir(parents=True)
     (exports / f"{runs[0].run_id}-0123456789ab.rrd").write_bytes(bytes(1_000_000))
 
@@ -59,12 +59,14 @@ def test_the_largest_runs_come_first_and_the_sums_are_those_of_all(folder, tmp_p
 
 
 def test_cached_files_count_for_their_run(folder, tmp_path):
-    exports, restored = (tmp_path / "cache" / "dualtaxi" / part for part in (EXPORTS, RESTORED))
+    exports, restored = (
+        tmp_path / "cache" / "dualtaxi" / part for part in (CACHED_EXPORTS, CACHED_RECORDINGS)
+    )
     exports.mkdir(parents=True)
     restored.mkdir()
     (exports / "a-b-0123456789ab.rrd").write_bytes(bytes(1))
     (exports / "a+b-0123456789ab.rrd").write_bytes(bytes(10))
     (restored / "a-b-0123456789abcdef.mcap").write_bytes(bytes(100))
     (restored / "a.c-0123456789abcdef.mcap").write_bytes(bytes(1000))
-    assert usages.cached(EXPORTS) == {"a-b": 1, "a": 10}
-    assert usages.cached(RESTORED) == {"a-b": 100, "a.c": 1000}
+    assert usages.cached(CACHED_EXPORTS) == {"a-b": 1, "a": 10}
+    assert usages.cached(CACHED_RECORDINGS) == {"a-b": 100, "a.c": 1000}
