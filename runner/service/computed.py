@@ -57,7 +57,7 @@ from runner.recording.reader import Recording, open_recording
 from runner.runs.branches import BranchOrigin, origin_in
 from runner.runs.run import Run
 from runner.service.settings import ServiceSettings, without_folders
-from runner.sweep.charts import best_section, learning, learning_section, parameters_section, picture_of
+from runner.sweep.charts import best_section, drawn_trials, learning, learning_section, parameters_section
 from runner.sweep.results import Results, effects_sections, ranking_sections
 from runner.util.extras import require
 from runner.util.humanize import sentence
@@ -526,7 +526,7 @@ def sweep_importance(results: Results, _: Path) -> Iterable[Section]:
 def sweep_pictures(results: Results, recordings: Path) -> Iterator[Section]:
     """Yield the charts of a sweep: its parameters, and learning curves of some of its trials."""
     with contextlib.suppress(RunnerError):  # no trial is finished yet, as the ranking says
-        yield parameters_section(picture_of(results))
+        yield parameters_section(drawn_trials(results))
     try:
         yield learning_section(learning(results, recordings))
     except RunnerError as error:

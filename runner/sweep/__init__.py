@@ -5,7 +5,7 @@ loading    reading a sweep file, with located errors
 objective  readings of a metric during a run, and what a run is worth
 task       one run, as a worker does it
 workers    processes of this machine or actors of Ray, which run tasks
-state      a sweep on disk: its resolved file, and locks; progress follows from its runs
+state      a sweep on disk: its resolved file and its lock; progress follows from its runs
 trials     the values to try next, by Optuna, and what is recorded of the trials
 running    a sweep from its start to its end: what it will take, and the loop over batches of runs
 results    ranking, importance, the best configuration
@@ -40,5 +40,5 @@ def sweeps_in(recordings: Path) -> list[str]:
 
 
 def is_sweep(names: Sequence[str], recordings: Path) -> bool:
-    """Return whether these names are that of one sweep, rather than names of runs."""
+    """Return whether the only name is the name of a sweep, rather than of a run."""
     return len(names) == 1 and names[0] in sweeps_in(recordings)

@@ -29,8 +29,6 @@ from runner.sweep.model import Parameter, Range
 from runner.sweep.results import Ranked, Results, value_text, values_text
 from runner.util.arrays import Floats
 
-Values = Floats
-
 _TRIAL: Final = series_colour(0)
 _BEST: Final = series_colour(1)
 _MAX_NOTE_LENGTH: Final = 175
@@ -45,20 +43,20 @@ class ParameterAxis:
     choices: tuple[str, ...]
     """The values of a list as text; empty for a range."""
     log: bool
-    values: Values
+    values: Floats
     """The value of each trial, or the number of its choice; NaN where its algorithm does not use it."""
 
 
 @dataclass(frozen=True, eq=False)
-class ChartPicture:
-    """Trials that have results, and their parameters."""
+class DrawnTrials:
+    """The trials that charts show, and their parameters."""
 
     trials: tuple[Ranked, ...]
     """The best first."""
     axes: tuple[ParameterAxis, ...]
-    values: Values
+    values: Floats
     """The median of each trial."""
-    ranges: Values
+    ranges: Floats
     """[trials, 2]: the lowest and the highest seed of each trial."""
     objective: str
     lower_is_better: bool
@@ -78,7 +76,7 @@ class ChartPicture:
         return text
 
 
-def picture_of(results: Results) -> ChartPicture:
+def drawn_trials(results: Results) -> DrawnTrials:
     """Return the trials of a sweep that can be drawn.
 
     Raises:
@@ -87,27 +85,27 @@ def picture_of(results: Results) -> ChartPicture:
     figures = np.array([(trial.median, trial.low, trial.high) for trial in results.ranking], np.float64)
     figures = figures.reshape(-1, 3)
     is_drawn = np.all(np.abs(figures) < NEVER, axis=1)  # None is NaN, and not drawn
-    drawn = tuple(itertools.compress(results.ranking, is_drawn.tolist()))
-    if not drawn:
+    trials = tuple(itertools.compress(results.ranking, is_drawn.tolist()))
+    if not trials:
         raise RunnerError(_nothing_to_draw(results))
     parameters = results.sweep.file.parameters
     objective = results.sweep.objective
     values = figures[is_drawn, 0]
     ranges = figures[is_drawn, 1:]
     at = f"first at {objective.level:g}, episodes" if objective.at == "first_over" else objective.at
-    return ChartPicture(
-        trials=drawn,
+    return DrawnTrials(
+        trials=trials,
         axes=tuple(
-            _axis(path, parameter, drawn)
+            _axis(path, parameter, trials)
             for path, parameter in parameters.items()
-            if any(path in trial.values for trial in drawn)
+            if any(path in trial.values for trial in trials)
         ),
         values=values,
         ranges=ranges,
         objective=f"{objective.metric}, {at}",
         lower_is_better=objective.direction == "minimize",
         log=bool(0 < 30 * ranges.min() < ranges.max()),
-        left_out=len(results.ranking) - len(drawn),
+        left_out=len(results.ranking) - len(trials),
     )
 
 
@@ -155,17 +153,17 @@ def _axis(path: str, parameter: Parameter, trials: Sequence[Ranked]) -> Paramete
     return ParameterAxis(path, tuple(map(value_text, parameter)), False, np.array(numbers))
 
 
-def sweep_sheet(title: str, picture: ChartPicture, groups: Sequence[Group], panel: Panel) -> Canvas:
+def sweep_sheet(title: str, drawn: DrawnTrials, groups: Sequence[Group], panel: Panel) -> Canvas:
     """Return one sheet: the objective along each parameter, parallel coordinates, and learning curves.
 
     The curves are those of groups of runs, in one panel.
     """
-    parameters = [parameter_chart(picture, axis) for axis in picture.axes]
+    parameters = [parameter_chart(drawn, axis) for axis in drawn.axes]
     columns = 2 if len(parameters) in (2, 4) else min(3, len(parameters))
     row_height = max(chart.height for chart in parameters)
-    parallel = parallel_chart(picture)
+    parallel = parallel_chart(drawn)
     curves = panel_chart(panel, len(groups))
-    notes = [(line, palette.INK) for line in textwrap.wrap(picture.footnote, _MAX_NOTE_LENGTH)]
+    notes = [(line, palette.INK) for line in textwrap.wrap(drawn.footnote, _MAX_NOTE_LENGTH)]
     for number, group in enumerate(groups):
         lines = textwrap.wrap(group.label, _MAX_NOTE_LENGTH, subsequent_indent="    ")
         notes += [(line, series_colour(number)) for line in lines]
@@ -187,39 +185,39 @@ def sweep_sheet(title: str, picture: ChartPicture, groups: Sequence[Group], pane
     return sheet
 
 
-def parameter_chart(picture: ChartPicture, axis: ParameterAxis) -> Chart:
+def parameter_chart(drawn: DrawnTrials, axis: ParameterAxis) -> Chart:
     """Return the objective of the trials against a parameter, the best trial in another colour.
 
     Pruned trials are hollow.
     """
     is_used = ~np.isnan(axis.values)
-    values, ranges, x = picture.values[is_used], picture.ranges[is_used], axis.values[is_used]
+    values, ranges, x = drawn.values[is_used], drawn.ranges[is_used], axis.values[is_used]
     labels = [textwrap.shorten(choice, 24) for choice in axis.choices]
     slanted = sum(map(len, labels)) > 28
     bottom, height = (144.0, 210.0) if slanted else (146.0, 187.0)
     across = Scale.around(x, 62.0, 280.0, log=axis.log)
     if labels:
         across = Scale(-0.5, len(labels) - 0.5, 62.0, 280.0)
-    up = Scale.around(ranges, bottom, 24.0, log=picture.log)
-    chart = Chart(across, up, WIDTH, height, f"{picture.objective} against {axis.path}")
+    up = Scale.around(ranges, bottom, 24.0, log=drawn.log)
+    chart = Chart(across, up, WIDTH, height, f"{drawn.objective} against {axis.path}")
     chart.x_ticks(list(enumerate(labels)) if labels else labelled(across.ticks), slanted)
     chart.y_ticks(labelled(up.ticks, float(np.abs(ranges).max()) >= 10_000))
-    better = "lower" if picture.lower_is_better else "higher"
-    chart.frame(axis.path, 14.0, "", [*textwrap.wrap(picture.objective, 30)[:2], f"({better} is better)"])
+    better = "lower" if drawn.lower_is_better else "higher"
+    chart.frame(axis.path, 14.0, "", [*textwrap.wrap(drawn.objective, 30)[:2], f"({better} is better)"])
     for place, ends in zip(chart.x(x).tolist(), chart.y(ranges).tolist(), strict=True):
         chart.shape([(place, end) for end in ends], stroke=_TRIAL, width=0.8, opacity=0.25)
     is_best = (np.arange(len(is_used)) == 0)[is_used]
-    is_finished = np.array([trial.state == "finished" for trial in picture.trials])[is_used]
+    is_finished = np.array([trial.state == "finished" for trial in drawn.trials])[is_used]
     for state, hollow in ((is_finished, False), (~is_finished, True)):
-        drawn = state & ~is_best
-        chart.markers(x[drawn], values[drawn], _TRIAL, 0, 1.7, opacity=0.6, hollow=hollow)
+        selected = state & ~is_best
+        chart.markers(x[selected], values[selected], _TRIAL, 0, 1.7, opacity=0.6, hollow=hollow)
     chart.markers(x[is_best], values[is_best], _BEST, 3, 4.0)
     return chart
 
 
-def parallel_chart(picture: ChartPicture) -> Chart:
+def parallel_chart(drawn: DrawnTrials) -> Chart:
     """Return parallel coordinates: each trial a line over all parameters to its objective."""
-    axes = [*picture.axes, ParameterAxis(picture.objective, (), picture.log, picture.values)]
+    axes = [*drawn.axes, ParameterAxis(drawn.objective, (), drawn.log, drawn.values)]
     lines = np.array([_unit(axis.values, axis.log, axis.choices) for axis in axes]).T
     places = np.arange(len(axes), dtype=np.float64)
     x = Scale(-0.1, len(axes) - 0.75, 10.0, 580.0)
@@ -240,7 +238,7 @@ def parallel_chart(picture: ChartPicture) -> Chart:
     return chart
 
 
-def _trial_line(chart: Chart, heights: Values, colour: str, width: float, opacity: float) -> None:
+def _trial_line(chart: Chart, heights: Floats, colour: str, width: float, opacity: float) -> None:
     """Draw a trial over the parameters that it uses."""
     is_used = ~np.isnan(heights)
     places = np.flatnonzero(is_used).astype(np.float64)
@@ -260,7 +258,7 @@ def _label_column(chart: Chart, column: int, axis: ParameterAxis) -> None:
         chart.text(chart.x.at(column) + 5, chart.y.at(height) + 2.8, text, size=SMALL, halo=True)
 
 
-def _unit(values: Values, log: bool, choices: tuple[str, ...]) -> Values:
+def _unit(values: Floats, log: bool, choices: tuple[str, ...]) -> Floats:
     """Return the places of values between the lowest, 0, and the highest, 1."""
     if choices:
         return values / max(len(choices) - 1, 1)
@@ -281,7 +279,7 @@ def render_sweep(results: Results, recordings: Path) -> str:
         ranking.title,
         ranking.sentences,
         [
-            parameters_section(picture_of(results)),
+            parameters_section(drawn_trials(results)),
             learning_section(learning(results, recordings)),
             replace(ranking, title="Ranking", sentences=[]),
             *others,
@@ -291,11 +289,11 @@ def render_sweep(results: Results, recordings: Path) -> str:
     )
 
 
-def parameters_section(picture: ChartPicture) -> Section:
+def parameters_section(drawn: DrawnTrials) -> Section:
     """Return the trials for a page: along each parameter, and in parallel coordinates."""
-    along = [Figure(parameter_chart(picture, axis).svg()) for axis in picture.axes]
-    parallel = Figure(parallel_chart(picture).svg(), is_wide=True)
-    return Section("Parameters", [picture.footnote], figures=[*along, parallel])
+    along = [Figure(parameter_chart(drawn, axis).svg()) for axis in drawn.axes]
+    parallel = Figure(parallel_chart(drawn).svg(), is_wide=True)
+    return Section("Parameters", [drawn.footnote], figures=[*along, parallel])
 
 
 def learning_section(groups: Sequence[Group]) -> Section:

@@ -309,14 +309,14 @@ class SweepFile(ConfigSection):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        self.searched.check(self.strategy, self.trials, self.parameters)
+        self.search_strategy.check(self.strategy, self.trials, self.parameters)
         if self.pruning is not None and self.objective.at == "first_over":
             raise refusal(("pruning",), "found one, but objective.at is first_over, which can come late")
         return self
 
     @property
-    def searched(self) -> Strategy:
-        """How its values are tried."""
+    def search_strategy(self) -> Strategy:
+        """How the values of its trials are found."""
         return STRATEGIES[self.strategy]
 
 

@@ -217,7 +217,7 @@ class Results(Answer):
     def is_whole_grid(self) -> bool:
         """Whether every point of a grid was completed, each seed with a finite value."""
         return (
-            self.sweep.file.searched.is_grid
+            self.sweep.file.search_strategy.is_grid
             and len(self.suggested) == points_of(self.sweep.file.parameters.values())
             and all(trial.state == "finished" for trial in self.suggested)
             and all(_is_reached(value) for trial in self.suggested for value in trial.seed_values.values())
@@ -248,8 +248,10 @@ class Results(Answer):
     @property
     def hints(self) -> list[str]:
         """How the best configuration is written."""
-        what = self.best and f"the configuration of trial {self.best.number}, with seeds not searched"
-        return [f"--write-best FILE writes {what}."] if what else []
+        if self.best is None:
+            return []
+        trial = f"the configuration of trial {self.best.number}, with seeds not searched"
+        return [f"--write-best FILE writes {trial}."]
 
     def as_json(self) -> Json:
         """Return objective, ranking and effects, and the number of the best trial."""

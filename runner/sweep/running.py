@@ -36,6 +36,10 @@ from runner.util.humanize import size
 
 INTERRUPTED: Final = "interrupted"
 _WAIT_SECONDS: Final = 0.2
+_BYTES_PER_EPISODE: Final = 40
+_BYTES_PER_EVALUATION: Final = 1500
+_COMPRESSED_SHARE: Final = 0.75
+"""Size of a compressed table as a share of its bytes."""
 
 
 @dataclass
@@ -64,6 +68,8 @@ class SweepStatus:
 
 Limit = Callable[[SweepStatus, Task], str]
 """Returns why a task may not be started; empty if it may."""
+
+# --- batches of runs --------------------------------------------------------------------------------------
 
 
 def run_sweep(
@@ -214,10 +220,7 @@ class _Runner:
         status.best = best_of(filter(None, (status.best, trial)), self.sweep)
 
 
-BYTES_PER_EPISODE: Final = 40
-BYTES_PER_EVALUATION: Final = 1500
-COMPRESSED_SHARE: Final = 0.75
-"""Size of a compressed table as a share of its bytes."""
+# --- what a sweep takes ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -240,7 +243,7 @@ class Plan:
 def plan_of(sweep: Sweep) -> Plan:
     """Return what a sweep will take, measured by its first trial with one episode."""
     search = Search(sweep)
-    is_grid = sweep.file.searched.is_grid
+    is_grid = sweep.file.search_strategy.is_grid
     configs: list[ExperimentConfig] = []
     errors: list[ConfigError] = []
     for values in search.ask(search.trials if is_grid else sweep.file.batch):
@@ -279,9 +282,9 @@ def _estimated_bytes(config: ExperimentConfig, mdp: Mdp) -> int:
     one = estimate(config, mdp.step_limit)
     trials = one.evaluations * (config.evaluation.trials if config.evaluation else 0)
     return round(
-        one.snapshots * table * COMPRESSED_SHARE
-        + (config.episodes + trials) * BYTES_PER_EPISODE
-        + one.evaluations * BYTES_PER_EVALUATION
+        one.snapshots * table * _COMPRESSED_SHARE
+        + (config.episodes + trials) * _BYTES_PER_EPISODE
+        + one.evaluations * _BYTES_PER_EVALUATION
         + (one.typical_bytes if config.recording.steps == "all" else 0)
     )
 
@@ -324,6 +327,9 @@ def limit_of(limits: SweepLimits, plan: Plan, recordings: Path, before: int) -> 
         return ""
 
     return reason
+
+
+# --- the whole sweep ------------------------------------------------------------------------------------
 
 
 def run_whole_sweep(

@@ -129,11 +129,11 @@ def require_startable(sweep: Sweep, recordings: Path, resume: bool, accept_chang
 
 def differences(before: Mapping[str, object], now: Mapping[str, object]) -> list[tuple[str, str, str]]:
     """Return what differs between two sweeps: path, value before, value now."""
-    ours, theirs = flatten(before), flatten(now)
+    old, new = flatten(before), flatten(now)
     return [
-        (key, str(ours.get(key, "nothing")), str(theirs.get(key, "nothing")))
-        for key in dict.fromkeys([*ours, *theirs])
-        if ours.get(key, "nothing") != theirs.get(key, "nothing")
+        (key, str(old.get(key, "nothing")), str(new.get(key, "nothing")))
+        for key in dict.fromkeys([*old, *new])
+        if old.get(key, "nothing") != new.get(key, "nothing")
         and not f"{key}.".startswith(tuple(f"{ignored}." for ignored in _IGNORED))
     ]
 

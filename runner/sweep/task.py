@@ -63,8 +63,18 @@ class Task:
         return replace(self, threads=threads, on_own_disk=self.on_own_disk or on_own_disk)
 
     def run(self, stop: Callable[[], bool]) -> Result:
-        """Run the task; see `run_task`."""
-        return run_task(self, stop)
+        """Run the task; errors that a user can fix become a failed result.
+
+        `stop` is called every few milliseconds; once it returns True, the run is interrupted.
+        """
+        try:
+            if self.on_own_disk:
+                return _run_on_own_disk(self, stop)
+            run = _run(self, stop)
+            return result_of(run, self.objective) if is_over(run) else Result("interrupted", run.run_id)
+        except RunnerError as error:
+            exists = (Path(self.recordings) / self.run_id).is_dir()
+            return Result("failed", self.run_id if exists else "", error=str(error))
 
 
 @dataclass(frozen=True)
@@ -81,21 +91,6 @@ class Result:
     error: str = ""
 
 
-def run_task(task: Task, stop: Callable[[], bool]) -> Result:
-    """Run a task; errors that a user can fix become a failed result.
-
-    `stop` is called every few milliseconds; once it returns True, the run is interrupted.
-    """
-    try:
-        if task.on_own_disk:
-            return _run_on_own_disk(task, stop)
-        run = _run(task, stop)
-        return result_of(run, task.objective) if is_over(run) else Result("interrupted", run.run_id)
-    except RunnerError as error:
-        exists = (Path(task.recordings) / task.run_id).is_dir()
-        return Result("failed", task.run_id if exists else "", error=str(error))
-
-
 def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
     """Run a task in a temporary folder of this machine; then move its files into the recordings."""
     target = Path(task.recordings) / task.run_id
@@ -105,7 +100,7 @@ def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
     with storage_errors(target), tempfile.TemporaryDirectory(prefix=prefix) as folder:
         own = Path(folder) / task.run_id
         shutil.copytree(target, own)
-        result = run_task(replace(task, recordings=folder, on_own_disk=False), stop)
+        result = replace(task, recordings=folder, on_own_disk=False).run(stop)
         if own.is_dir():
             move_files(own, target)
             if result.status == "pruned":
@@ -176,7 +171,7 @@ def _run(task: Task, stop: Callable[[], bool]) -> Run:
             run = run_job(job, begun, pruner.report, pruner.stop, mdp=mdp, threads=task.threads)
     if pruner.is_pruned and run.status != "finished":
         _mark_pruned(run.folder)
-        return Run(run.folder, run.facts)
+        return Run(run.folder, run.facts)  # with the new tag
     return run
 
 

@@ -50,11 +50,11 @@ class Search:
         file = sweep.file
         self._file = file
         self._space = {path: self._distribution(parameter) for path, parameter in file.parameters.items()}
-        sampler = file.searched.sampler(self._optuna.samplers, file.batch, file.search_seed % 2**32)
+        sampler = file.search_strategy.sampler(self._optuna.samplers, file.batch, file.search_seed % 2**32)
         self._study = self._optuna.create_study(sampler=sampler, direction=file.objective.direction)
         self._asked_trials: list[OptunaTrial] = []
         self._suggested: set[str] = set()
-        self._points = self._distinct_points() if file.searched.is_grid else []
+        self._points = self._distinct_points() if file.search_strategy.is_grid else []
         self.trials = file.trials or len(self._points)
         """The number of trials of the whole search."""
 
@@ -65,7 +65,7 @@ class Search:
             if self._points:
                 self._study.enqueue_trial(self._grid_point(self._points[number]))
             trial, values = self._draw()
-            if self._file.searched.skips_repeats and not self._file.repeats:
+            if self._file.search_strategy.skips_repeats and not self._file.repeats:
                 # The same values would give the same runs, from which the search learns nothing.
                 for _ in range(_MAX_DRAWS):
                     if self._identity(values) not in self._suggested:
@@ -207,7 +207,7 @@ class Trials:
         self.search = Search(sweep)
         self.done: list[Trial] = []
         """The trials of the batches that are over."""
-        adaptive = sweep.file.searched.is_adaptive or sweep.file.pruning is not None
+        adaptive = sweep.file.search_strategy.is_adaptive or sweep.file.pruning is not None
         self._batch_size = sweep.file.batch if adaptive else self.search.trials
 
     def ask(self) -> list[Trial]:

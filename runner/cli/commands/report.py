@@ -130,16 +130,16 @@ def _refuse_style(axis: str, style: CurveStyle) -> None:
 def _plot_sweep(name: str, recordings: Path, to: Writing) -> Reply:
     from runner.analysis.groups import panels_of
     from runner.export.plots.chart import save
-    from runner.sweep.charts import learning, panel_of, picture_of, sweep_sheet
+    from runner.sweep.charts import drawn_trials, learning, panel_of, sweep_sheet
     from runner.sweep.results import results_of
 
     results = results_of(name, recordings)
-    picture = picture_of(results)
+    drawn = drawn_trials(results)
     groups = learning(results, recordings)
     panel = panel_of(results.sweep.objective.metric, panels_of(groups))
     with stage_line("drawing"), new_file(to.path(), to.force) as path:
-        save(sweep_sheet(f"Sweep {name}", picture, groups, panel), path)
-    count = len(picture.trials)
+        save(sweep_sheet(f"Sweep {name}", drawn, groups, panel), path)
+    count = len(drawn.trials)
     return written(f"{to.path()}: the sweep {name}, {count} trials", to.path(), sweep=name, trials=count)
 
 

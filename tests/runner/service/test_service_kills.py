@@ -23,7 +23,6 @@ from runner.service.jobs.store import JobStore
 from runner.sweep import state
 from runner.sweep.loading import from_values
 from runner.sweep.running import run_sweep
-from runner.sweep.task import run_task
 from runner.sweep.trials import Trials, recorded_trials
 from tests.reliability.jobs import is_worker
 
@@ -162,7 +161,7 @@ class Here:
         self.idle = 1
 
     def submit(self, task):
-        self.answers.append((task, run_task(task, lambda: False)))
+        self.answers.append((task, task.run(lambda: False)))
 
     def collect(self, seconds):
         answers, self.answers = self.answers, []

@@ -38,20 +38,20 @@ def arrange(moment):
 
 
 def run_dying(notes, moments, task, stop):
-    """Run a task as `run_task`; the first attempt at the nth job dies at the nth moment."""
+    """Run a task as `Task.run`; the first attempt at the nth job dies at the nth moment."""
     try:
         (notes / task.identity).mkdir()
     except FileExistsError:
-        return tasks.run_task(task, stop)
+        return task.run(stop)
     number = next(n for n in itertools.count() if is_first(notes / f"attempt {n}"))
     if number >= len(moments):
-        return tasks.run_task(task, stop)
+        return task.run(stop)
     moment = moments[number]
     (notes / f"died {moment}").touch()
     if moment == moments[0]:
         die()
     arrange(moment)
-    tasks.run_task(task, stop)
+    task.run(stop)
     return die()
 
 
@@ -64,7 +64,7 @@ def is_first(path):
 
 
 def attempt(task, stop):
-    """Run a task as `run_task`, and die as the environment variables say."""
+    """Run a task as `Task.run`, and die as the environment variables say."""
     return run_dying(Path(os.environ["DYING_NOTES"]), os.environ["DYING_MOMENTS"].split(","), task, stop)
 
 

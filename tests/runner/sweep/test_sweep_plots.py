@@ -17,7 +17,7 @@ from runner.errors import RunnerError
 from runner.export.plots.chart import Markers
 from runner.runs.run import list_runs
 from runner.sweep import state
-from runner.sweep.charts import learning, panel_of, parameter_chart, picture_of
+from runner.sweep.charts import drawn_trials, learning, panel_of, parameter_chart
 from runner.sweep.loading import from_values
 from runner.sweep.results import fresh_seeds, results_of
 
@@ -34,28 +34,26 @@ def typed(*words):
 
 
 def test_each_trial_is_drawn_at_its_values(results, done):
-    picture = picture_of(results)
+    drawn = drawn_trials(results)
     by_number = {trial.number: trial for trial in done[1].done}
-    assert picture.trials[0].number == done[2].best.number
-    step_size, discount = picture.axes
+    assert drawn.trials[0].number == done[2].best.number
+    step_size, discount = drawn.axes
     for place, choice, value, trial in zip(
-        step_size.values, discount.values, picture.values, picture.trials, strict=True
+        step_size.values, discount.values, drawn.values, drawn.trials, strict=True
     ):
         trial_there = by_number[trial.number]
         assert place == trial_there.values["step_size"]
         assert discount.choices[int(choice)] == str(trial_there.values["discount"])
         assert value == trial_there.value
-    assert all(
-        low <= value <= high for value, (low, high) in zip(picture.values, picture.ranges, strict=True)
-    )
+    assert all(low <= value <= high for value, (low, high) in zip(drawn.values, drawn.ranges, strict=True))
 
 
 def test_a_pruned_trial_is_hollow(results):
     def hollow(entries):
-        picture = picture_of(replace(results, ranking=entries))
-        marks = parameter_chart(picture, picture.axes[0]).marks
+        drawn = drawn_trials(replace(results, ranking=entries))
+        marks = parameter_chart(drawn, drawn.axes[0]).marks
         dots = [mark for mark in marks if isinstance(mark, Markers) and not mark.fill]
-        return sum(len(mark.points) for mark in dots), "A hollow one was pruned" in picture.footnote
+        return sum(len(mark.points) for mark in dots), "A hollow one was pruned" in drawn.footnote
 
     *kept, last = results.ranking
     assert hollow(results.ranking) == (0, False)
@@ -116,7 +114,7 @@ def test_a_sweep_without_finished_trials_cannot_be_drawn(tmp_path):
     sweep = from_values(described())
     state.begin(sweep, tmp_path, resume=False, accept_changes=False)
     with pytest.raises(RunnerError, match="no finished trial yet"):
-        picture_of(results_of(sweep.name, tmp_path))
+        drawn_trials(results_of(sweep.name, tmp_path))
 
 
 def test_duplicate_values_are_shown_once(tmp_path):
@@ -138,7 +136,7 @@ def test_a_level_never_reached_is_not_drawn(tmp_path):
     trials, _ = swept(tmp_path, sweep)
     assert len(digests(trials)) == 3
     with pytest.raises(RunnerError, match="nothing to draw"):
-        picture_of(results_of(sweep.name, tmp_path))
+        drawn_trials(results_of(sweep.name, tmp_path))
 
 
 def test_a_sweep_of_archived_runs_is_complete(tmp_path, monkeypatch):

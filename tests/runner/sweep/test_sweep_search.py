@@ -13,7 +13,7 @@ from runner.recording import schema
 from runner.recording.reader import open_recording
 from runner.recording.topic_chunks import TopicChunks
 from runner.sweep import state
-from runner.sweep.charts import parameters_section, picture_of
+from runner.sweep.charts import drawn_trials, parameters_section
 from runner.sweep.loading import from_values
 from runner.sweep.model import STRATEGIES, Objective
 from runner.sweep.objective import curve_of, pruning_bounds, should_prune, value_of
@@ -175,8 +175,8 @@ def test_parameters_that_an_algorithm_does_not_use_spend_no_trials(changes, tmp_
     assert results.trials == len(results.suggested) == 4
     rows = {row[-3]: row[-2] for row in results.sections()[0].grids[0].rows}
     assert rows["q_learning"] == "–"
-    picture = picture_of(results)
-    assert "nan" not in "".join(plot.svg for plot in parameters_section(picture).figures).lower()
+    drawn = drawn_trials(results)
+    assert "nan" not in "".join(plot.svg for plot in parameters_section(drawn).figures).lower()
 
 
 def test_an_old_sweep_without_repeats_may_repeat_values(tmp_path):
