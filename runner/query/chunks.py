@@ -199,7 +199,7 @@ def _known_of(recording: Recording, chunks: TopicChunks, condition: Condition) -
 
 
 def _episodes_of_steps(phase: Phase, starts: Ints, ends: Ints) -> dict[str, tuple[Ints, Ints]]:
-    """Return the first and the last episode of chunks of steps, as an episode has the time of its last step.
+    """Return the first and the last episode of chunks of steps: an episode has the time of its last step.
 
     Environments that take turns count their own episodes. A chunk after the last episode may be of any later
     one, as of a run that was killed. Nothing is known where a repair lost episodes.
@@ -209,9 +209,9 @@ def _episodes_of_steps(phase: Phase, starts: Ints, ends: Ints) -> dict[str, tupl
     turns = phase.steps.environments if phase.steps.have_turns else 1
     blocks: list[list[Ints]] = [[np.zeros(0, np.int64)] for _ in range(turns)]
     for block in phase.episodes.rows():
-        for k, own in enumerate(blocks):
-            mine = block[block["environment"] == k] if turns > 1 else block
-            own.append(mine["log_time"].astype(np.int64))
+        for k, times in enumerate(blocks):
+            rows = block[block["environment"] == k] if turns > 1 else block
+            times.append(rows["log_time"].astype(np.int64))
     first, last = [], []
     for ended in map(np.concatenate, blocks):
         after = np.searchsorted(ended, ends)
@@ -230,7 +230,7 @@ def _batches_of_archive(
     if not rows:
         return
     run_id = archive.run_id
-    where = f"{store.place(archive.run_id)}/{table.name}"
+    where = f"{store.place(run_id)}/{table.name}"
     places = {name: k for k, name in enumerate(table.columns.names) if name in _COMPARED}
     try:
         with (

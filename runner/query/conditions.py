@@ -49,7 +49,7 @@ _BOUNDS: Final[dict[Operation, tuple[str, str]]] = {
     ),
 }
 """Over the index, whether a condition holds at all steps of an episode, and whether it holds at some."""
-_OTHERS: Final = "a filter of runs can exclude it"
+_EXCLUDABLE: Final = "a filter of runs can exclude it"
 _MAX_WITHIN: Final = 2**31 - 1
 _OF_STEPS: Final = re.compile(r"(?:min|count)\((?!.* == )(.*)\)|n_(.*)")
 """A column of the index for each column of steps, and for each event, which may be known without steps."""
@@ -194,7 +194,7 @@ class EpisodeParser(Parser[Part]):
                 )
             number = self.numbered(right, names, "action")
         except RunnerError as error:
-            raise NotInRun(error, f"it has no action {text.label}; {_OTHERS}.") from None
+            raise NotInRun(error, f"it has no action {text.label}; {_EXCLUDABLE}.") from None
         return self.applied(CONDITION, ast.Eq, action, self.fixed(NUMBER, number))
 
     def call(self, node: ast.Call, name: str) -> Part:
@@ -240,7 +240,7 @@ class EpisodeParser(Parser[Part]):
         if (column := columns.get(spelt(text))) is None:
             hint = nearest(text, [*columns, *AGGREGATES])
             more = ""
-            reason = f"no {text}; {_OTHERS}"
+            reason = f"no {text}; {_EXCLUDABLE}"
             if not self._is_inside:
                 more = ", any(), count(), then()"
                 if spelt(text) in self.facts.columns(True):

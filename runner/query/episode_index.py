@@ -32,7 +32,7 @@ from runner.environments.naming import action_names
 from runner.errors import RecordingError
 from runner.query.conditions import ENDS, Facts, quoted
 from runner.query.sql import Database
-from runner.query.views import SelectedRuns
+from runner.query.sql_views import SelectedRuns
 from runner.recording.reader import Recording, open_recording
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.run import RECORDING_FILE, RUN_FILE, listed_run
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 MAX_FILES: Final = 20_000
 _VERSION: Final = 7
 _PACKED: Final = 64
-"""The files that a pack has in the mean."""
+"""The average number of files in a pack."""
 _LEAST: Final = 8
 """The fewest files for which a pack is made, or read."""
 _HEX: Final = 16
@@ -73,10 +73,10 @@ class EpisodeIndex:
             written = self.folder.glob("[!.]*-*.parquet")  # a hidden one is being written by another search
             self._files = {path.stem[:-_HEX]: path for path in written}
         self.read = set[Path]()
-        """The files that were asked for, their packs, and what else is packed there."""
+        """The files of the index that were asked for, their packs, and the other files in these packs."""
 
     def file(self, row: IndexRow, runs: SelectedRuns) -> Path:
-        """Return the file of a run, which is made if it is missing.
+        """Return the file of a run; make it if it is missing.
 
         Raises:
             RunnerError: the run has no episodes, is damaged, or its archive cannot be reached.

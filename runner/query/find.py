@@ -17,7 +17,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from runner.analysis.contents import END_WORDS
 from runner.analysis.episodes import EpisodeRef, mark_steps
@@ -36,7 +36,7 @@ from runner.query.episode_index import (
     with_steps,
 )
 from runner.query.sql import MEMORY_MB, Database, QueryFailed
-from runner.query.views import Recordings, SelectedRuns
+from runner.query.sql_views import Recordings, SelectedRuns
 from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
@@ -62,7 +62,7 @@ _OPEN: Final = {"enable_external_access": "true"}
 
 @dataclass(frozen=True)
 class Hit:
-    """An episode that was found."""
+    """An episode that matches."""
 
     run_id: str
     name: str
@@ -214,8 +214,16 @@ def are_words(expression: str) -> bool:
     return bool(_WORDS.fullmatch(expression)) and _OF_CONDITIONS.isdisjoint(expression.split())
 
 
-_Question = tuple[str, str, dict[str, str], dict[str, str]]
-"""An expression in SQL, the number to sort by, and the aggregates and windows of steps that they need."""
+class _Question(NamedTuple):
+    """A condition in SQL, over the index alone or with the steps read."""
+
+    where: str
+    key: str
+    """The number to sort by."""
+    aggregates: dict[str, str]
+    """The functions of steps that both need, the SQL of each by name."""
+    windows: dict[str, str]
+    """The columns of steps that the aggregates need, the SQL of each by name."""
 
 
 class _Search:
@@ -247,8 +255,8 @@ class _Search:
             FileNotFoundError: a file of the index was removed meanwhile.
         """
         try:
-            self._take(condition, phase, sort)
-            return self._found(expression, limit)
+            self._search_runs(condition, phase, sort)
+            return self._first_hits(expression, limit)
         except QueryFailed as error:
             if not all(path.exists() for path in self.index.read):
                 raise FileNotFoundError from error
@@ -258,8 +266,8 @@ class _Search:
                 f"{error}\nThe index of these runs was removed: the next search makes it again."
             ) from error
 
-    def _take(self, condition: str, phase: str | None, sort: str) -> None:
-        """Search all runs."""
+    def _search_runs(self, condition: str, phase: str | None, sort: str) -> None:
+        """Add the hits in all runs; leave out the runs that have no index or not what the condition names."""
         kinds = defaultdict[str, list[int]](list)
         for k, row in enumerate(self.runs.rows):
             try:
@@ -276,35 +284,36 @@ class _Search:
         for numbers in kinds.values():
             facts = self.database.call(facts_of, self.files[numbers[0]])
             try:
-                first, second = (_parsed(facts, condition, sort, reads) for reads in (False, True))
+                of_index, of_steps = (_parsed(facts, condition, sort, reads) for reads in (False, True))
             except RunnerError as error:
                 wrong.append(error)
                 reason = error.reason if isinstance(error, NotInRun) else str(error).partition("\n")[0]
                 for k in numbers:
                     self.runs.left_out[self.runs.rows[k]["id"]] = {"find": reason}
             else:
-                self._ask(numbers, first, second, f" AND phase = '{phase}'" if phase else "")
+                self._add_hits(numbers, of_index, of_steps, f" AND phase = '{phase}'" if phase else "")
         if wrong and len(wrong) == len(kinds):
             raise next((error for error in wrong if "Did you mean" in str(error)), wrong[0])
 
-    def _ask(self, numbers: Sequence[int], first: _Question, second: _Question, among: str) -> None:
+    def _add_hits(
+        self, numbers: Sequence[int], of_index: _Question, of_steps: _Question, in_phase: str
+    ) -> None:
         """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
-        where, key, aggregates, _ = first
+        where, key, aggregates, _ = of_index
         is_open = f"{where} IS NULL OR {key} IS NULL" if aggregates else "FALSE"
         files = in_files(self.index.packed({self.files[k] for k in numbers}))
         self.database.rows(
             f"INSERT INTO hits SELECT run, row, {key}, {is_open} FROM {files} JOIN runs USING (file) "
-            f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{among}"
+            f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{in_phase}"
         )
         for (k,) in self.database.rows("SELECT DISTINCT run FROM hits WHERE is_open ORDER BY run"):
             with self.runs.reading("find", self.runs.rows[k]):
-                self._read(k, *second)
+                self._add_hits_by_steps(k, of_steps)
         self.database.rows("DELETE FROM hits WHERE is_open")
 
-    def _read(
-        self, k: int, where: str, key: str, aggregates: dict[str, str], windows: dict[str, str]
-    ) -> None:
-        """Add those of the open episodes of a run that match by their steps."""
+    def _add_hits_by_steps(self, k: int, question: _Question) -> None:
+        """Add the open episodes of a run that match by their steps."""
+        where, key, aggregates, windows = question
         row = self.runs.rows[k]
         chosen = (
             f"SELECT * FROM {in_files([self.files[k]])} "
@@ -325,8 +334,8 @@ class _Search:
         rows = with_steps(chosen, aggregates, windows, among)
         self.database.rows(f"INSERT INTO hits SELECT {k}, row, {key}, FALSE FROM ({rows}) WHERE {where}")
 
-    def _found(self, expression: str, limit: int | None) -> Found:
-        """Return the first episodes, as they are sorted."""
+    def _first_hits(self, expression: str, limit: int | None) -> Found:
+        """Return the first episodes in the order of the search."""
         searched = [k for k, row in enumerate(self.runs.rows) if not self.runs.left_out.get(row["id"])]
         self.database.rows("DELETE FROM hits WHERE run NOT IN (SELECT unnest($runs))", {"runs": searched})
         ((count,),) = self.database.rows("SELECT count(*) FROM hits")
@@ -371,4 +380,4 @@ def _parsed(facts: Facts, condition: str, sort: str, reads_steps: bool) -> _Ques
     if sort:
         sorting = EpisodeParser(sort, facts, reads_steps, parser.aggregates, parser.windows)
         key = sorting.whole(NUMBER).sql
-    return f"({where})", f"({key})::DOUBLE", parser.aggregates, parser.windows
+    return _Question(f"({where})", f"({key})::DOUBLE", parser.aggregates, parser.windows)

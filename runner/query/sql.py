@@ -19,7 +19,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from runner.errors import RunnerError
-from runner.query.views import VIEWS, Recordings, SelectedRuns
+from runner.query.sql_views import VIEWS, Recordings, SelectedRuns
 from runner.runs.catalogue.filters import parse
 from runner.util.extras import require
 from runner.util.processes import Tell

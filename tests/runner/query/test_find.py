@@ -23,7 +23,7 @@ from runner.cli import cli
 from runner.errors import RunnerError
 from runner.query import episode_index
 from runner.query.conditions import EpisodeParser
-from runner.query.views import SelectedRuns
+from runner.query.sql_views import SelectedRuns
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run
 from runner.util.files import CACHE_VARIABLE, CACHED_EPISODES, cache_folder

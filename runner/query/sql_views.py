@@ -1,4 +1,4 @@
-"""The views of a query: the tables of the selected runs as one, with a column for the run.
+"""The views that a query in SQL names: the tables of the selected runs as one, with a column for the run.
 
 Steps, extras, episodes and scalars are read while the query runs, in the columns and chunks that it needs. A
 column that a run does not have is null in its rows. The other views are small.
