@@ -172,8 +172,8 @@ def exit_code_of(error: RunnerError) -> int:
     return error.exit_code
 
 
-def _of_the_system(error: Exception) -> RunnerError | None:
-    """Return the error of our own for one of the system: a full disk, too little memory, too many files."""
+def _system_error(error: Exception) -> RunnerError | None:
+    """Return our error for an error of the system: a full disk, too little memory, too many open files."""
     number = error.errno if isinstance(error, OSError) else None
     limit = ""
     if number in _DISK_FULL and isinstance(error, OSError):
@@ -258,7 +258,7 @@ class LazyGroup(ViewGroup):
         except RunnerError as error:
             raise Failure(error) from error
         except (OSError, MemoryError, RuntimeError) as error:
-            if (understood := _of_the_system(error)) is None:
+            if (understood := _system_error(error)) is None:
                 raise
             raise Failure(understood) from error
         except click.exceptions.NoArgsIsHelpError:

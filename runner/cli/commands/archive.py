@@ -122,8 +122,8 @@ def import_command(
     """Import FILE, a recording from elsewhere, into the folder of runs.
 
     FILE was written by `dualtaxi export mcap`, or is any recording. Every byte is checked before the run
-    appears; a damaged or inconsistent file is refused, and nothing is written. A run that is
-    here already with the same content or more stays as it is; an interrupted run is completed from FILE.
+    appears; a damaged or inconsistent file is refused, and nothing is written. A run that is here already
+    with the same content or more stays as it is; an interrupted run is completed from FILE.
 
     Examples:
       dualtaxi import quick-k3v9m2xq.mcap

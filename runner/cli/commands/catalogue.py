@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import click
 
@@ -174,9 +174,6 @@ def _contents(index: CatalogueIndex) -> tuple[Counter[str], int, list[str]]:
     return statuses, copies, index.problems()
 
 
-_HEADINGS: Final = ("id", "name", "seed", "status", "success %", "age", "frees")
-_LEFT: Final = ("id", "name", "status")
-
 _yes_option = option("--yes", "-y", is_flag=True, help="Do not ask for confirmation.")
 _foreign_option = option(
     "--foreign-files",
@@ -191,7 +188,7 @@ _dry_run_option = option(
 @click.command("rm", cls=Command)
 def rm_command(
     run_names: tuple[str, ...] = runs_argument,
-    root: Path = runs_folder,
+    folder: Path = runs_folder,
     yes: bool = _yes_option,
     dry_run: bool = _dry_run_option,
     foreign: bool = _foreign_option,
@@ -208,9 +205,9 @@ def rm_command(
     """
     from runner.runs.catalogue.removal import plan
 
-    runs = {run.folder.resolve(): run for run in (find(name, root) for name in run_names)}
-    removals = [plan(run, root, foreign) for run in runs.values()]
-    refused = [f"run {each.run_id} stays: {each.refusal}." for each in removals if each.refusal]
+    runs = {run.folder.resolve(): run for run in (find(name, folder) for name in run_names)}
+    removals = [plan(run, folder, foreign) for run in runs.values()]
+    refused = [f"run {removal.run_id} stays: {removal.refusal}." for removal in removals if removal.refusal]
     if refused:
         raise RunnerError("\n".join([*refused, "Nothing was removed."]))
     yield from _carry_out(removals, {}, foreign, yes, dry_run)
@@ -272,13 +269,13 @@ def prune_command(
         raise click.UsageError("expected a FILTER, --older-than, --keep-last or --status: which runs?")
     rows, protected = look(recordings, lambda index: unwanted(index, criteria, time.time()), say)
     removals = [plan_row(row, foreign) for row in rows]
-    refusals = {each.run_id: each.refusal for each in removals if each.refusal}
+    refusals = {removal.run_id: removal.refusal for removal in removals if removal.refusal}
     for run_id, reason in refusals.items():
         say(f"Run {run_id} stays: {reason}.")
     if protected:
         counts = ", ".join(f"{count:,} {reason}" for reason, count in sorted(protected.items()))
         say(f"Left alone: {counts}.")
-    removals = [each for each in removals if not each.refusal]
+    removals = [removal for removal in removals if not removal.refusal]
     yield from _carry_out(removals, refusals, foreign, yes, dry_run)
 
 
@@ -389,7 +386,8 @@ def _preview(removals: Sequence[Removal], contents: int) -> Iterator[Part]:
         )
         for removal in removals
     ]
-    yield Grid(_HEADINGS, rows, left=_LEFT, cut=("name",))
+    headings = ("id", "name", "seed", "status", "success %", "age", "frees")
+    yield Grid(headings, rows, left=("id", "name", "status"), cut=("name",))
     yield from (Remark(_archive_notice(removal.run())) for removal in removals if removal.is_archived)
     if contents:
         yield Remark(f"Checkpoints that no other run refers to go too: {size(contents)}.")

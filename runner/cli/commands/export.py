@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -145,9 +145,9 @@ def mcap(
     return written(text, path, anonymous=anonymous)
 
 
-GRID_LENGTHS = 2
+_GRID_LENGTHS: Final = 2
 """A grid ends after this many times the median length of its episodes; a failed trial is far longer."""
-_MAX_GIF_FPS = 50
+_MAX_GIF_FPS: Final = 50
 """A GIF counts in hundredths of a second, and players show one of them too slowly."""
 
 
@@ -164,7 +164,7 @@ def film_command(
     whole: bool = option(
         "--whole",
         is_flag=True,
-        help=f"Show a grid until all episodes end.  [default: {GRID_LENGTHS} times the median length]",
+        help=f"Show a grid until all episodes end.  [default: {_GRID_LENGTHS} times the median length]",
     ),
     fps: float | None = option(
         "--fps",
@@ -217,15 +217,17 @@ def film_command(
         opened: list[Pictures] = []
 
         def shots() -> Iterator[film.Shot]:
-            for one in shown:
-                opened.append(Pictures(recording, one.phase, one.number_in(recording), trust))
-                yield film.Shot(f"{run.title}: {one.title}", opened[-1], one.t)
+            for episode in shown:
+                opened.append(Pictures(recording, episode.phase, episode.number_in(recording), trust))
+                yield film.Shot(f"{run.title}: {episode.title}", opened[-1], episode.t)
 
-        lengths = [len(recording.phase(one.phase).episode(one.number_in(recording))) for one in shown]
+        lengths = [
+            len(recording.phase(episode.phase).episode(episode.number_in(recording))) for episode in shown
+        ]
         if shown[0].t > lengths[0]:
             raise shown[0].no_step(recording, lengths[0], shown[0].t)
         longest = (
-            max(lengths) if whole or not grid else min(max(lengths), int(GRID_LENGTHS * median(lengths)))
+            max(lengths) if whole or not grid else min(max(lengths), int(_GRID_LENGTHS * median(lengths)))
         )
         cut = sum(length > longest for length in lengths)
         frames = sum(min(length, longest) + 1 for length in lengths) - shown[0].t
@@ -234,9 +236,9 @@ def film_command(
                 made = film.write_grid(temporary, shots(), grid[1], speed, width, progress, longest + 1)
             else:
                 made = film.write_film(temporary, next(shots()), speed, width, progress)
-    for note in dict.fromkeys(each.reason for each in opened if each.reason):
+    for note in dict.fromkeys(pictures.reason for pictures in opened if pictures.reason):
         say(f"The film shows {opened[0].source}: {note}")
-    notes = [each.note for each in opened if each.note]
+    notes = [pictures.note for pictures in opened if pictures.note]
     for note in notes:
         say(note)
     if cut:
@@ -246,7 +248,7 @@ def film_command(
     reply = written(
         f"{path}: {what}, {opened[0].source}, {facts}",
         path,
-        episodes=[one.title for one in shown],
+        episodes=[episode.title for episode in shown],
         source=str(opened[0].source),
         frames=made.frames,
     )
@@ -266,7 +268,7 @@ def _ranked(recording: Recording, grid: tuple[int, int]) -> list[EpisodeRef]:
     return references(recording, phase, ranked[places])
 
 
-_TABLES_HELP = "Steps, episodes and metrics as tables."
+_TABLES_HELP: Final = "Steps, episodes and metrics as tables."
 _phase_option = option(
     "--phase",
     type=click.Choice(["train", "eval"]),

@@ -73,8 +73,8 @@ def play_command(
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
     episode. --best and --worst choose among the trials of all evaluations, or else the training episodes. The
     space bar pauses, the arrow keys (or b and n) step back and forward, r restarts, and q quits; the last
-    step stays until a key is pressed. Where stdout is no
-    terminal, the frames come one after another, without waiting. --json prints one line for each step.
+    step stays until a key is pressed. Where stdout is no terminal, the frames come one after another, without
+    waiting. --json prints one line for each step.
 
     `dualtaxi export film` writes the pictures of an episode.
 
@@ -288,13 +288,13 @@ def view_command(
             path, selections = cached_export(runs, location.request, stage)
     for selection in selections:
         print_selection(selection)
-    _show(path, location, web, port, screenshot, picture_size)
+    _open_viewer(path, location, web, port, screenshot, picture_size)
 
 
-def _show(
+def _open_viewer(
     path: Path, location: Location, web: bool, port: int, screenshot: Path | None, picture_size: str
 ) -> None:
-    """Show an exported file."""
+    """Show an exported file in the viewer: as a picture, in the browser or in a window."""
     from runner.export.rerun import viewer
 
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so the viewer is ended too

@@ -75,7 +75,7 @@ def resume_command(
 
 
 def _announce(run: Run) -> None:
-    """Print from where a run is resumed, if its recording can be read."""
+    """Print where a run is resumed, if its recording can be read."""
     from runner.recording.reader import open_recording
 
     with contextlib.suppress(RecordingError), open_recording(run.recording) as recording:
@@ -84,10 +84,7 @@ def _announce(run: Run) -> None:
 
 
 @click.command("rerecord", cls=Command)
-def rerecord_command(
-    run: Run = found_run,
-    trust: bool = trust_option,
-) -> Reply:
+def rerecord_command(run: Run = found_run, trust: bool = trust_option) -> Reply:
     """Record the steps of RUN, which was recorded without them.
 
     A job (recording.steps: none) is retrained. The environment of a loop (steps="actions") takes the
@@ -313,7 +310,7 @@ def repair_command(named: tuple[Path, Run | None] = recording_and_run) -> Reply:
         done.append((repaired, own))
     first, *others = [_repair_as_json(repaired) for repaired, _ in done]
     value = first | ({"shards": others} if others else {})
-    text = [_repair(repaired, own) for repaired, own in done]
+    text = [_repair_facts(repaired, own) for repaired, own in done]
     whole = run if run is None else folded(run)
     has_losses = not all(repaired.lossless for repaired, _ in done) or (whole and whole.summary.unfolded)
     return Reply(value, text, exit_code=ExitCode.DIFFERENT if has_losses else ExitCode.OK)
@@ -326,7 +323,7 @@ def _repair_as_json(repaired: Repair) -> dict[str, object]:
     return {"path": str(repaired.path.absolute()), **values, "original": original}
 
 
-def _repair(repaired: Repair, run: Run | None) -> dict[str, str]:
+def _repair_facts(repaired: Repair, run: Run | None) -> dict[str, str]:
     rows = {"recording": str(repaired.path)}
     if run is not None and run.summary.unfolded:
         rows["not in it"] = run.summary.error or ""
