@@ -80,9 +80,10 @@ def episodes(
     values = {name: column.tolist() for name, column in columns.items()}
     episodes_shown = references(recording, phase, values["episode"])
     is_training = phase == "train"
-    sentence = counted(total, "episode" if is_training else "trial")
+    noun = "episode" if is_training else "trial"
+    sentence = counted(total, noun)
     if not episodes_shown:
-        sentence = f"There are {total:,}, from 0" if total else "None was recorded"
+        sentence = f"There are {total:,}, from 0" if total else f"No {noun} has ended"
     elif len(episodes_shown) < total:
         sentence = f"Rows {rows.start:,} to {rows.start + len(episodes_shown) - 1:,} of {sentence}"
     address = f"{EPISODES.name}?phase={phase}&order={order}"

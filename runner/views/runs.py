@@ -118,7 +118,7 @@ class Listing(Answer):
         def work(index: CatalogueIndex) -> int:
             spool.seek(0)
             spool.truncate()
-            self._listed, self._problems = 0, []
+            self._listed, self._problems = 0, index.unreadable()
             rows: Iterable[Row]
             if limit is None:
                 total = index.count(self._filter)
@@ -146,6 +146,7 @@ class Listing(Answer):
         limit = ON_A_TERMINAL if self._limit is None and sys.stdout.isatty() else self._limit or None
 
         def work(index: CatalogueIndex) -> tuple[list[Row], int]:
+            self._problems = index.unreadable()
             rows, total = index.page(self._filter, *order, limit=limit, offset=self._offset, columns=needed)
             return index.with_same_as(rows), total
 
@@ -164,7 +165,7 @@ class Listing(Answer):
             yield row
 
     def _remarks(self) -> Iterator[str]:
-        """Yield problems of damaged runs; how many matching runs are not listed, or why none is."""
+        """Yield what is damaged or cannot be read, how many matching runs are not listed, or why none is."""
         rest = "{} more runs are damaged: `dualtaxi ls 'status == \"damaged\"'`."
         yield from map(capitalised, first_remarks(self._problems, rest))
         folders = ", ".join(map(str, self._recordings))
@@ -174,7 +175,7 @@ class Listing(Answer):
             yield f"Shown are {self._listed:,} of {self._total:,} runs; --limit 0 shows all{more_runs}."
         elif not self._listed and self._filter.condition is not None:
             yield f"No run in {folders} matches."
-        elif not self._listed:
+        elif not self._listed and not self._problems:
             yield f"No runs in {folders} yet. `dualtaxi run CONFIG` makes one."
 
 

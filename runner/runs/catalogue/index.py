@@ -73,6 +73,12 @@ class CatalogueIndex:
         damaged = self._database.execute(f"SELECT problem FROM runs WHERE {where}", self.roots)
         return [problem for (problem,) in damaged]
 
+    def unreadable(self) -> list[str]:
+        """Return the problems of folders that have the files of a run, of which none can be read as one."""
+        where = f"id IS NULL AND +root {self._is_here} AND problem IS NOT NULL ORDER BY root, entry"
+        folders = self._database.execute(f"SELECT problem FROM runs WHERE {where}", self.roots)
+        return [problem for (problem,) in folders]
+
     def select(self, chosen: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> list[IndexRow]:
         """Return the rows that match a filter; arguments as for `rows`."""
         return list(self.rows(chosen, *order, columns=columns))

@@ -65,6 +65,16 @@ def test_other_files_are_ignored(command, tiny, content):
     assert command.json("ls")["runs"] == []
 
 
+def test_a_folder_whose_files_cannot_be_read_is_named(command, tiny):
+    run = create_run(command.recordings, experiment_of(tiny), 3)
+    (run.folder / RUN_FILE).write_text("{")
+    run.recording.write_bytes(b"no recording")
+    for form in ((), ("--quiet",), ("--json",)):
+        done = command("ls", *form)
+        assert done.exit_code == 0
+        assert f"{run.folder}: neither run.json nor recording.mcap can be read as a run." in done.stderr
+
+
 def test_values_of_the_wrong_kind_make_a_damaged_run(command, tiny):
     run = create_run(command.recordings, experiment_of(tiny), 3)
     for key, wrong in (("created", "soon"), ("seed", "x"), ("summary", []), ("config", 3), ("owner", "me")):
