@@ -97,6 +97,8 @@ COMMANDS: Final[dict[str, dict[str, tuple[str, str]]]] = {
 _DISK_FULL: Final = tuple(getattr(errno, name) for name in ("ENOSPC", "EDQUOT") if hasattr(errno, name))
 _NO_THREAD: Final = "can't start new thread"
 """Python's message where the system gives no thread, which has no class of its own."""
+_NOT_LOADED: Final = ("load shared object", "failed to map segment")
+"""Parts of the messages about a library for which there is too little memory."""
 
 _WRONG_PATH: Final = (
     errno.ENOENT,
@@ -182,7 +184,7 @@ def _system_error(error: Exception) -> RunnerError | None:
         limit = "more open files (`ulimit -n`)"
     elif number in (errno.ENOMEM, errno.EAGAIN) or isinstance(error, MemoryError) or _NO_THREAD in str(error):
         limit = "more memory (`ulimit -v`) and processes (`ulimit -u`)"
-    elif isinstance(error, OSError) and number is None and "load shared object" in str(error):
+    elif number is None and any(text in str(error) for text in _NOT_LOADED):
         limit = "more memory (`ulimit -v`), or install the package again"
     if not limit:
         return None
@@ -257,7 +259,7 @@ class LazyGroup(ViewGroup):
             raise click.exceptions.Exit(ExitCode.OK) from None
         except RunnerError as error:
             raise Failure(error) from error
-        except (OSError, MemoryError, RuntimeError) as error:
+        except (OSError, MemoryError, RuntimeError, ImportError) as error:
             if (understood := _system_error(error)) is None:
                 raise
             raise Failure(understood) from error

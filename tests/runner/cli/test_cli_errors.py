@@ -100,6 +100,23 @@ def test_parent_folders_of_output_are_created(recorded, tmp_path):
     assert recorded("plot", "tiny", "-o", tmp_path / "file" / "plot.svg").exit_code == 2
 
 
+@pytest.mark.parametrize(
+    "error",
+    [
+        ImportError("_dispatcher.so: failed to map segment from shared object"),
+        OSError("Could not find/load shared object file 'libllvmlite.so'"),
+    ],
+)
+def test_a_library_for_which_there_is_too_little_memory_has_no_traceback(recorded, monkeypatch, error):
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("runner.runs.catalogue.filters.parse", fails)
+    done = recorded("ls", "tiny")
+    assert done.exit_code == 1
+    assert done.stderr.startswith(f"Error: the system refused: {error}. Allow more memory")
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of the system")
 @pytest.mark.parametrize(
     ("limit", "value", "name", "expected"),

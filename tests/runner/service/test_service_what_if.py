@@ -83,8 +83,8 @@ def test_the_last_frame_of_a_replay_asks_for_the_last_step(page, recorded):
     with open_recording(find_run("first", recorded).recording) as recording:
         length = len(recording.train.episode(0))
     browser = page(f"/runs/first/replay/train/0?t={length}")
-    link = browser.find_element(By.PARTIAL_LINK_TEXT, "What if")
     wait(browser, lambda: browser.find_elements(By.CSS_SELECTOR, ".choice p"))
+    link = browser.find_element(By.PARTIAL_LINK_TEXT, "What if")
     assert link.get_attribute("href").endswith(f"/what-if/0:{length - 1}")
 
 
