@@ -324,7 +324,9 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
     for name in records[0].events:
         kinds.setdefault(name.rpartition(".")[2], []).append(name)
     fixed = len(columns)
-    for kind, names in sorted(kinds.items(), key=lambda own: (own[1][0] not in success_events, len(own[1]))):
+    for kind, names in sorted(
+        kinds.items(), key=lambda item: (item[1][0] not in success_events, len(item[1]))
+    ):
         counts = [[record.events[name] for name in names] for record in records]
         heading = spoken(kind)
         cells = [str(sum(by_agent)) for by_agent in counts]
@@ -338,7 +340,9 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
     filled = [list(record.training.percent_filled.values()) for record in records if record.training]
     if filled:
         digits = 0 if len(filled[0]) > 1 else 1
-        columns["filled\n%"] = ["/".join(f"{percent:.{digits}f}" for percent in own) for own in filled]
+        columns["filled\n%"] = [
+            "/".join(f"{percent:.{digits}f}" for percent in percents) for percents in filled
+        ]
     rows = list(zip(*columns.values(), strict=True))
     return Grid(tuple(columns), rows, left=(), cut=(), spare=tuple(spare), gap=1)
 

@@ -260,7 +260,7 @@ class RunDetails(Answer):
         with open_recording(self.run.recording) as recording:
             states = states_in_words(recording.mdp)
             gains = zip(recording.agents, measures["values"], measures["best_responses"], strict=True)
-        gain = " and ".join(f"{best - own:.3f} ({agent})" for agent, own, best in gains)
+        gain = " and ".join(f"{best - learned:.3f} ({agent})" for agent, learned, best in gains)
         rows = {
             "succeeds": f"{measures['success_percent']:.1f} % of {measures['starts']:,} start states "
             f"(the optimum {measures['optimal_success_percent']:.1f} %)",
@@ -451,9 +451,9 @@ def usage_sections(largest: Sequence[Usage], sums: Sums, freeable: Mapping[str, 
 
 def _extras_in_words(extras: Mapping[str, RecordedExtras]) -> dict[str, str]:
     """Return the number of steps with extras, and dtype and shape of each name: `int64 [T]`."""
-    rows = {f"{schema.PHASE_NAMES[phase]} steps": f"{own.steps:,}" for phase, own in extras.items()}
-    for own in extras.values():
-        for name, (dtype, shape) in own.names.items():
+    rows = {f"{schema.PHASE_NAMES[phase]} steps": f"{recorded.steps:,}" for phase, recorded in extras.items()}
+    for recorded in extras.values():
+        for name, (dtype, shape) in recorded.names.items():
             lengths = ", ".join("T" if n is None else str(n) for n in shape)
             rows[name] = f"{dtype} [{lengths}]" if shape else dtype
     return rows

@@ -152,11 +152,11 @@ class SpaceColumns:
         """Return the encoded values of records."""
         parts: list[list[bytes]] = [[b""] * len(values)]
         for leaf in self._leaves:
-            own = _inside(values, leaf)
+            leaf_values = _inside(values, leaf)
             if leaf.item is not None:
-                parts.append([encode_bytes(v.tobytes()) for v in own])
+                parts.append([encode_bytes(v.tobytes()) for v in leaf_values])
             else:
-                parts.append([encode_text(v) if leaf.dtype is None else v.tobytes() for v in own])
+                parts.append([encode_text(v) if leaf.dtype is None else v.tobytes() for v in leaf_values])
         return [b"".join(pieces) for pieces in zip(*parts, strict=True)]
 
 
@@ -292,9 +292,9 @@ class Table:
     @cached_property
     def columns(self) -> pa.Schema:
         """All columns."""
-        own = {column.name: column.type for column in self.messages}
-        phase = {"phase": TEXT} if len(self.topics) > 1 or "phase" in own else {}
-        return pa.schema({"run_id": TEXT, **phase, "position": pa.int64(), **own})
+        types = {column.name: column.type for column in self.messages}
+        phase = {"phase": TEXT} if len(self.topics) > 1 or "phase" in types else {}
+        return pa.schema({"run_id": TEXT, **phase, "position": pa.int64(), **types})
 
 
 class Shape:
@@ -434,29 +434,31 @@ class Shape:
         column = stored(name, _type_of(field), lambda records: records[name])
         if name == "seed":
             column = nullable(column, lambda records: records["seeded"])
-        own = self.own_actions if message is schema.STEP and name == "action" else []
-        return [column, *(self._action_of(i, action) for i, action in enumerate(own))]
+        agent_actions = self.own_actions if message is schema.STEP and name == "action" else []
+        return [column, *(self._action_of(i, action) for i, action in enumerate(agent_actions))]
 
     def _action_of(self, agent: int, name: str) -> ArchiveColumn:
         """Return the column of an agent's own action, which follows from the joint one."""
         assert self.mdp is not None
-        own = self.mdp.own_actions[:, agent].astype(np.int32)
-        return ArchiveColumn(name, _INT32, lambda records: pa.array(own[records["action"] % len(own)]))
+        actions = self.mdp.own_actions[:, agent].astype(np.int32)
+        return ArchiveColumn(
+            name, _INT32, lambda records: pa.array(actions[records["action"] % len(actions)])
+        )
 
     def _summed(self, name: str, source: str) -> list[ArchiveColumn]:
         """Return the column of the learners' sum and, where there are several, one for each."""
-        own = self.per_learner(name)
-        if not own:
+        learners = self.per_learner(name)
+        if not learners:
             return [stored(name, _FLOAT, _item(source, 0))]
         total = ArchiveColumn(name, _FLOAT, lambda records: pa.array(records[source].sum(axis=1)))
-        return [total, *(stored(key, _FLOAT, _item(source, i)) for i, key in enumerate(own))]
+        return [total, *(stored(key, _FLOAT, _item(source, i)) for i, key in enumerate(learners))]
 
     def _explored(self) -> list[ArchiveColumn]:
         """Return the column for any learner's exploration and, where there are several, one for each."""
-        own = self.per_learner("explored")
+        learners = self.per_learner("explored")
         any_explored = ArchiveColumn("explored", _FLAG, lambda records: pa.array(records["explored"] != 0))
-        bits = [_bit("explored", i, name) for i, name in enumerate(own or ["explored"])]
-        return [any_explored, *bits] if own else bits
+        bits = [_bit("explored", i, name) for i, name in enumerate(learners or ["explored"])]
+        return [any_explored, *bits] if learners else bits
 
 
 def _bit(field: str, i: int, name: str) -> ArchiveColumn:

@@ -332,8 +332,8 @@ def _actions(mdp: Mdp, shape: Shape) -> pa.Table:
     action = np.arange(mdp.joint_actions, dtype=np.int32)
     columns: dict[str, object] = {"action": action, "words": actions_in_words(mdp).tolist()}
     if shape.own_actions:
-        own = mdp.own_actions.T.astype(np.int32)
-        columns |= dict(zip(shape.own_actions, own, strict=True))
+        actions = mdp.own_actions.T.astype(np.int32)
+        columns |= dict(zip(shape.own_actions, actions, strict=True))
     return _table(columns, shape)
 
 

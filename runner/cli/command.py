@@ -68,11 +68,11 @@ class _Record:
 
     def __call__(self, **values: object) -> object:
         """Call the function with its part of all values."""
-        own = {
+        fields = {
             name: declared(**values) if isinstance(declared, _Record) else values[name]
             for name, declared in self._declared.items()
         }
-        return self._make(**own)
+        return self._make(**fields)
 
 
 def _with_examples(text: str | None) -> str | None:

@@ -150,8 +150,10 @@ def _valued(recording: Recording, phase: str) -> Callable[[Step], dict[str, obje
             description = {name: as_json(plain_value(row[name])) for name in ("action", "next_observation")}
         if agents != ("",):
             description["acted"] = [agent for i, agent in enumerate(agents) if int(row["acted"]) >> i & 1]
-        own = {agent: words for agent, words in in_words(row).items() if agent in has_names}
-        return description | ({"action_in_words": own.get("", own)} if own else {})
+        words_by_agent = {agent: words for agent, words in in_words(row).items() if agent in has_names}
+        return description | (
+            {"action_in_words": words_by_agent.get("", words_by_agent)} if words_by_agent else {}
+        )
 
     return describe
 

@@ -129,8 +129,8 @@ class ConfigName(click.Path):
         from runner.config.shipped import shipped
 
         names = {experiment.name for experiment in shipped().values() if experiment.kind == self.kind}
-        own = [item for item in SHIPPED.shell_complete(ctx, param, incomplete) if item.value in names]
-        return [*own, *super().shell_complete(ctx, param, incomplete)]
+        completions = [item for item in SHIPPED.shell_complete(ctx, param, incomplete) if item.value in names]
+        return [*completions, *super().shell_complete(ctx, param, incomplete)]
 
     def get_missing_message(self, param: click.Parameter, ctx: click.Context | None) -> str:  # noqa: ARG002
         """Return where names of configurations are found."""

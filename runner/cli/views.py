@@ -136,7 +136,10 @@ def command_of(view: View) -> Command:
             shown = () if answer.contents and not is_page else _text(subject, answer)
             yield Reply(data, shown, {}, page, chain(notes, answer.remarks), answer.exit_code)
 
-    declared = {"subject": named, **{name: _declared(name, each, view) for name, each in view.inputs.items()}}
+    declared = {
+        "subject": named,
+        **{name: _declared(name, declared_input, view) for name, declared_input in view.inputs.items()},
+    }
     if view.file_ending:
         help_text = f"{view.file_help} FILE `-` is stdout."
         metavar = f"FILE{view.file_ending}"

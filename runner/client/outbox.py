@@ -76,18 +76,18 @@ def deliver(run: Run, client: Client, report: Report = lambda *_: None) -> Uploa
         ServerError: the server refused it, or was unavailable; it stays.
         RunnerError: another process has it.
     """
-    with locked(run) as own:
-        if (own.folder / SHARDS_FOLDER).exists():
+    with locked(run) as waiting:
+        if (waiting.folder / SHARDS_FOLDER).exists():
             raise RunnerError(
-                f"its shards are not added to it yet: `dualtaxi show {own.folder}` does it when all of its "
-                "processes have ended."
+                f"its shards are not added to it yet: `dualtaxi show {waiting.folder}` does it when all "
+                "of its processes have ended."
             )
-        push = _read_push_file(own)
-        upload = client.push(own, report, begun=push.upload if push.server == client.url else "")
-        sent = own.folder.with_name(f"{_SENT}{own.folder.name}")
-        own.folder.rename(sent)
+        push = _read_push_file(waiting)
+        upload = client.push(waiting, report, begun=push.upload if push.server == client.url else "")
+        sent = waiting.folder.with_name(f"{_SENT}{waiting.folder.name}")
+        waiting.folder.rename(sent)
     shutil.rmtree(sent, ignore_errors=True)
-    Store(own.folder.parent).drop(own.folder.name)
+    Store(waiting.folder.parent).drop(waiting.folder.name)
     return upload
 
 

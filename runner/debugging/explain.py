@@ -259,7 +259,9 @@ def _resolved(
         source = from_mapping(source)
     if isinstance(source, str | os.PathLike):
         path = Path(source)
-        experiments = [name for name, each in shipped().items() if each.kind == "experiment"]
+        experiments = [
+            name for name, configuration in shipped().items() if configuration.kind == "experiment"
+        ]
         if path.suffix in (".yaml", ".yml") or os.fspath(source) in experiments:
             source = load(path)
         else:

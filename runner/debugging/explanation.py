@@ -270,8 +270,8 @@ def _interactions_section(explanation: Explanation) -> Section:
 def _meaning(explanation: Explanation, pair: Interaction) -> str:
     """Return what an interaction means for the two settings."""
     shares = {setting.name: setting.share for setting in explanation.settings}
-    own = [shares[name] for name in pair.settings]
-    signs = {share.value > 0 for share in own if share is not None and share.excludes_zero}
+    setting_shares = [shares[name] for name in pair.settings]
+    signs = {share.value > 0 for share in setting_shares if share is not None and share.excludes_zero}
     if len(signs) != 1:
         return "the effect of one depends on the other"
     return "stronger together" if signs == {pair.beyond.value > 0} else "weaker together"
@@ -385,8 +385,8 @@ class Trained:
     @property
     def bytes(self) -> int:
         """The bytes that removing it frees; runs that are kept or in use stay."""
-        own = sum(file.stat().st_size for file in self.files)
-        return own + sum(run.freed for run in self.runs if not run.refusal)
+        result_bytes = sum(file.stat().st_size for file in self.files)
+        return result_bytes + sum(run.freed for run in self.runs if not run.refusal)
 
 
 def trained_in(recordings: Path) -> list[Trained]:

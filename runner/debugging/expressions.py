@@ -336,9 +336,11 @@ class JobColumns:
             if quantity.name == "q":
                 width = self._widths[quantity.learner]
                 row = offsets[quantity.learner] + quantity.state * width
-                own = range(row, row + width) if quantity.action < 0 else [row + quantity.action]
-                self._cells[quantity] = slice(len(cells), len(cells) + len(own))
-                cells += own
+                cells_of_quantity = (
+                    range(row, row + width) if quantity.action < 0 else [row + quantity.action]
+                )
+                self._cells[quantity] = slice(len(cells), len(cells) + len(cells_of_quantity))
+                cells += cells_of_quantity
             elif quantity.name == "greedy":
                 learners = range(len(self._widths)) if quantity.learner == JOINT else [quantity.learner]
                 self._greedy[quantity] = [len(greedy) + k for k in range(len(learners))]
@@ -414,9 +416,11 @@ class JobColumns:
             elif quantity.name == "epsilon":
                 columns[quantity] = np.empty(len(steps))
                 for start, rules in self._segments:
-                    own = steps[steps["step"] >= start]
-                    numbers = (np.ascontiguousarray(own[name], np.int64) for name in ("episode", "step"))
-                    columns[quantity][len(steps) - len(own) :] = explorations(rules, *numbers)
+                    wanted_steps = steps[steps["step"] >= start]
+                    numbers = (
+                        np.ascontiguousarray(wanted_steps[name], np.int64) for name in ("episode", "step")
+                    )
+                    columns[quantity][len(steps) - len(wanted_steps) :] = explorations(rules, *numbers)
         return columns
 
     def _of_tables(self, changes: WatchedValues, places: Ints) -> dict[Quantity, Array]:
@@ -429,9 +433,13 @@ class JobColumns:
         columns: dict[Quantity, Array] = {}
         for quantity, cells in self._cells.items():
             columns[quantity] = changes.q[:, cells] if quantity.action < 0 else changes.q[:, cells.start]
-        for quantity, own in self._greedy.items():
-            strides = [math.prod(self._widths[i + 1 :]) for i in range(len(own))] if len(own) > 1 else [1]
-            columns[quantity] = (changes.greedy[:, own] * np.array(strides)).sum(axis=1).astype(np.float64)
+        for quantity, learners in self._greedy.items():
+            strides = (
+                [math.prod(self._widths[i + 1 :]) for i in range(len(learners))] if len(learners) > 1 else [1]
+            )
+            columns[quantity] = (
+                (changes.greedy[:, learners] * np.array(strides)).sum(axis=1).astype(np.float64)
+            )
         for p, quantity in enumerate(self._paths):
             columns[quantity] = changes.succeeds[:, p]
         return columns
@@ -461,8 +469,8 @@ class JobColumns:
             return np.asarray(mask)
         actions = steps["action"]
         if quantity.learner != JOINT and len(self._widths) > 1:
-            own = self._mdp.own_actions[:, quantity.learner]
-            actions = own[np.minimum(actions, len(own) - 1)]
+            agent_actions = self._mdp.own_actions[:, quantity.learner]
+            actions = agent_actions[np.minimum(actions, len(agent_actions) - 1)]
         return np.asarray(mask & (actions == quantity.action))
 
 

@@ -163,8 +163,8 @@ class Game:
 
     def _part(self, number: int) -> float:
         """Return the part of the difference that a mixture makes."""
-        low, own, high = self.values((0, number, self.mixing.everything)).mean(axis=1).tolist()
-        return float((own - low) / (high - low)) if high != low else math.nan
+        low, value, high = self.values((0, number, self.mixing.everything)).mean(axis=1).tolist()
+        return float((value - low) / (high - low)) if high != low else math.nan
 
     def values(self, numbers: Sequence[int]) -> Floats:
         """Return the values of mixtures that were measured, [mixtures, seeds]."""
@@ -214,10 +214,10 @@ def settings_of(game: Game, players: Sequence[int]) -> tuple[Setting, ...]:
     if players and len(players) <= MAX_ALL:
         values = game.values(coalitions(players))
         bits = [1 << j for j in range(len(players))]
-        own = shapley_values(values)
+        shapley = shapley_values(values)
         alone = values[bits] - values[0]
         last = values[-1] - values[[len(values) - 1 - bit for bit in bits]]
-        rows = zip(*map(bootstrap_means, (own, alone, last)), strict=True)
+        rows = zip(*map(bootstrap_means, (shapley, alone, last)), strict=True)
         shares = dict(zip(players, rows, strict=True))
     order = sorted(shares, key=lambda i: -abs(shares[i][0].value))
     order += [i for i in range(len(factors)) if i not in shares]

@@ -218,13 +218,13 @@ def _grouped(mixing: Mixing) -> Mixing:
         if wrong is None:
             break
         i, j = _conflict(mixing, wrong)
-        one, other = (mixing.factors[k] for k in sorted((i, j)))
-        changes = one.changes + other.changes
-        name = f"{one.name} + {other.name}"
+        first, second = (mixing.factors[k] for k in sorted((i, j)))
+        changes = first.changes + second.changes
+        name = f"{first.name} + {second.name}"
         merged = Factor("mode" if name == "tables + rewards" else name, changes)
         reason = str(_problem(mixing, wrong)).splitlines()[-1]
-        notes.append(f"{one.name} and {other.name} only go together, and count as one setting ({reason})")
-        rest = [factor for factor in mixing.factors if factor not in (one, other)]
+        notes.append(f"{first.name} and {second.name} only go together, and count as one setting ({reason})")
+        rest = [factor for factor in mixing.factors if factor not in (first, second)]
         mixing = Mixing(mixing.a, mixing.b, (merged, *rest), tuple(notes))
     return mixing
 

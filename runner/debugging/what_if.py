@@ -302,11 +302,11 @@ def _chosen(mdp: Mdp, actions: list[str]) -> Iterable[int]:
     if not all(equals for _, equals, _ in pairs):
         return dict.fromkeys(joint_action(mdp, text) for text in actions)
     allowed = np.ones(mdp.own_actions.shape, bool)  # [J, agents]
-    for i, own in enumerate(mdp.own_actions.T):
+    for i, agent_actions in enumerate(mdp.own_actions.T):
         values = [own_action(mdp, i, value) for name, _, value in pairs if agent_of(mdp, name) == i]
-        allowed[:, i] = np.isin(own, values) if values else True
-    chosen: list[int] = np.flatnonzero(allowed.all(axis=1)).tolist()
-    return chosen
+        allowed[:, i] = np.isin(agent_actions, values) if values else True
+    numbers: list[int] = np.flatnonzero(allowed.all(axis=1)).tolist()
+    return numbers
 
 
 # --- the branches of a step ---------------------------------------------------------------------------
@@ -474,8 +474,8 @@ class _Branches:
         """Return the Q-values of each joint action in a state; empty tuples where nothing is learned."""
         if not self._learns:
             return [()] * self._mdp.joint_actions
-        own = self._tables.learner.model.own_action  # [J, learners]
-        columns = [table[state, own[:, i]].tolist() for i, table in enumerate(self._tables.tables)]
+        actions = self._tables.learner.model.own_action  # [J, learners]
+        columns = [table[state, actions[:, i]].tolist() for i, table in enumerate(self._tables.tables)]
         return list(zip(*columns, strict=True))
 
     def _exact_values(self, state: int, policy: Floats) -> tuple[Floats, Floats]:
@@ -485,10 +485,10 @@ class _Branches:
         discount = self._playing.discount
         if discount >= 1:
             return np.full((mdp.joint_actions, learners), np.nan), np.full(mdp.joint_actions, np.nan)
-        own = policy_values(mdp, policy, learners, discount)
+        values = policy_values(mdp, policy, learners, discount)
         best = optimal_values(mdp, discount)[:, np.newaxis]
         return (
-            action_values(mdp, state, own, mdp.rewards_of(learners), discount),
+            action_values(mdp, state, values, mdp.rewards_of(learners), discount),
             action_values(mdp, state, best, mdp.summed_rewards[..., np.newaxis], discount)[:, 0],
         )
 
@@ -572,14 +572,14 @@ class _Continuation:
         width = learner.model.width
         policy = learner.policy
         if isinstance(policy, np.ndarray):
-            own = [np.eye(n)[learner.tables.greedy[i]] for i, n in enumerate(width)]
+            policies = [np.eye(n)[learner.tables.greedy[i]] for i, n in enumerate(width)]
         else:
-            own = policy
+            policies = policy
         if self._rules.independent:
             return joint_probabilities(
-                [epsilon / n + (1 - epsilon) * table for n, table in zip(width, own, strict=True)]
+                [epsilon / n + (1 - epsilon) * table for n, table in zip(width, policies, strict=True)]
             )
-        joint = joint_probabilities(own)
+        joint = joint_probabilities(policies)
         return epsilon / math.prod(width) + (1 - epsilon) * joint
 
     def play(self, action: int, steps: Records, episodes: Records) -> int:
@@ -615,12 +615,12 @@ class _Continuation:
         tables = learner.tables
         if action is not None:  # greedy agents that prefer it take it
             state = int(self._step["state"])
-            own = learner.model.own_action[action]
+            choices = learner.model.own_action[action]
             rules = rules._replace(epsilon=compile_schedule(0.0), epsilon_exploits=False)
             tables = tables._replace(greedy=tables.greedy.copy(), extra=tables.extra.copy())
-            tables.greedy[:, state] = own
+            tables.greedy[:, state] = choices
             if self._draws_actions:
-                for offset, width, choice in zip(tables.offset, learner.model.width, own, strict=True):
+                for offset, width, choice in zip(tables.offset, learner.model.width, choices, strict=True):
                     row = tables.extra[POLICY, offset + state * width :][:width]
                     row[:] = np.arange(width) == choice
         fixed = (learner.seed, learner.model, tables, rules)

@@ -106,7 +106,10 @@ class When(Answer):
     def as_json(self) -> Json:
         """Return the result as JSON can hold it; each moment with its step reference as `at`."""
         result = asdict(self)
-        for moment in (result["last"], *(each[k] for each in result["intervals"] for k in ("start", "end"))):
+        for moment in (
+            result["last"],
+            *(interval[k] for interval in result["intervals"] for k in ("start", "end")),
+        ):
             if moment is not None:
                 at = EpisodeRef(moment["episode"], moment["t"])
                 moment |= {"at": str(at), "replay": at.replay_address(self.run_id)}

@@ -313,9 +313,9 @@ def _cell(
     is_joint = len(recording.agents) < len(recording.mdp.agents)
     if state is None or action is None:
         taken = _step_at(recording, at)
-        own = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]
+        taken_action = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]
         state = str(taken["state"]) if state is None else state
-        action = str(own) if action is None else action
+        action = str(taken_action) if action is None else action
     number = joint_action(mdp, str(action)) if is_joint else own_action(mdp, learner, str(action))
     return _Cell(learner, state_of(mdp, str(state)), number)
 
@@ -426,8 +426,8 @@ def _picture(mdp: Mdp, state: int, moves: Sequence[Move]) -> str:
     drawing = svg.drawing_of(mdp)
     if drawing is None or mdp.scene is None:
         return ""
-    place = drawing.places(mdp, np.array([state]))[0]
-    return moves_map(mdp.scene, moves, place, "The moves by which the value was learned, by weight")
+    positions = drawing.places(mdp, np.array([state]))[0]
+    return moves_map(mdp.scene, moves, positions, "The moves by which the value was learned, by weight")
 
 
 # --- weights of rewards and initial values ------------------------------------------------------------

@@ -149,7 +149,7 @@ class SvgDrawing:
         """Return the walls between cells."""
         lines = []
         for wall in self._scene["walls"]:
-            ends = (MARGIN + place * CELL for point in wall_ends(wall) for place in point)
+            ends = (MARGIN + coordinate * CELL for point in wall_ends(wall) for coordinate in point)
             lines.append('<line class="g-wall" x1="{}" y1="{}" x2="{}" y2="{}"/>'.format(*ends))
         return "".join(lines)
 

@@ -29,7 +29,7 @@ class TextDrawing:
     def __init__(self, scene: SceneDescription) -> None:
         self._rows = scene["rows"]
         self._columns = scene["columns"]
-        self._walls = {frozenset((tuple(one), tuple(other))) for one, other in scene["walls"]}
+        self._walls = {frozenset((tuple(cell), tuple(other))) for cell, other in scene["walls"]}
         self._landmarks = {tuple(mark["cell"]): mark for mark in scene["landmarks"]}
         self._things = scene["things"]
         self._signs = signs(self._things)
@@ -76,8 +76,8 @@ class TextDrawing:
             else:
                 text.append(sign, style=self._styles[i])
 
-    def _wall(self, one: Cell, other: Cell) -> bool:
-        return frozenset((one, other)) in self._walls
+    def _wall(self, cell: Cell, other: Cell) -> bool:
+        return frozenset((cell, other)) in self._walls
 
 
 def signs(things: Sequence[Thing]) -> list[str]:

@@ -94,9 +94,9 @@ def as_parallel(env: Any) -> Any:
 
 def is_multi_agent(env: object) -> bool:
     """Return whether an environment has the interface of RLlib's `MultiAgentEnv`."""
-    own = getattr(env, "unwrapped", env)
+    base = getattr(env, "unwrapped", env)
     parts = ("get_observation_space", "possible_agents")
-    return not isinstance(env, MultiAgent) and all(hasattr(own, part) for part in parts)
+    return not isinstance(env, MultiAgent) and all(hasattr(base, part) for part in parts)
 
 
 def is_in_turns(env: object) -> bool:

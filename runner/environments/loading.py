@@ -172,8 +172,8 @@ def _nearest_id(module: str, name: str) -> str:
 
 def _raised(error: Exception) -> str:
     """Return the error and its place in other code: `KeyError: 'goal' (corridor.py, line 12)`."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    at = "" if isinstance(error, SyntaxError) else f" ({Path(place.filename).name}, line {place.lineno})"
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    at = "" if isinstance(error, SyntaxError) else f" ({Path(frame.filename).name}, line {frame.lineno})"
     return f"{type(error).__name__}: {error}{at}"
 
 
@@ -184,13 +184,13 @@ _OutcomesOfPairs = Mapping[int, Mapping[int, list[tuple[float, int, ArrayLike, b
 def _transitions(env_id: str, base: object) -> Transitions:
     """Return the transition arrays, from the environment's own or from its `P`."""
     if hasattr(base, "transitions"):
-        own = base.transitions
+        transitions = base.transitions
         return {
-            "next_state": np.ascontiguousarray(own.next_state, dtype=np.int32),
-            "probability": np.ascontiguousarray(own.probability, dtype=np.float64),
-            "rewards": np.ascontiguousarray(own.rewards, dtype=np.float64),
-            "terminated": np.ascontiguousarray(own.terminated, dtype=np.bool_),
-            "events": np.ascontiguousarray(own.events, dtype=np.uint32),
+            "next_state": np.ascontiguousarray(transitions.next_state, dtype=np.int32),
+            "probability": np.ascontiguousarray(transitions.probability, dtype=np.float64),
+            "rewards": np.ascontiguousarray(transitions.rewards, dtype=np.float64),
+            "terminated": np.ascontiguousarray(transitions.terminated, dtype=np.bool_),
+            "events": np.ascontiguousarray(transitions.events, dtype=np.uint32),
         }
     if not hasattr(base, "P") or not hasattr(base, "initial_state_distrib"):
         raise EnvironmentNotUsable(

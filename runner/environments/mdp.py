@@ -442,8 +442,12 @@ def _array_checks(mdp: Mdp) -> Iterator[tuple[str, bool, object]]:
     yield bits, not stray.any(), lambda: hex(int(mdp.events.max()))
     adds = mdp.rewards.ndim == 4 and mdp.rewards.shape[:-1] == shape
     yield f"rewards must add one axis to next_state's, {shape}", adds, mdp.rewards
-    each = mdp.rewards.shape[-1] in (1, len(mdp.agents))
-    yield f"rewards must be 1, or one for each of the {len(mdp.agents)} agents", each, mdp.rewards.shape[-1]
+    has_valid_width = mdp.rewards.shape[-1] in (1, len(mdp.agents))
+    yield (
+        f"rewards must be 1, or one for each of the {len(mdp.agents)} agents",
+        has_valid_width,
+        mdp.rewards.shape[-1],
+    )
     finite = np.isfinite(mdp.rewards)
     yield "rewards must be finite", bool(finite.all()), lambda: str(mdp.rewards[~finite][0])
     sums = "probabilities of a pair must be from 0 on and add up to 1"

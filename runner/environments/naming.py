@@ -58,7 +58,7 @@ def agent_actions_in_words(mdp: Mdp) -> list[str]:
         return words
     names = [spoken(agent) for agent in mdp.agents]
     return [
-        ", ".join(f"{name} {own}" for name, own in zip(names, word.split(" + "), strict=True))
+        ", ".join(f"{name} {action}" for name, action in zip(names, word.split(" + "), strict=True))
         for word in words
     ]
 

@@ -87,10 +87,10 @@ def branch_training(
     with open_recording(run.recording) as recording:
         job, where = branch_job(recording, at, action, overrides, episodes)
         fresh = create_run(folder, job.config, job.seed, run_name, parent=run)
-        own = train_branch(recording, job, fresh, report, stop)
+        branch = train_branch(recording, job, fresh, report, stop)
     origin = origin_in(job.config.to_mapping())
     assert isinstance(origin, TrainingOrigin)
-    return TrainingBranch(own, origin, where)
+    return TrainingBranch(branch, origin, where)
 
 
 def branch_name(run: Run, name: str | None) -> str:
@@ -109,9 +109,9 @@ def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: St
     with unless_empty(run):
         packed = PackedChunks.before(parent, step) if job.config.recording.packing == packing else None
         initial = recorded_tables(parent)
-        own = run_job(job, run, report, stop, mdp=parent.mdp, initial=initial, packed=packed)
-    _check_beginning(parent, own, reference_to(parent, step).episode)
-    return own
+        branch = run_job(job, run, report, stop, mdp=parent.mdp, initial=initial, packed=packed)
+    _check_beginning(parent, branch, reference_to(parent, step).episode)
+    return branch
 
 
 def branch_job(
@@ -154,11 +154,11 @@ def chosen_actions(mdp: Mdp, action: Action | None) -> dict[str, str]:
         return {}
     if isinstance(action, Mapping):
         chosen = [(agent_of(mdp, agent), str(value)) for agent, value in action.items()]
-        own = {agent: own_action(mdp, agent, value) for agent, value in chosen}
+        numbers = {agent: own_action(mdp, agent, value) for agent, value in chosen}
     else:
-        own = dict(enumerate(agent_actions(mdp, joint_action(mdp, str(action)))))
+        numbers = dict(enumerate(agent_actions(mdp, joint_action(mdp, str(action)))))
     names = numbered_actions(mdp)
-    return {mdp.agents[agent]: names[agent][value] for agent, value in own.items()}
+    return {mdp.agents[agent]: names[agent][value] for agent, value in numbers.items()}
 
 
 def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> ChangesSection:
@@ -181,13 +181,13 @@ def _changes(now: ExperimentConfig, wanted: ExperimentConfig) -> ChangesSection:
     )
 
 
-def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
+def _check_beginning(parent: Recording, branch: Run, episodes: int) -> None:
     """Check that the episodes before a branch are those of its parent.
 
     Raises:
         RunnerError: they are not.
     """
-    with open_recording(own.recording) as recording:
+    with open_recording(branch.recording) as recording:
         count = min(episodes, unbroken(parent)[1], recording.train.episodes.count())
         ours, theirs = (run.train.episodes.blocks(0, count) for run in (recording, parent))
         left, right = first_difference(ours, theirs, ("episode", "last_step", "returns"))
@@ -195,7 +195,7 @@ def _check_beginning(parent: Recording, own: Run, episodes: int) -> None:
     if differing is not None:
         episode = int(differing["episode"][0])
         raise RunnerError(
-            f"run {own.run_id}: training episode {episode:,} is not that of its parent {parent.run_id}, "
+            f"run {branch.run_id}: training episode {episode:,} is not that of its parent {parent.run_id}, "
             "though the branch begins later: the parent was recorded with other versions of NumPy or Numba, "
-            f"or on another kind of processor. `dualtaxi diff {parent.run_id} {own.run_id}` shows them."
+            f"or on another kind of processor. `dualtaxi diff {parent.run_id} {branch.run_id}` shows them."
         )

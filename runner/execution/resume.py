@@ -275,11 +275,11 @@ class _ResumedSession(Session):
 
 def _steps(recording: Recording, phase: str) -> int:
     """Return the number of steps of a phase, also if the recording leaves them out."""
-    own = recording.phase(phase)
-    ended = own.episodes.count()
+    records = recording.phase(phase)
+    ended = records.episodes.count()
     if ended == 0:
-        return own.steps.count()
-    return max(own.steps.count(), int(own.episodes.array(ended - 1)[-1]["last_step"]) + 1)
+        return records.steps.count()
+    return max(records.steps.count(), int(records.episodes.array(ended - 1)[-1]["last_step"]) + 1)
 
 
 def _changes(run: Run) -> Differences:

@@ -272,13 +272,16 @@ def write_grid(
         films: list[Encoder] = []
         done = 0
         for number, shot in enumerate(shots):
-            with contextlib.closing(shot.pictures), Encoder(Path(folder, f"{number}"), LOSSLESS, fps) as one:
+            with (
+                contextlib.closing(shot.pictures),
+                Encoder(Path(folder, f"{number}"), LOSSLESS, fps) as lossless,
+            ):
                 captions = captioned(shot, (width or MAX_WIDTH) // columns)
                 for frame in islice(captions, max_frames):
-                    one.add(frame)
+                    lossless.add(frame)
                     done += 1
                     progress(done)
-            films.append(one)
+            films.append(lossless)
         height, each_width = max(film.size[1] for film in films), max(film.size[0] for film in films)
         rows = -(-len(films) // columns)
         canvas = np.full((rows * height, columns * each_width, 3), 255, np.uint8)
@@ -366,9 +369,9 @@ def _lines(shown: Pictures, picture: EpisodePicture) -> list[str]:
     if len(picture.rewards) == 1:
         rewards = f"reward {picture.rewards[0]:+g}, sum {total:+g}"
     else:
-        each = (
+        by_agent = (
             f"{spoken(name)} {reward:+.3g}"
             for name, reward in zip(shown.learners, picture.rewards, strict=True)
         )
-        rewards = f"sum {total:+.5g}; {', '.join(each)}"
+        rewards = f"sum {total:+.5g}; {', '.join(by_agent)}"
     return [f"{step}: {picture.action}", rewards, ", ".join(filter(None, [picture.events, picture.ended]))]

@@ -439,8 +439,8 @@ def paint_values(recording: Recording, phase: str, episode: int, seen: Iterator[
 
     def numbers(steps: Iterator[Seen]) -> Iterator[Floats]:
         for observation, step in steps:
-            own = unknown if observation is None else values.numbers_in(observation)
-            yield np.append(own, unpaid if step is None else step["rewards"])
+            observed = unknown if observation is None else values.numbers_in(observation)
+            yield np.append(observed, unpaid if step is None else step["rewards"])
 
     low = np.zeros(len(names))
     high = low

@@ -76,11 +76,13 @@ def write_tables(
         phase = phase or "train"
         whole_ranges(episodes, _episode_count(recording, phase), phase, str(recording.path))
     source = Batches(recording)
-    own = source.shape.tables
+    archive_tables = source.shape.tables
     keys = _keys_of(recording, phase, episodes) if phase is not None and episodes else None
-    sources = {name: source.of(own[table]) for name, table in _TABLES.items() if table in own}
+    sources = {
+        name: source.of(archive_tables[table]) for name, table in _TABLES.items() if table in archive_tables
+    }
     if "extras" in sources:
-        sources["extras"] = _with_episodes(sources["extras"], recording, own[layout.STEPS].columns)
+        sources["extras"] = _with_episodes(sources["extras"], recording, archive_tables[layout.STEPS].columns)
     tables = {name: _selected(rows, phase, episodes, keys) for name, rows in sources.items()}
     tables["metrics"] = _metrics(recording)
     rows = {}
@@ -163,12 +165,12 @@ def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | N
     It is made of the environment and the episode as the rows count it, in their own environment; the phase
     counts the episodes of all as they ended.
     """
-    own = recording.phase(phase)
-    if not own.steps.have_turns:
+    records = recording.phase(phase)
+    if not records.steps.have_turns:
         return None
-    count = own.episodes.count()
+    count = records.episodes.count()
     numbers = [n for start, stop in episodes for n in range(start, count if stop is None else stop)]
-    selected = map(own.episode, numbers)
+    selected = map(records.episode, numbers)
     keys = [steps.environment << _ENVIRONMENT_BITS | int(steps.one(0)["episode"]) for steps in selected]
     return pa.array(keys, pa.int64())
 

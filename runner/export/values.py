@@ -173,7 +173,7 @@ def actions_at(recording: Recording, at: EpisodeRef) -> dict[str, str]:
     mdp = recording.mdp
     mdp.check_steps(np.asarray(step).reshape(1), str(recording.path), schema.PHASE_NAMES[at.phase])
     chosen = zip(mdp.agents, numbered_actions(mdp), agent_actions(mdp, int(step["action"])), strict=True)
-    return {agent: names[own] for agent, names, own in chosen}
+    return {agent: names[number] for agent, names, number in chosen}
 
 
 def _action_in_words(recording: Recording, phase: str, agent: str) -> Callable[[Value], str]:
@@ -211,8 +211,8 @@ def number_names(leaf: Leaf, name: str, skip: int = 0, known: Sequence[str] = ()
 
     A leaf without a path has the `name`; the first `skip` keys of a path are left out.
     """
-    own = ".".join(leaf.path[skip:]) or name
-    return iter(known) if known else names_in(own, leaf.dtype.shape if leaf.dtype is not None else ())
+    label = ".".join(leaf.path[skip:]) or name
+    return iter(known) if known else names_in(label, leaf.dtype.shape if leaf.dtype is not None else ())
 
 
 def names_in(array: str, shape: tuple[int, ...]) -> Iterator[str]:

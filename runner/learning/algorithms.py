@@ -241,8 +241,8 @@ def _expected_sarsa(rules: Rules, model: Model, tables: Tables, seen: Transition
         bootstrapped = np.int64(tables.greedy[seen.learner, seen.next_state])
         next_row, width = _row(model, tables, seen.learner, seen.next_state), model.width[seen.learner]
         total = 0.0
-        for each in range(Index(width)):
-            total += tables.q[next_row + each]
+        for action in range(Index(width)):
+            total += tables.q[next_row + action]
         epsilon = seen.next_epsilon
         expected = epsilon * (total / width) + (1.0 - epsilon) * tables.value[seen.learner, seen.next_state]
         td_target += seen.discount * expected

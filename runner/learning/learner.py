@@ -283,11 +283,13 @@ def rules_of(config: ExperimentConfig) -> Rules:
     step_size, discount = compile_schedule(config.step_size), compile_schedule(config.discount)
     epsilon = compile_schedule(config.epsilon if learns else 1.0)
     sections = (
-        getattr(config, key) for key, each in SECTION_OF.items() if each.algorithm == config.algorithm
+        getattr(config, key)
+        for key, section_info in SECTION_OF.items()
+        if section_info.algorithm == config.algorithm
     )
-    own = {key: compile_schedule(value) for section in sections if section for key, value in section}
+    settings = {key: compile_schedule(value) for section in sections if section for key, value in section}
     return Rules(
-        algorithm=ALGORITHMS[config.algorithm].settings(**own),
+        algorithm=ALGORITHMS[config.algorithm].settings(**settings),
         step_size=step_size,
         discount=discount,
         epsilon=epsilon,
@@ -319,11 +321,11 @@ def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> Ints32:
     }
     if not chosen:
         return CHOSEN
-    own = mdp.own_actions.copy()
+    actions = mdp.own_actions.copy()
     for agent, action in chosen.items():
         number = agent_of(mdp, agent)
-        own[:, number] = own_action(mdp, number, action)
-    replacement: Ints32 = np.ravel_multi_index(tuple(own.T), mdp.action_counts).astype(np.int32)
+        actions[:, number] = own_action(mdp, number, action)
+    replacement: Ints32 = np.ravel_multi_index(tuple(actions.T), mdp.action_counts).astype(np.int32)
     return replacement
 
 

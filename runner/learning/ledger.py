@@ -95,8 +95,8 @@ def spread(
         update = updates[k]
         pair = np.int64(update.outcome) // outcomes
         state, action = pair // joint_actions, pair % joint_actions
-        own = np.int64(model.own_action[action, 0 if rules.first_action_for_all else i])
-        cell = state * width + own
+        cell_action = np.int64(model.own_action[action, 0 if rules.first_action_for_all else i])
+        cell = state * width + cell_action
         learned = np.int64(is_double and update.second)
         other = 1 - learned if is_double else learned
         weight = ledger.weights[learned, cell]
@@ -128,9 +128,11 @@ def spread(
         greedy = passed
         if expects(rules):
             epsilon = exploring(rules, episode, step + 1)
-            for each in range(width):
-                ledger.weights[other, next_row + each] += passed * epsilon / width * weight
-                ledger.distances[other, next_row + each] += passed * epsilon / width * (distance + weight)
+            for next_action in range(width):
+                ledger.weights[other, next_row + next_action] += passed * epsilon / width * weight
+                ledger.distances[other, next_row + next_action] += (
+                    passed * epsilon / width * (distance + weight)
+                )
             greedy = passed * (1.0 - epsilon)
         ledger.weights[other, next_row + update.bootstrapped] += greedy * weight
         ledger.distances[other, next_row + update.bootstrapped] += greedy * (distance + weight)

@@ -60,7 +60,7 @@ def build_model(mdp: Mdp, tables: str) -> Model:
     """Return `mdp` prepared for one `joint` table, or for one table `per_agent`; not to be changed."""
     width = (mdp.joint_actions,) if tables == "joint" else mdp.action_counts
     stride = tuple(math.prod(width[i + 1 :]) for i in range(len(width)))
-    own = np.arange(mdp.joint_actions)[:, None] if tables == "joint" else mdp.own_actions
+    own_actions = np.arange(mdp.joint_actions)[:, None] if tables == "joint" else mdp.own_actions
     rewards = mdp.rewards_of(len(width)).reshape(-1, len(width)) + 0.0  # turns -0.0 into 0.0
     terminated = mdp.terminated.reshape(-1)
     penalty = mdp.summed_rewards.reshape(-1) < mdp.penalty_below
@@ -81,7 +81,7 @@ def build_model(mdp: Mdp, tables: str) -> Model:
         event_mask=event_mask.astype(np.uint32),
         start_states=support.astype(np.int32),
         start_cumulative=_cumulative(mdp.start[support][None])[0],
-        own_action=np.ascontiguousarray(own, np.int32),
+        own_action=np.ascontiguousarray(own_actions, np.int32),
         stride=stride,
         width=width,
         step_limit=mdp.step_limit,

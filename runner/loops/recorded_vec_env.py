@@ -83,7 +83,7 @@ class RecordedVecEnv(VecEnv):  # type: ignore[misc]
         if self.training_steps is not None:
             self.recorded.at_step(self.training_steps())
         seeds, options = self.base._seeds, self.base._options
-        are_alike = all(exact_json(own) == exact_json(options[0]) for own in options)
+        are_alike = all(exact_json(env_options) == exact_json(options[0]) for env_options in options)
         given: Any = options[0] or None if are_alike else options  # a list is not recorded, with a warning
         is_seeded = any(seed is not None for seed in seeds)
         self.recorded.reset(seed=list(seeds) if is_seeded else None, options=given)

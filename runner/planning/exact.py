@@ -132,7 +132,7 @@ def random_policy(mdp: Mdp) -> list[Floats]:
 def joint_probabilities(policies: Sequence[Floats]) -> Floats:
     """Return the probability [S, J] of each joint action, the first learner's the most significant."""
     return functools.reduce(
-        lambda joint, own: (joint[:, :, None] * own[:, None, :]).reshape(len(own), -1), policies
+        lambda joint, policy: (joint[:, :, None] * policy[:, None, :]).reshape(len(policy), -1), policies
     )
 
 
@@ -229,7 +229,7 @@ def _merged(mdp: Mdp, probability: Floats, learners: int) -> _RewardProcess:
     return _RewardProcess(
         padded(mdp.next_state[at][first]),
         padded(total),
-        padded(np.stack([np.bincount(group, chance * own) / total for own in rewards.T], axis=1)),
+        padded(np.stack([np.bincount(group, chance * reward) / total for reward in rewards.T], axis=1)),
         padded(mdp.terminated[at][first]),
         padded(success[first]),
         padded(np.bincount(group, chance * penalty) / total),
@@ -336,8 +336,8 @@ def best_response(mdp: Mdp, policy: Ints32, learner: int, learners: int, discoun
     """
     widths = mdp.action_counts if learners > 1 else (mdp.joint_actions,)
     stride = int(np.prod(widths[learner + 1 :], dtype=np.int64))
-    own = policy // stride % widths[learner]
-    joint = (policy - own * stride)[:, None] + np.arange(widths[learner]) * stride
+    own_action = policy // stride % widths[learner]
+    joint = (policy - own_action * stride)[:, None] + np.arange(widths[learner]) * stride
     rows = np.arange(mdp.states)[:, None]
     reward = (mdp.probability * mdp.rewards_of(learners)[..., learner]).sum(axis=-1)
     weight = _weight(mdp, discount)[rows, joint]

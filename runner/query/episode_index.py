@@ -151,14 +151,16 @@ class EpisodeIndex:
         plain = [name for name in columns.names if name in _PLAIN or name.startswith(("return_", "n_"))]
         if shape.mdp is not None and shape.mdp.success_events:
             plain.append("success")
-        environment, own = ("environment", _COUNTED) if "environment" in columns.names else ("0", "episode")
+        environment, number = (
+            ("environment", _COUNTED) if "environment" in columns.names else ("0", "episode")
+        )
         aggregates = _aggregates(shape, steps)
         facts = json.dumps(asdict(Facts([*plain, *aggregates], actions)))
         path = self.folder / f"{stem}{_hash(facts)}.parquet"
         named = cleaned(map(columns.field, plain))
         rows = (
             f"SELECT {number_of(path)} AS file, row_number() OVER (ORDER BY phase DESC, episode) AS row, "
-            f"{named}, {environment} AS environment, {own} AS own, {_AT} AS at FROM episodes "
+            f"{named}, {environment} AS environment, {number} AS own, {_AT} AS at FROM episodes "
             "ASOF LEFT JOIN evaluations ON episode >= start"
         )
         if aggregates:
@@ -286,8 +288,8 @@ def _names_of_actions(shape: Shape, recording: Recording) -> dict[str, Sequence[
     space = recording.spaces.get("action", {})
     agents = recording.agents
     if shape.mdp is not None:
-        own = zip(shape.own_actions, action_names(shape.mdp) or (), strict=False)
-        return {"action": train.action_names(), **dict(own)}
+        agent_names = zip(shape.own_actions, action_names(shape.mdp) or (), strict=False)
+        return {"action": train.action_names(), **dict(agent_names)}
     return {
         "_".join(filter(None, ("action", agent.replace(".", "_")))): train.action_names(agent)
         for agent, part in (space["spaces"] if len(agents) > 1 else {"": space}).items()

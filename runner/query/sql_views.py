@@ -191,12 +191,12 @@ class SelectedRuns:
         for left_out in ("run_id", "taken"):
             kinds.pop(left_out, None)
         own_names: dict[str, str] = {}
-        for own in kinds:  # DuckDB ignores case
-            shown = own
+        for stored_name in kinds:  # DuckDB ignores case
+            shown = stored_name
             while shown.casefold() in map(str.casefold, own_names):
                 shown += "_"
-            own_names[shown] = own
-        columns = pa.schema([(shown, kinds[own]) for shown, own in own_names.items()])
+            own_names[shown] = stored_name
+        columns = pa.schema([(shown, kinds[stored_name]) for shown, stored_name in own_names.items()])
         return Relation(columns, partial(self._batches, name, rows, own_names))
 
     def _batches(
@@ -237,12 +237,12 @@ def _batches_of(
     read = list(dict.fromkeys([*stored, *is_turn, *of_events])) or ["position"]  # to count the rows
     for batch in tables.batches(table, condition, read):
         rows = batch.filter(batch["taken"]) if is_turn else batch
-        own = {name: rows[name] for name in stored} | {"run": pa.repeat(run_id, rows.num_rows)}
+        columns = {name: rows[name] for name in stored} | {"run": pa.repeat(run_id, rows.num_rows)}
         if masks:
             events = _events_of(tables.shape, rows)
-            own |= {name: pa.array(events & mask != 0) for name, mask in masks.items()}
+            columns |= {name: pa.array(events & mask != 0) for name, mask in masks.items()}
         values = [
-            own[name].cast(column.type) if name in own else pa.nulls(rows.num_rows, column.type)
+            columns[name].cast(column.type) if name in columns else pa.nulls(rows.num_rows, column.type)
             for name, column in zip(names, needed, strict=True)
         ]
         yield pa.RecordBatch.from_arrays(values, schema=needed)
@@ -268,16 +268,16 @@ def _table(rows: Sequence[Mapping[str, Any]], kinds: Mapping[str, pa.DataType | 
     return pa.table({name: pa.array([row.get(name) for row in rows], kind) for name, kind in kinds.items()})
 
 
-def _wider(one: pa.DataType | None, other: pa.DataType) -> pa.DataType:
+def _wider(known: pa.DataType | None, new: pa.DataType) -> pa.DataType:
     """Return the type of a column in a query that has these types in runs; text if they are unlike."""
-    if pa.types.is_dictionary(other):
-        other = pa.string()
-    elif pa.types.is_fixed_size_binary(other):
-        other = pa.binary()
-    if one is None or one == other:
-        return other
+    if pa.types.is_dictionary(new):
+        new = pa.string()
+    elif pa.types.is_fixed_size_binary(new):
+        new = pa.binary()
+    if known is None or known == new:
+        return new
     try:
-        pair = [pa.schema([("", kind)]) for kind in (one, other)]
+        pair = [pa.schema([("", kind)]) for kind in (known, new)]
         return pa.unify_schemas(pair, promote_options="permissive").types[0]
     except pa.ArrowException:
         return pa.string()

@@ -116,8 +116,8 @@ class Store:
                     self._refer(run, digests)
 
     def _refer(self, run: str, digests: Iterable[str]) -> None:
-        own = set(self.of_run(run))
-        if fresh := [digest for digest in dict.fromkeys(digests) if digest not in own]:
+        referred = set(self.of_run(run))
+        if fresh := [digest for digest in dict.fromkeys(digests) if digest not in referred]:
             path = self._folder / "runs" / run
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("a", encoding="ascii") as stream:
@@ -144,9 +144,9 @@ class Store:
         seen: set[str] = set()
         by_run = {}
         for run in self.runs():
-            own = [digest for digest in self.of_run(run) if digest not in seen]
-            seen.update(own)
-            by_run[run] = sum(map(self._size, own))
+            unseen = [digest for digest in self.of_run(run) if digest not in seen]
+            seen.update(unseen)
+            by_run[run] = sum(map(self._size, unseen))
         return by_run
 
     def only_of(self, runs: Iterable[str]) -> dict[str, int]:
@@ -154,8 +154,8 @@ class Store:
         leaving = set(runs)
         known = set(self.runs())
         staying = {digest for run in known - leaving for digest in self.of_run(run)}
-        own = {digest for run in known & leaving for digest in self.of_run(run)}
-        return {digest: self._size(digest) for digest in sorted(own - staying)}
+        left_by = {digest for run in known & leaving for digest in self.of_run(run)}
+        return {digest: self._size(digest) for digest in sorted(left_by - staying)}
 
     def drop(self, run: str) -> int:
         """Forget a run, and remove the contents that no other run refers to; return the bytes freed."""

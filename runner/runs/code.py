@@ -165,9 +165,9 @@ class CodeCollector:
     def made_by(self, run: Run) -> dict[str, str]:
         """Return the provenance in `run.json`, with the commit if it is known."""
         provenance = run.facts.get("provenance")  # of a resumed run, whose file may hold anything
-        own = provenance.items() if isinstance(provenance, dict) else ()
+        recorded = provenance.items() if isinstance(provenance, dict) else ()
         git = {"git": self.entries["git"]} if "git" in self.entries else {}
-        return {key: text for key, text in own if isinstance(text, str)} | git
+        return {key: text for key, text in recorded if isinstance(text, str)} | git
 
     def write(self, file: RecordingFile, wait: bool = False) -> None:
         """Write the code into a recording, once, if it is known; nothing else may write into it meanwhile.

@@ -140,7 +140,7 @@ def import_recording(
 def merge_marks(run: Run, marks: Marks) -> None:
     """Add marks that somebody else set or removed to a run, if it has a folder of its own."""
     if marks != Marks() and not run.stands_alone:
-        change_marks(run.folder, lambda own: own.merged(marks.marks, marks.removed))
+        change_marks(run.folder, lambda present: present.merged(marks.marks, marks.removed))
 
 
 def run_facts(recording: Recording, details: JsonView) -> Json:
@@ -247,7 +247,7 @@ def _continue_or_keep(
     with locked(there) as run:
         if run.status not in UNFINISHED or not continues(recording, run.recording):
             raise occupied
-        change_labels(run.folder, lambda own: _merged(own, labels))
+        change_labels(run.folder, lambda present: _merged(present, labels))
         with storage_errors(run.folder):
             sync(recording)
             recording.replace(run.recording)
@@ -270,10 +270,10 @@ def _with_facts(run: Run, facts: Mapping[str, object]) -> Run:
     return run_at(run.folder)
 
 
-def _merged(own: Labels, more: Labels) -> Labels:
+def _merged(present: Labels, more: Labels) -> Labels:
     """Return the labels of both sides; of name and note, the own ones come first."""
-    tags = tuple(sorted({*own.tags, *more.tags})[:MAX_TAGS])
-    return Labels(own.name or more.name, tags, own.note or more.note)
+    tags = tuple(sorted({*present.tags, *more.tags})[:MAX_TAGS])
+    return Labels(present.name or more.name, tags, present.note or more.note)
 
 
 def _place(source: Path, target: Path, facts: Json, rewritten: bool) -> None:

@@ -170,8 +170,10 @@ def _packages() -> dict[str, str]:
                 if match := _INSTALLED.fullmatch(as_utf8(entry)):
                     versions.setdefault(f"package.{_normalised(match['name'])}", match["version"])
                 elif entry.endswith(".egg-info"):
-                    for one in distributions(path=[folder]):
-                        versions.setdefault(as_utf8(f"package.{_normalised(one.name)}"), as_utf8(one.version))
+                    for package in distributions(path=[folder]):
+                        versions.setdefault(
+                            as_utf8(f"package.{_normalised(package.name)}"), as_utf8(package.version)
+                        )
     return dict(sorted(versions.items()))
 
 

@@ -184,8 +184,8 @@ class Uploads:
                 upload = fresh
                 self._drop_old()
                 owners = [other.owner for other in self.all() if not other.is_over]
-                if (own := owners.count(owner)) >= self._limits.uploads_each:
-                    message = f"{own:,} of your uploads are open, the maximum; complete or delete some."
+                if (count := owners.count(owner)) >= self._limits.uploads_each:
+                    message = f"{count:,} of your uploads are open, the maximum; complete or delete some."
                     raise LimitReached(message)
                 if len(owners) >= self._limits.uploads:
                     raise LimitReached(f"{len(owners):,} uploads are open; try again when some are done.")

@@ -178,7 +178,9 @@ def _type_of(view: View) -> type[BaseModel]:
             default = ()
         return kind, Field(default, alias=given.name, description=given.help, **limits)
 
-    fields: Any = _NAMES.get(view.subject, {}) | {name: declared(each) for name, each in view.inputs.items()}
+    fields: Any = _NAMES.get(view.subject, {}) | {
+        name: declared(declared_input) for name, declared_input in view.inputs.items()
+    }
     made: type[BaseModel] = create_model(view.title, **fields)
     return made
 

@@ -196,7 +196,8 @@ def _checked(sweep: Sweep, document: Document, checks: Checks) -> Sweep:
 def _valid_experiment(sweep: Sweep, path: str, sample: object, document: Document) -> ExperimentConfig:
     """Return an experiment with a value of a parameter, and the first values of the others valid with it."""
     samples = {
-        key: [sample] if key == path else samples_of(each) for key, each in sweep.file.parameters.items()
+        key: [sample] if key == path else samples_of(sweep_values)
+        for key, sweep_values in sweep.file.parameters.items()
     }
     problem = None
     for values in itertools.islice(itertools.product(*samples.values()), _MAX_COMBINATIONS):

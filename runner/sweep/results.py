@@ -112,7 +112,7 @@ def effects_of_grid(
         return {tuple(names[axis] for axis in axes): share for axes, share in shares.items()}
 
     points = list(map(np.asarray, seed_values))
-    resampled = [shares_of(rng.choice(own, len(own)) for own in points) for _ in range(RESAMPLES)]
+    resampled = [shares_of(rng.choice(values, len(values)) for values in points) for _ in range(RESAMPLES)]
     exact = shares_of(points)
     return _effects([shares for shares in resampled if shares], exact) if exact else []
 
@@ -145,7 +145,7 @@ def _effects(
     effects = []
     if resampled:
         for parameters in resampled[0]:
-            shares = [each[parameters] for each in resampled]
+            shares = [shares_of_sample[parameters] for shares_of_sample in resampled]
             low, middle, high = np.quantile(shares, [0.025, 0.5, 0.975]).tolist()
             effects.append(Effect(parameters, exact[parameters] if exact else middle, low, high))
     return sorted(effects, key=lambda effect: -effect.share)

@@ -279,13 +279,13 @@ def _estimated_bytes(config: ExperimentConfig, mdp: Mdp) -> int:
     """Return an estimate of the bytes that one episode does not show."""
     counts = (mdp.joint_actions,) if config.tables == "joint" else mdp.action_counts
     table = mdp.states * sum(counts) * 8
-    one = estimate(config, mdp.step_limit)
-    trials = one.evaluations * (config.evaluation.trials if config.evaluation else 0)
+    estimated = estimate(config, mdp.step_limit)
+    trials = estimated.evaluations * (config.evaluation.trials if config.evaluation else 0)
     return round(
-        one.snapshots * table * _COMPRESSED_SHARE
+        estimated.snapshots * table * _COMPRESSED_SHARE
         + (config.episodes + trials) * _BYTES_PER_EPISODE
-        + one.evaluations * _BYTES_PER_EVALUATION
-        + (one.typical_bytes if config.recording.steps == "all" else 0)
+        + estimated.evaluations * _BYTES_PER_EVALUATION
+        + (estimated.typical_bytes if config.recording.steps == "all" else 0)
     )
 
 

@@ -98,11 +98,11 @@ def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
     for left in Path(tempfile.gettempdir()).glob(f"{prefix}*"):  # by a worker that was killed
         shutil.rmtree(left, ignore_errors=True)
     with storage_errors(target), tempfile.TemporaryDirectory(prefix=prefix) as folder:
-        own = Path(folder) / task.run_id
-        shutil.copytree(target, own)
+        working = Path(folder) / task.run_id
+        shutil.copytree(target, working)
         result = replace(task, recordings=folder, on_own_disk=False).run(stop)
-        if own.is_dir():
-            move_files(own, target)
+        if working.is_dir():
+            move_files(working, target)
             if result.status == "pruned":
                 _mark_pruned(target)
         else:  # nothing was recorded
@@ -110,7 +110,7 @@ def _run_on_own_disk(task: Task, stop: Callable[[], bool]) -> Result:
     return result
 
 
-def move_files(own: Path, target: Path) -> None:
+def move_files(source: Path, target: Path) -> None:
     """Replace the files of a run by those of a copy that was continued; labels and marks stay.
 
     Each file is replaced atomically, `run.json` last: a run that was moved in part is as good as one whose
@@ -124,10 +124,12 @@ def move_files(own: Path, target: Path) -> None:
             if path.name not in (LABELS_FILE, MARKS_FILE) and path.suffix != ".lock"
         }
 
-    for name in sorted(names(own), key=lambda name: name == RUN_FILE):
+    for name in sorted(names(source), key=lambda name: name == RUN_FILE):
         with replacing(target / name) as fresh:
-            shutil.copyfile(own / name, fresh)
-    for name in names(target) - names(own):  # a replacement that is complete, or what a killed worker copied
+            shutil.copyfile(source / name, fresh)
+    for name in names(target) - names(
+        source
+    ):  # a replacement that is complete, or what a killed worker copied
         (target / name).unlink()
 
 

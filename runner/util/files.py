@@ -132,7 +132,7 @@ def write_object(path: Path, value: JsonView, mode: int = 0o666) -> None:
         OSError: it cannot be written; it is as before.
     """
     # A line for each key: with `indent`, `json` takes much longer.
-    lines = [f" {_to_json(key)}: {_to_json(own)}" for key, own in value.items()]
+    lines = [f" {_to_json(key)}: {_to_json(part)}" for key, part in value.items()]
     data = ("{\n" + ",\n".join(lines) + "\n}\n").encode()
     with replacing(path) as fresh:
         descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BINARY, mode)

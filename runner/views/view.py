@@ -199,7 +199,7 @@ class View:
     @cached_property
     def inputs(self) -> Mapping[str, Input]:
         """The inputs, by the name of their parameter."""
-        return {name: each for name, each in self._defaults.items() if isinstance(each, Input)}
+        return {name: default for name, default in self._defaults.items() if isinstance(default, Input)}
 
     @property
     def shows_progress(self) -> bool:
@@ -219,7 +219,10 @@ class View:
 
     @cached_property
     def _defaults(self) -> dict[str, object]:
-        return {each.name: each.default for each in inspect.signature(self.compute).parameters.values()}
+        return {
+            parameter.name: parameter.default
+            for parameter in inspect.signature(self.compute).parameters.values()
+        }
 
     @property
     def help(self) -> str:

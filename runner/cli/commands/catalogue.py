@@ -283,20 +283,23 @@ def _prune_explanations(recordings: Sequence[Path], dry_run: bool, yes: bool) ->
     """Show what explanations trained, ask, and remove it."""
     from runner.debugging.explanation import remove_trained, trained_in
 
-    explanations = [each for folder in recordings for each in trained_in(folder)]
-    rows = [{"name": each.name, "bytes": each.bytes} for each in explanations]
-    freed = sum(each.bytes for each in explanations)
+    explanations = [explanation for folder in recordings for explanation in trained_in(folder)]
+    rows = [{"name": explanation.name, "bytes": explanation.bytes} for explanation in explanations]
+    freed = sum(explanation.bytes for explanation in explanations)
     what = counted(len(explanations), "explanation")
     if explanations:
-        cells = [(each.name, f"{len(each.runs):,}", size(each.bytes)) for each in explanations]
-        stay = [run for each in explanations for run in each.runs if run.refusal]
+        cells = [
+            (explanation.name, f"{len(explanation.runs):,}", size(explanation.bytes))
+            for explanation in explanations
+        ]
+        stay = [run for explanation in explanations for run in explanation.runs if run.refusal]
         notices = [Remark(f"Run {run.run_id} stays: {run.refusal}.") for run in stay]
         grid = Grid(("explanation", "runs", "frees"), cells, left=("explanation",))
         yield Reply(text=[grid, *notices])
         if not dry_run:
             _confirm(f"Remove {what} for good, and free {size(freed)}?", yes)
-            for each in explanations:
-                remove_trained(each)
+            for explanation in explanations:
+                remove_trained(explanation)
     yield _removed(what if explanations else "", {"dry_run": dry_run, "freed": freed, "removed": rows})
 
 

@@ -197,8 +197,10 @@ def _action(actions: tuple[str, ...], run: Run) -> object:
 
 def _trained(parent: Run, branch: TrainingBranch) -> Reply:
     run = branch.run
-    results = [each.summary.last_evaluation for each in (parent, run)]
-    success = [None if each is None else each.values.get("success_percent") for each in results]
+    results = [trained.summary.last_evaluation for trained in (parent, run)]
+    success = [
+        None if evaluation is None else evaluation.values.get("success_percent") for evaluation in results
+    ]
     rows = {"branched": f"run {parent.run_id} {branch.origin} (step {branch.at})"}
     if None not in success:
         rows["success"] = (
@@ -225,7 +227,8 @@ def _played(parent: Run, branch: Branch) -> Reply:
         )
     outcomes = (("parent", parent.run_id, branch.parent), ("branch", branch.run.run_id, branch.outcome))
     played = [
-        (name, run, each.returns_in_words, f"{each.length:,}", each.end) for name, run, each in outcomes
+        (name, run, outcome.returns_in_words, f"{outcome.length:,}", outcome.end)
+        for name, run, outcome in outcomes
     ]
     grid = Grid(("", "run", "return", "length", "end"), played)
     rows = run_facts(branch.run) | {"branched": f"run {parent.run_id} {branch.origin}"}

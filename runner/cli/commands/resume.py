@@ -222,10 +222,10 @@ def _evaluate_checkpoint(
         played = recording.eval.episodes.array()
     spreads = {"return": spread_of(played["returns"].sum(axis=1)), "length": spread_of(played["length"])}
     spread = {
-        name: f", standard deviation {number(own['standard_deviation'])}, "
-        f"{number(own['lowest'])} to {number(own['highest'])}"
-        for name, own in spreads.items()
-        if own
+        name: f", standard deviation {number(figures['standard_deviation'])}, "
+        f"{number(figures['lowest'])} to {number(figures['highest'])}"
+        for name, figures in spreads.items()
+        if figures
     }
     evaluation = run.summary.last_evaluation
     means = {} if evaluation is None else evaluation.values
@@ -297,20 +297,20 @@ def repair_command(named: tuple[Path, Run | None] = recording_and_run) -> Reply:
     if run is not None:
         parts += [(shard.recording, shard) for shard in shards_of(run) if can_be_repaired(shard.recording)]
     done: list[tuple[Repair, Run | None]] = []
-    for part, own in parts:
-        lock = contextlib.nullcontext() if own is None else locked(own)
+    for part, owner in parts:
+        lock = contextlib.nullcontext() if owner is None else locked(owner)
         with lock, bytes_line("repairing") as report:
-            repaired = repair(part, report, own.summary if own is not None else None)
-            if own is not None and repaired.lost and own.status == "finished":
+            repaired = repair(part, report, owner.summary if owner is not None else None)
+            if owner is not None and repaired.lost and owner.status == "finished":
                 # Resuming the run must arrive at the digest that it had. What a process of it states it holds
                 # is compared when its recording is added to the run; of the run, the recording says it now.
-                left = ("seconds", "error", "unfolded") if own is run else tuple(own.summary)
-                summary = {key: own.summary[key] for key in left if key in own.summary}
-                own.update(status="interrupted", proof=own.summary.content_digest, summary=summary)
-        done.append((repaired, own))
+                left = ("seconds", "error", "unfolded") if owner is run else tuple(owner.summary)
+                summary = {key: owner.summary[key] for key in left if key in owner.summary}
+                owner.update(status="interrupted", proof=owner.summary.content_digest, summary=summary)
+        done.append((repaired, owner))
     first, *others = [_repair_as_json(repaired) for repaired, _ in done]
     value = first | ({"shards": others} if others else {})
-    text = [_repair_facts(repaired, own) for repaired, own in done]
+    text = [_repair_facts(repaired, owner) for repaired, owner in done]
     whole = run if run is None else folded(run)
     has_losses = not all(repaired.lossless for repaired, _ in done) or (whole and whole.summary.unfolded)
     return Reply(value, text, exit_code=ExitCode.DIFFERENT if has_losses else ExitCode.OK)

@@ -135,12 +135,12 @@ def _announce(config: ExperimentConfig, folder: Path) -> None:
     if limit == 0:
         say(f"{runs} without a step limit, so the size is unknown; {size(free)} of disk are free.")
         return
-    one = estimate(config, limit)
-    steps, disk = one.typical_steps * seeds, one.typical_bytes * seeds
+    estimated = estimate(config, limit)
+    steps, disk = estimated.typical_steps * seeds, estimated.typical_bytes * seeds
     say(
         f"{runs}: about {amount(LEAST * steps)} to {amount(steps)} steps, "
         f"{size(LEAST * disk)} to {size(disk)} "
-        f"(at most {amount(one.max_steps * seeds)}, {size(one.max_bytes * seeds)})."
+        f"(at most {amount(estimated.max_steps * seeds)}, {size(estimated.max_bytes * seeds)})."
     )
     if free >= disk:
         return

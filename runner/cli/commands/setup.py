@@ -61,10 +61,17 @@ def ls() -> Reply:
     """
     from runner.config.shipped import shipped
 
-    rows = [(each.name, each.kind, each.about) for each in shipped().values()]
+    rows = [
+        (configuration.name, configuration.kind, configuration.about) for configuration in shipped().values()
+    ]
     configs = [
-        {"name": each.name, "kind": each.kind, "about": each.about, "path": str(each.path)}
-        for each in shipped().values()
+        {
+            "name": configuration.name,
+            "kind": configuration.kind,
+            "about": configuration.about,
+            "path": str(configuration.path),
+        }
+        for configuration in shipped().values()
     ]
     return Reply({"configs": configs}, [Grid(("name", "kind", "about"), rows)])
 

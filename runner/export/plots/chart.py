@@ -422,9 +422,9 @@ def _add_to_figure(mpl: ModuleType, figure: Figure, mark: Mark, transform: Trans
         return
     if isinstance(mark, Cells):
         for x, y, width, height in mark.points.tolist():
-            own = mpl.patches.Rectangle((x, y), width, height, facecolor=mark.fill, linewidth=0)
-            own.set_transform(transform)
-            figure.add_artist(own)
+            rectangle = mpl.patches.Rectangle((x, y), width, height, facecolor=mark.fill, linewidth=0)
+            rectangle.set_transform(transform)
+            figure.add_artist(rectangle)
         return
     style: dict[str, object] = {"alpha": mark.opacity, "transform": transform}
     if isinstance(mark, ChartShape) and mark.fill:

@@ -157,8 +157,10 @@ def tables_svg(tables: Sequence[TableDiff]) -> str:
         chart.y_ticks(labelled(y.ticks[:: 1 if len(y.ticks) < 5 else 2]))
         chart.frame(label, 27.0, "training episodes" if is_last else "")
         for i, agent in enumerate(agents):
-            own = [(table.episode, factor * getattr(table, name)) for table in tables if table.agent == agent]
-            episodes, values = np.array(own, np.float64).T
+            points = [
+                (table.episode, factor * getattr(table, name)) for table in tables if table.agent == agent
+            ]
+            episodes, values = np.array(points, np.float64).T
             chart.line(episodes, values, colours[i], i)
             chart.markers(episodes, values, colours[i], i, 1.6)
         canvas.place(chart, 0, 76.0 * row)
@@ -259,16 +261,22 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
     chart = Chart(x, Scale(len(rows) - 0.5, -0.5, bottom, 24.0), _WIDTH, bottom + 18, title)
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.x_ticks()
-    for row, (name, each) in enumerate(rows):
+    for row, (name, share) in enumerate(rows):
         middle = chart.y.at(row)
         zero = x.at(0)
-        end = x.at(each.value)
+        end = x.at(share.value)
         corners = [(zero, middle - 6), (end, middle - 6), (end, middle + 6), (zero, middle + 6)]
-        chart.shape(corners, fill=series_colour(0), opacity=0.75 if each.excludes_zero else 0.3)
-        if math.isfinite(each.low):
-            chart.shape([(x.at(each.low), middle), (x.at(each.high), middle)], stroke=palette.INK, width=1.2)
-            for place in (x.at(each.low), x.at(each.high)):
-                chart.shape([(place, middle - 3), (place, middle + 3)], stroke=palette.INK, width=1.2)
+        chart.shape(corners, fill=series_colour(0), opacity=0.75 if share.excludes_zero else 0.3)
+        if math.isfinite(share.low):
+            chart.shape(
+                [(x.at(share.low), middle), (x.at(share.high), middle)], stroke=palette.INK, width=1.2
+            )
+            for end_of_interval in (x.at(share.low), x.at(share.high)):
+                chart.shape(
+                    [(end_of_interval, middle - 3), (end_of_interval, middle + 3)],
+                    stroke=palette.INK,
+                    width=1.2,
+                )
         chart.text(_NAMES - 8, middle + 3, _short(name), "end")
     chart.shape([(x.at(0), 24), (x.at(0), bottom)], stroke=palette.INK)
     return chart
@@ -284,15 +292,15 @@ def mixtures_chart(title: str, names: Sequence[str], columns: Sequence[BarColumn
     chart.y_ticks()
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.shape([(x.start, 24), (x.start, bottom), (x.end, bottom)], stroke=palette.INK)
-    for column, one in enumerate(columns):
-        own = np.array(one.values)
-        colour = series_colour(1 if one.is_marked else 0)
-        spread = np.linspace(-0.18, 0.18, len(own)) if len(own) > 1 else np.zeros(1)
-        chart.markers(column + spread, own, colour, 0, 1.3, opacity=0.5)
-        chart.line(np.array([column - 0.32, column + 0.32]), np.full(2, own.mean()), colour, width=2.2)
+    for column, mixture in enumerate(columns):
+        results = np.array(mixture.values)
+        colour = series_colour(1 if mixture.is_marked else 0)
+        spread = np.linspace(-0.18, 0.18, len(results)) if len(results) > 1 else np.zeros(1)
+        chart.markers(column + spread, results, colour, 0, 1.3, opacity=0.5)
+        chart.line(np.array([column - 0.32, column + 0.32]), np.full(2, results.mean()), colour, width=2.2)
         for row, name in enumerate(names):
             place = np.array([[x.at(column), bottom + 16 + 16 * row]])
-            chart.marks.append(Markers(place, 0, 3.5, colour if name in one.changed else "", colour, 1.0))
+            chart.marks.append(Markers(place, 0, 3.5, colour if name in mixture.changed else "", colour, 1.0))
     for row, name in enumerate(names):
         chart.text(_NAMES - 8, bottom + 19 + 16 * row, _short(name), "end")
     return chart

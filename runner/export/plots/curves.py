@@ -95,11 +95,11 @@ def not_drawn(panels: Sequence[Panel], style: CurveStyle) -> str:
     """Return a sentence on what logarithmic axes leave out, and which axes stay linear; empty if nothing."""
     left_out, linear = [], []
     for panel in panels:
-        own = style_of(panel, style)
-        count = sum(int((~visible(curve.places, curve.middle, own)).sum()) for curve in panel.curves)
+        panel_style = style_of(panel, style)
+        count = sum(int((~visible(curve.places, curve.middle, panel_style)).sum()) for curve in panel.curves)
         if count:
             left_out.append(f"“{panel.title}” ({count:,})")
-        if style.log_y and not own.log_y and panel.metric != SHARES:
+        if style.log_y and not panel_style.log_y and panel.metric != SHARES:
             linear.append(f"“{panel.title}”")
     parts = []
     if left_out:

@@ -118,9 +118,9 @@ def _host_panels(host: HostMetrics) -> list[_Panel]:
 
 def _plot(panel: _Panel, seconds: Floats, duration: float) -> Figure:
     unit, divisor = next(
-        each
-        for each in (("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
-        if duration >= 2 * each[1] or each[1] == 1
+        scale
+        for scale in (("hours", 3600.0), ("minutes", 60.0), ("seconds", 1.0))
+        if duration >= 2 * scale[1] or scale[1] == 1
     )
     usable = {name: np.where(np.isfinite(values), values, np.nan) for name, values in panel.lines.items()}
     highest = max(float(np.nanmax(values, initial=0.0)) for values in usable.values())

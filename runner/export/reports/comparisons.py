@@ -216,6 +216,6 @@ def _map(mdp: Mdp, distances: Floats, agent: str) -> Iterator[Figure]:
     fixed = situation_in_words(mdp, state, movers)
     caption = f"{title}, at the end, in the situation where it is largest{f' ({fixed})' if fixed else ''}."
     if mdp.scene is not None and len(movers) == 2:
-        one, other = (mdp.scene["things"][mover]["label"] for mover in movers)
-        caption += f" Large square: the place of {one}; in it: the place of {other}."
+        outer, inner = (mdp.scene["things"][mover]["label"] for mover in movers)
+        caption += f" Large square: the place of {outer}; in it: the place of {inner}."
     yield Figure(drawn(mdp, values, bounds, title), caption, ramp=bounds)

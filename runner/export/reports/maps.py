@@ -107,9 +107,9 @@ def maps_of(mdp: Mdp, learners: Sequence[str], stages: Sequence[MapStage], state
     if len(things) == 2:
         for learner, name in enumerate(learners):
             whose = "" if len(learners) == 1 else f" of {spoken(name)}"
-            one, other = (thing["label"] for thing in things)
+            outer, inner = (thing["label"] for thing in things)
             explanation = (
-                f"Large square: the place of {one}. In it the grid again: the place of {other}. Grey: all "
+                f"Large square: the place of {outer}. In it the grid again: the place of {inner}. Grey: all "
                 "actions have the same value."
             )
             title = f"Highest Q-value{whose} for every pair of places"

@@ -181,20 +181,20 @@ class Playback:
         ]
         ways = [f" ({text}: chosen at random)" if text else "" for text in explored]
         for action in self.actions:
-            own = [i for i, agent in enumerate(self.agents) if spoken(action.agent) in ("", agent)]
-            names = [self.agents[i] for i in own]
+            numbers = [i for i, agent in enumerate(self.agents) if spoken(action.agent) in ("", agent)]
+            names = [self.agents[i] for i in numbers]
             taken = [action.values[i] + way for i, way in zip(action.at, ways, strict=True)]
             yield _words(
                 action.agent, "last action", ["" if self.first else "none yet: the episode begins", *taken]
             )
-            yield _words(action.agent, "reward", ["", *(_signed(names, row) for row in rewards[1:, own])])
+            yield _words(action.agent, "reward", ["", *(_signed(names, row) for row in rewards[1:, numbers])])
             if self.events:
                 events = [
                     ", ".join(name for i, name in enumerate(self.events) if mask >> i & 1) or "none"
                     for mask in self.event
                 ]
                 yield _words(action.agent, "events", ["", *events])
-            yield _words(action.agent, "return so far", [_signed(names, row) for row in returns[:, own]])
+            yield _words(action.agent, "return so far", [_signed(names, row) for row in returns[:, numbers]])
 
 
 def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, first: int = 0) -> Playback:
@@ -262,7 +262,10 @@ def tabular_playback(
     actions = shown["action"].tolist()
     taken = [actions] * len(values)
     if len(values) > 1:  # each learner has a table of its own actions
-        taken = [list(own) for own in zip(*(agent_actions(mdp, action) for action in actions), strict=True)]
+        taken = [
+            list(actions_of_agent)
+            for actions_of_agent in zip(*(agent_actions(mdp, action) for action in actions), strict=True)
+        ]
     time = _frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
     before = steps["rewards"][:first].sum(axis=0).tolist() if first else []
     return Playback(
@@ -381,7 +384,7 @@ def _loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int)
         before=[_short(value) for value in before.tolist()] if first else [],
         reward=_short_rows(reward),
         actions=[
-            _words(agent, "action", (shortened(own.get(agent, "–"), _MAX_LETTERS) for own in actions))
+            _words(agent, "action", (shortened(words.get(agent, "–"), _MAX_LETTERS) for words in actions))
             for agent in agents
         ],
         texts=[*texts, *extra_texts],
@@ -475,8 +478,8 @@ def _frames(
             texts.append(_words(part.agent, part.names[0] or "observation", unknown + shown))
             continue
         numbers = np.concatenate(columns).astype(np.float64)
-        for name, own in zip(part.names, numbers.T.tolist(), strict=True):
-            values: list[Value] = [None] * (frames - len(own)) + [*map(_short, own)]
+        for name, series_values in zip(part.names, numbers.T.tolist(), strict=True):
+            values: list[Value] = [None] * (frames - len(series_values)) + [*map(_short, series_values)]
             series.append(PlayerSeries(part.agent, "observation", name or "observation", values))
     return texts, series
 
@@ -493,7 +496,7 @@ def _extras(
     extras = recording.phase(phase).extras
     by_name = extras.at(steps) if extras else {}
     for name, values in by_name.items():
-        agent = next((one for one in agents if name.startswith(f"{one}/")), "")
+        agent = next((candidate for candidate in agents if name.startswith(f"{candidate}/")), "")
         if values.dtype.hasobject:
             shown = [_shortened(value) for value in filled(values).tolist()]
             texts.append(_words(agent, name.removeprefix(f"{agent}/"), [*shown, ""]))
@@ -503,9 +506,9 @@ def _extras(
         if columns.shape[1] > _MAX_SERIES:
             notes.append(f"{name}: {_sizes(shape)} numbers with each step")
             continue
-        for own, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
+        for label, column in zip(names_in(name.removeprefix(f"{agent}/"), shape), columns.T, strict=True):
             numbers = [None if value is None else _short(value) for value in column.tolist()]
-            series.append(PlayerSeries(agent, "extras", own, [*numbers, None]))
+            series.append(PlayerSeries(agent, "extras", label, [*numbers, None]))
     return texts, series
 
 

@@ -241,13 +241,13 @@ def _player(recording: Recording, episodes: Mapping[EpisodeRef, list[str]], prog
     data = []
     has_frames = False
     for i, (at, episode) in enumerate(shown, 1):
-        own = Thumbnails()
+        images = Thumbnails()
         if episode.grid is None:
             progress(f"pictures of episode {i} of {len(shown)}")
-            own = thumbnails(recording.path, at.phase, at.number_in(recording), len(episode.reward) + 1)
-            own.picture_note = own.picture_note or picture_note(recording, at.phase)[1]
-        has_frames = has_frames or bool(own.pictures)
-        data.append(episode.as_json() | asdict(own))
+            images = thumbnails(recording.path, at.phase, at.number_in(recording), len(episode.reward) + 1)
+            images.picture_note = images.picture_note or picture_note(recording, at.phase)[1]
+        has_frames = has_frames or bool(images.pictures)
+        data.append(episode.as_json() | asdict(images))
     titles = [episode.title for _, episode in shown]
     return Player(titles, picture, key, embedded(data), has_frames, is_broad)
 

@@ -81,13 +81,13 @@ class LoopTracks:
         """Everything but the steps: episodes, and recorded frames at the steps of their environments."""
         for block in self._of_phase.episodes.blocks():
             for member in self._members:
-                own = block[member.is_own(block)]
-                if len(own):
-                    times = times_of(own["log_time"], episode=own["episode"])
-                    yield self._line(member, "return", times, own["returns"][:, [member.column]])
+                episodes = block[member.is_own(block)]
+                if len(episodes):
+                    times = times_of(episodes["log_time"], episode=episodes["episode"])
+                    yield self._line(member, "return", times, episodes["returns"][:, [member.column]])
                     if member.column == 0:  # agents have one length
                         named = member._replace(name="") if member.agent else member
-                        yield self._line(named, "length", times, own["length"][:, np.newaxis])
+                        yield self._line(named, "length", times, episodes["length"][:, np.newaxis])
         recording = self._recording
         is_each_step = frames_every(self._recording) == 1
         for frame in self._of_phase.frames.decoded():
@@ -105,13 +105,13 @@ class LoopTracks:
             is_own = member.is_own(steps)
             if not is_own.any():
                 continue
-            own = steps[is_own]
-            times = times_of(own["log_time"], episode=own["episode"], t=own["t"])
-            yield self._line(member, "reward", times, own["rewards"][:, [member.column]])
+            member_steps = steps[is_own]
+            times = times_of(member_steps["log_time"], episode=member_steps["episode"], t=member_steps["t"])
+            yield self._line(member, "reward", times, member_steps["rewards"][:, [member.column]])
             for quantity, names in member.numbers.items():
-                values = OBSERVED[quantity](recording, own)
+                values = OBSERVED[quantity](recording, member_steps)
                 parts = leaves("", values[member.agent] if member.agent else values)
-                numbers = np.concatenate([part.reshape(len(own), -1) for _, part in parts], axis=1)
+                numbers = np.concatenate([part.reshape(len(member_steps), -1) for _, part in parts], axis=1)
                 yield self._line(member, quantity, times, numbers, names)
             prefix = f"{member.agent}/" if member.agent else ""
             for name, values in extras.items():
@@ -243,10 +243,10 @@ def logged_tracks(recording: Recording) -> Iterator[Track]:
     for series, rows in recording.scalars():
         names = np.array([entity_name(name) for name, _ in series])[rows["series"]]
         for name in dict.fromkeys(names.tolist()):
-            own = rows[names == name]
-            times = times_of(own["log_time"], episode=own["episode"])
+            values_of_name = rows[names == name]
+            times = times_of(values_of_name["log_time"], episode=values_of_name["episode"])
             view = name.replace("_", " ")
-            values = scalars(own["value"][:, np.newaxis])
+            values = scalars(values_of_name["value"][:, np.newaxis])
             style = [series_lines([name])]
             yield Track(f"logged/{name}", times, values, style, TrackView("logged", view))
 

@@ -112,7 +112,7 @@ class Scene:
         """[S, shapes, 2]: the centre of each shape."""
         actions = description["actions"] if action_names(mdp) else ()
         moves = [action.get("move") or (0, 0) for action in actions]
-        self.stops = [own for own, move in enumerate(moves) if not any(move)]
+        self.stops = [number for number, move in enumerate(moves) if not any(move)]
         """Actions of an agent that are no moves, such as a pickup, as far as actions have names."""
         moves = moves or [(0, 0)] * max(mdp.action_counts)
         self.own_moves = pairs([*(move[::-1] for move in moves), (0, 0)]) * np.float32(_BLOCKED_ARROW)
@@ -255,8 +255,8 @@ class GridLabels:
         """[agents, own actions + 1]: the letter of an action such as a pickup; -1 for a move or none."""
         for agent, names in enumerate(numbered_actions(mdp)):
             if scene:
-                for own in scene.stops:
-                    self.stops[agent, own] = self._add([names[own][0].upper()], palette.agent(agent))
+                for action in scene.stops:
+                    self.stops[agent, action] = self._add([names[action][0].upper()], palette.agent(agent))
         self._add_levels(*value_range)
 
     def track(self) -> Track:

@@ -178,16 +178,16 @@ def select(recording: Recording, request: Request) -> Selection:
 
 def episodes_of(recording: Recording, phase: str) -> SelectedEpisodes:
     """Return the episodes of a phase that have steps."""
-    own = recording.phase(phase)
+    records_of_phase = recording.phase(phase)
     n = recording.environments
-    total = own.steps.count() if own.steps else 0
-    records = own.episodes.array()
+    total = records_of_phase.steps.count() if records_of_phase.steps else 0
+    records = records_of_phase.episodes.array()
     begin, last = (records[name].astype(np.int64) for name in ("first_step", "last_step"))
     if n > 1:  # from the beginning of a round to the end of one
         place = records["environment"].astype(np.int64)
         there = last < total
         return SelectedEpisodes((begin - place)[there], (last - place + n)[there], int(there.sum()))
-    first = np.zeros(own.episodes.count() + 1, np.int64)
+    first = np.zeros(records_of_phase.episodes.count() + 1, np.int64)
     number = records["episode"].astype(np.int64).clip(max=len(first) - 2)
     first[number] = begin
     first[number + 1] = last + 1
@@ -322,8 +322,10 @@ def _select_drawn(
             places = recording.phase(phase).episodes.array(0, len(lengths))["environment"]
         if request.is_default:
             for environment in range(shown):
-                own = np.flatnonzero(places == environment)
-                numbers.append(own[_default_episodes(lengths[own], FRAME_STEPS // shown)])
+                in_environment = np.flatnonzero(places == environment)
+                numbers.append(
+                    in_environment[_default_episodes(lengths[in_environment], FRAME_STEPS // shown)]
+                )
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)
     drawn = sum(map(len, selection.drawn.values()))

@@ -293,11 +293,11 @@ class ValueReader:
         for start, stop in pairwise(edges):
             if replay.step != trained[start]:
                 replay.seek(int(trained[start]))
-            own = probe.between(start, stop)
+            batch_probe = probe.between(start, stop)
             if stride:
-                replay.apply(steps[start:stop], tables[start:stop], own)
+                replay.apply(steps[start:stop], tables[start:stop], batch_probe)
             else:
-                replay.read(own)
+                replay.read(batch_probe)
                 tables[start:stop] = replay.values_in(steps["state"][start:stop])
         return Batch(*batch[:3], *self._by_agent(tables), map_rows, *maps)
 
@@ -305,8 +305,8 @@ class ValueReader:
         """Return values and greedy actions by agent, of rows by learner."""
         counts = self._recording.mdp.action_counts
         if tables.shape[1] == len(counts):
-            own = [tables[:, i, :count] for i, count in enumerate(counts)]
-            return np.concatenate(own, axis=1), np.stack([q.argmax(axis=1) for q in own], axis=1)
+            by_agent = [tables[:, i, :count] for i, count in enumerate(counts)]
+            return np.concatenate(by_agent, axis=1), np.stack([q.argmax(axis=1) for q in by_agent], axis=1)
         joint = tables[:, 0].reshape(-1, *counts)
         axes = set(range(1, joint.ndim))
         best = [joint.max(axis=tuple(axes - {axis})) for axis in sorted(axes)]
@@ -361,13 +361,13 @@ class ValueTracks:
         """Yield the values of each step of a batch as they were before its update."""
         q, labels, first, agent = batch.values, self._labels, self._first, self._agent
         n, count = q.shape
-        own = self._own_actions[batch.records["action"]]
+        actions = self._own_actions[batch.records["action"]]
         is_explored = batch.records["explored"][:, None] >> self._explored_bit & 1
         classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
         classes[:, :count] = labels.of_values(q)
         steps = np.arange(n)[:, None]
         classes[steps, count + first + batch.greedy] = labels.greedy
-        classes[steps, 2 * count + first + own] = np.where(is_explored, labels.explored, labels.exploited)
+        classes[steps, 2 * count + first + actions] = np.where(is_explored, labels.explored, labels.exploited)
         low, high = (bound.reduceat(q, first, axis=1) for bound in (np.minimum, np.maximum))
         span = high - low
         scale = np.divide(BAR_LENGTH * _BAR_FRACTION, span, out=np.zeros_like(span), where=span > 0)
@@ -405,9 +405,11 @@ class MapTracks:
         self._origins = centres + offsets[:, None]
         """[agents, pixels, 2]."""
         actions = mdp.own_actions.T if is_joint else [np.arange(mdp.action_counts[learner])]
-        own = np.pad(actions, ((0, 0), (0, 1)), constant_values=-1)  # the last for pixels without a state
-        self._arrows = scene.own_moves[own] * np.float32(_ARROW_SCALE)
-        self._letters = labels.stops[np.array(agents)[:, None], own]
+        padded_actions = np.pad(
+            actions, ((0, 0), (0, 1)), constant_values=-1
+        )  # the last for pixels without a state
+        self._arrows = scene.own_moves[padded_actions] * np.float32(_ARROW_SCALE)
+        self._letters = labels.stops[np.array(agents)[:, None], padded_actions]
         height, width = placements.height, placements.width
         lines = crossing_lines(range(0, height + 1, scene.rows), range(0, width + 1, scene.columns))
         pixels = rr.components.ImageFormat(

@@ -140,7 +140,7 @@ class Writer:
 def times_of(log_time: ArrayLike, **timelines: Array) -> Times:
     """Return the timeline `step` of log times, and others."""
     steps = np.asarray(log_time, np.int64) // STEP_NANOSECONDS
-    return {"step": steps, **{name: each.astype(np.int64) for name, each in timelines.items()}}
+    return {"step": steps, **{name: numbers.astype(np.int64) for name, numbers in timelines.items()}}
 
 
 def columns(archetype: object, **parts: Array) -> list[rr.ComponentColumn]:

@@ -195,7 +195,7 @@ def contents_freed(removals: Sequence[Removal]) -> int:
     names: dict[Path, list[str]] = {}
     for removal in removals:
         names.setdefault(removal.root, []).append(removal.folder.name)
-    return sum(sum(Store(root).only_of(own).values()) for root, own in names.items())
+    return sum(sum(Store(root).only_of(run_ids).values()) for root, run_ids in names.items())
 
 
 @dataclass(frozen=True)

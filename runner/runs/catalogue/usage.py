@@ -91,13 +91,13 @@ def contents_of(folder: str | Path) -> Contents:
                 facts = entry.stat(follow_symlinks=False)
             except FileNotFoundError:
                 continue
-            own = stat.S_ISREG(facts.st_mode) and belongs(entry.name)
+            is_own = stat.S_ISREG(facts.st_mode) and belongs(entry.name)
             size = _size_within(entry.path) if stat.S_ISDIR(facts.st_mode) else facts.st_size
-            if entry.name == RECORDING_FILE and own:
+            if entry.name == RECORDING_FILE and is_own:
                 contents.recording = size
             else:
                 contents.other += size
-            if own:
+            if is_own:
                 contents.freed += size if facts.st_nlink == 1 else 0
                 contents.left_over += size if _LEFT_OVER.fullmatch(entry.name) else 0
             else:
