@@ -227,9 +227,9 @@ def interruptible(second: Handler = None) -> Iterator[Interrupt]:
 
     def restore(replacement: Handler) -> None:
         for number, handler in before.items():
-            chosen = handler if replacement is None else replacement
-            if chosen is not None:  # a handler that was not set from Python cannot be set again
-                signal.signal(number, chosen)
+            restored = handler if replacement is None else replacement
+            if restored is not None:  # a handler that was not set from Python cannot be set again
+                signal.signal(number, restored)
 
     try:
         for number in _SIGNALS:

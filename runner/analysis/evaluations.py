@@ -288,11 +288,11 @@ def metric_columns(records: Sequence[EvaluationRecord], is_narrow: bool = False)
     Narrow columns join the values of several agents: `-800.0/-812.5`.
     """
     columns = {"episode": [f"{record.episode:,}" for record in records]}
-    shown = list(METRICS)
+    metrics = list(METRICS)
     if records[0].training is None:  # of a job, the table's explanation states the trials
         columns["trials"] = [f"{record.trials:,}" for record in records]
-        shown = [m for m in shown if any(record.value(m.name) is not None for record in records)]
-    for metric in shown:
+        metrics = [m for m in metrics if any(record.value(m.name) is not None for record in records)]
+    for metric in metrics:
         values = [record.values[metric.name] for record in records]
         texts = [list(map(humanize.number, by_agent.values())) for by_agent in values]
         if is_narrow or len(texts[0]) == 1:

@@ -127,13 +127,13 @@ def duplicates(groups: Sequence[Group]) -> list[str]:
     return [f"left out, as the same run is there: {listed(left_out)}"] if left_out else []
 
 
-def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tuple[str, str]]:
+def metrics_of(groups: Sequence[Group], metrics: Sequence[str] = ()) -> list[tuple[str, str]]:
     """Return the (metric, line) pairs to compare: the chosen ones, or else evaluations, or else training.
 
     Args:
         groups: the runs.
-        chosen: metrics (`mean_return`, of all its agents), single lines of them (`mean_return.taxi_1`), or
-            names under which loops logged values (`loss`, or `training.logged.loss`).
+        metrics: names of metrics (`mean_return`, of all its agents), of single lines
+            (`mean_return.taxi_1`), or of values that loops logged (`loss`, or `training.logged.loss`).
 
     Raises:
         RunnerError: no run has one of them, or any at all.
@@ -152,7 +152,7 @@ def metrics_of(groups: Sequence[Group], chosen: Sequence[str] = ()) -> list[tupl
     if not any(metric.name in by_name for metric in METRICS if metric.requires == "success_events"):
         usual.sort(key=lambda name: name != "mean_return")  # without a goal the return says most
     names = (
-        chosen
+        metrics
         or [name for name in usual if name in by_name]
         or [name for name in _TRAINING_METRICS if name in by_name]
     )

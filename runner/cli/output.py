@@ -232,13 +232,13 @@ def grid_table(grid: Grid, width: int) -> Table:
         least.append(
             min(longest, _LEAST["wrapped" if grid.cut is None else "cut"]) if heading in cut else longest
         )
-    shown = [*range(len(least))]
+    columns_kept = [*range(len(least))]
     needed = sum(least) + grid.gap * (len(least) - 1)
     for heading in filter(grid.headings.__contains__, grid.spare):
         if needed > width:
             number = grid.headings.index(heading)
             needed -= least[number] + grid.gap
-            shown.remove(number)
+            columns_kept.remove(number)
             left_out.append(heading)
     drawn = Table(
         box=None,
@@ -250,7 +250,7 @@ def grid_table(grid: Grid, width: int) -> Table:
         min_width=needed,
     )
     numeric = grid.numeric
-    for number in shown:
+    for number in columns_kept:
         heading = grid.headings[number]
         side: Literal["left", "right"] = "right" if numeric[number] else "left"
         header = Align(heading, side, vertical="bottom")
@@ -261,7 +261,7 @@ def grid_table(grid: Grid, width: int) -> Table:
                 Text(on_one_line(row[number]), no_wrap=True)
                 if grid.cut and grid.headings[number] in cut
                 else printable(row[number])
-                for number in shown
+                for number in columns_kept
             )
         )
     return drawn

@@ -133,8 +133,8 @@ def command_of(view: View) -> Command:
             if is_page or answer.contents:
                 page = f"{output}: {answer.contents or size(output.stat().st_size)}"
                 notes = [f"Note: {limit}." for limit in answer.limits]
-            shown = () if answer.contents and not is_page else _text(subject, answer)
-            yield Reply(data, shown, {}, page, chain(notes, answer.remarks), answer.exit_code)
+            printed = () if answer.contents and not is_page else _text(subject, answer)
+            yield Reply(data, printed, {}, page, chain(notes, answer.remarks), answer.exit_code)
 
     declared = {
         "subject": named,

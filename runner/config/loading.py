@@ -114,9 +114,9 @@ def recorded_packing(config: JsonView) -> Packing:
     Raises:
         ConfigError: the configuration has values that are not possible.
     """
-    chosen = config.get("recording")
+    section = config.get("recording")
     names = [option.name for option in fields(Packing)]
-    parts = {key: chosen[key] for key in names if key in chosen} if isinstance(chosen, Mapping) else {}
+    parts = {key: section[key] for key in names if key in section} if isinstance(section, Mapping) else {}
     return packing_from(parts).packing
 
 
@@ -252,8 +252,8 @@ def put(document: Document, values: Sequence[tuple[tuple[str, ...], Document]]) 
 
 
 def _parse(text: str) -> tuple[tuple[str, ...], Document]:
-    shown = shortened(text, _MAX_SHOWN)
-    source = shown if shown.isprintable() else repr(shown)
+    excerpt = shortened(text, _MAX_SHOWN)
+    source = excerpt if excerpt.isprintable() else repr(excerpt)
     key, separator, value = text.partition("=")
     path = tuple(key.strip().split("."))
     if not separator or not all(path):

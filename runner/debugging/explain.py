@@ -172,9 +172,9 @@ def ask(
     values = [mixing.a.to_mapping(), mixing.b.to_mapping()]
     digest = blake3(json.dumps(values, sort_keys=True).encode()).hexdigest()[:8]
     names = [re.sub(r"[^A-Za-z0-9_.-]", "_", side.name).lstrip(".-")[:40] for side in (side_a, side_b)]
-    chosen = tuple(range(first, first + seeds) if first + seeds <= 2**64 else range(seeds))
+    seed_numbers = tuple(range(first, first + seeds) if first + seeds <= 2**64 else range(seeds))
     name = f"{'-'.join(names)}-{digest}"
-    return Question(name, side_a, side_b, mixing, chosen, metric, at, recordings, tuple(notes))
+    return Question(name, side_a, side_b, mixing, seed_numbers, metric, at, recordings, tuple(notes))
 
 
 def answer(

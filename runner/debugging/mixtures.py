@@ -243,8 +243,8 @@ def _conflict(mixing: Mixing, wrong: int) -> tuple[int, int]:
 
 def _outer(count: int) -> Iterator[int]:
     """Yield the mixtures in which at most two settings differ from the others."""
-    for chosen in itertools.chain(*(itertools.combinations(range(count), size) for size in (1, 2))):
-        mixture = sum(1 << i for i in chosen)
+    for subset in itertools.chain(*(itertools.combinations(range(count), size) for size in (1, 2))):
+        mixture = sum(1 << i for i in subset)
         yield from (mixture, 2**count - 1 - mixture)
 
 

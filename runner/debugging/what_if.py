@@ -199,11 +199,11 @@ class WhatIf(Answer):
         mdp = self.mdp
         if len(mdp.agents) != 2 or len(self.actions) < mdp.joint_actions:
             return ""
-        shown = {
+        values_of = {
             row.action: row.returns if None in row.values else [value or 0.0 for value in row.values]
             for row in self.actions
         }
-        totals = np.array([sum(shown[action]) for action in range(mdp.joint_actions)])
+        totals = np.array([sum(values_of[action]) for action in range(mdp.joint_actions)])
         levels = svg_maps.levels_of(totals, float(totals.min()), float(totals.max()))
         rows, columns = numbered_actions(mdp)
         first, second = map(spoken, mdp.agents)
@@ -223,7 +223,7 @@ class WhatIf(Answer):
             y = _HEAD[1] + i * _CELL[1]
             colour = ramp_colour(levels[row.action])
             edge = ' stroke="currentColor" stroke-width="4"' if row.is_recorded else ""
-            values = " / ".join(number(value, 1) for value in shown[row.action])
+            values = " / ".join(number(value, 1) for value in values_of[row.action])
             cell = (
                 f'<rect x="{x + 2}" y="{y + 2}" width="{_CELL[0] - 4}" height="{_CELL[1] - 4}" '
                 f'fill="{colour}"{edge}/>' + _text(x + _CELL[0] / 2, y + 27, values, ink_on(colour))
@@ -338,10 +338,10 @@ def branch_playback(
     They begin with step `first`; errors as for `what_if`.
     """
     branch = branched(recording, at, action)
-    shown = branch.steps[first : first + limit]
-    if not len(shown):
+    steps = branch.steps[first : first + limit]
+    if not len(steps):
         raise branch.at.no_step(recording, len(branch.steps), first, "this branch of ")
-    values = tuple(table[shown["state"]] for table in branch.tables)
+    values = tuple(table[steps["state"]] for table in branch.tables)
     return tabular_playback(recording, branch.at, branch.steps, branch.outcome.end, values, first, limit)
 
 

@@ -134,26 +134,26 @@ def draw_bars(names: Sequence[str], low: Floats, high: Floats, rows: Iterable[Fl
     """
     from PIL import Image, ImageDraw
 
-    shown = min(len(names), MAX_BARS)
-    low, high = np.minimum(low[:shown], 0), np.maximum(high[:shown], 0)
+    bars = min(len(names), MAX_BARS)
+    low, high = np.minimum(low[:bars], 0), np.maximum(high[:bars], 0)
     left, right = _BARS
     scale = (right - left) / np.where(high > low, high - low, 1)  # pixels of a unit
     zeros = (left - low * scale).tolist()
-    lines = shown + (len(names) > MAX_BARS)
+    lines = bars + (len(names) > MAX_BARS)
     ground = Image.new("RGB", (BARS_WIDTH, lines * _LINE + 2 * _MARGIN), palette.WHITE)
     pen = ImageDraw.Draw(ground)
-    for k, name in enumerate(names[:shown]):
+    for k, name in enumerate(names[:bars]):
         text = shortened(name, left - 2 * _MARGIN, _TEXT)
         pen.text((_MARGIN, _middle(k)), text, palette.INK, font(_TEXT), anchor="lm")
         zero = round(zeros[k])
         pen.line((zero, _middle(k) - _LINE // 2, zero, _middle(k) + _LINE // 2), palette.GREY)
-    if lines > shown:
-        text = f"and {len(names) - shown:,} more values"
-        pen.text((_MARGIN, _middle(shown)), text, palette.GREY, font(_TEXT), anchor="lm")
+    if lines > bars:
+        text = f"and {len(names) - bars:,} more values"
+        pen.text((_MARGIN, _middle(bars)), text, palette.GREY, font(_TEXT), anchor="lm")
     for values in rows:
         picture = ground.copy()
         pen = ImageDraw.Draw(picture)
-        for k, value in enumerate(values[:shown].tolist()):
+        for k, value in enumerate(values[:bars].tolist()):
             if np.isfinite(value):
                 start, end = sorted((zeros[k], zeros[k] + value * float(scale[k])))
                 colour = palette.BLUE if value > 0 else palette.ORANGE

@@ -153,8 +153,8 @@ def chosen_actions(mdp: Mdp, action: Action | None) -> dict[str, str]:
     if action is None:
         return {}
     if isinstance(action, Mapping):
-        chosen = [(agent_of(mdp, agent), str(value)) for agent, value in action.items()]
-        numbers = {agent: own_action(mdp, agent, value) for agent, value in chosen}
+        by_agent = [(agent_of(mdp, agent), str(value)) for agent, value in action.items()]
+        numbers = {agent: own_action(mdp, agent, value) for agent, value in by_agent}
     else:
         numbers = dict(enumerate(agent_actions(mdp, joint_action(mdp, str(action)))))
     names = numbered_actions(mdp)

@@ -144,8 +144,8 @@ def evaluate(
         RunnerError: there is no such table, or the new run cannot be recorded.
     """
     with open_recording(run.recording) as recording:
-        chosen = last_step(recording) if step is None else step
-        tables_at(recording, chosen)  # raises here, before there is a new run
+        after_step = last_step(recording) if step is None else step
+        tables_at(recording, after_step)  # raises here, before there is a new run
         states = recording.mdp.states
         if isinstance(start, int) and not 0 <= start < states:
             raise RunnerError(f"start: found state {start}, expected one of 0 to {states - 1}.")
@@ -156,7 +156,7 @@ def evaluate(
         name=f"{run.name[:90]}.evaluated",
         seeds=[seed],
         episodes=0,
-        initial_q={"run": address(run, recordings), "step": chosen},
+        initial_q={"run": address(run, recordings), "step": after_step},
         evaluation={
             "every": 1,
             "trials": starts if trials is None else trials,

@@ -172,10 +172,10 @@ def verify(
     Raises:
         RecordingError: there is no such file, or it is not a dualtaxi recording.
     """
-    found = check(path, damage_of(path), bool(rerun), report, trust)
-    if rerun is False or not found.can_be_rerun:
-        return found
-    return rerun_loop(found, sample, tolerance, trust)
+    verification = check(path, damage_of(path), bool(rerun), report, trust)
+    if rerun is False or not verification.can_be_rerun:
+        return verification
+    return rerun_loop(verification, sample, tolerance, trust)
 
 
 def damage_of(path: Path, report: BytesReport = lambda *_: None) -> RecordingError | None:
@@ -213,8 +213,8 @@ def check(
     is_cut = isinstance(damage, CutOff) and not _states_its_end(path)
     try:
         with open_recording(path) as recording:
-            found = _check_content(recording, installed, report, trust)
-            found = replace(found, composition=composition_of(recording))
+            verification = _check_content(recording, installed, report, trust)
+            verification = replace(verification, composition=composition_of(recording))
             unreadable = "" if damage is None or is_cut else _first_unreadable(recording)
     except (RecordingError, ConfigError) as error:
         if is_cut and not survey(path).chunks:
@@ -224,14 +224,16 @@ def check(
             finding += _first_unreadable(recording)
         return Verification(path, verdict="damaged", finding=finding)
     if damage is None:
-        return found
-    if is_cut and found.sound:
+        return verification
+    if is_cut and verification.sound:
         note = str(damage).removeprefix(f"{path}: ")
-        return replace(found, verdict="interrupted", content_digest="", notes=(*found.notes, note))
-    if found.sound:
-        return replace(found, verdict="damaged", finding=f"{damage}{unreadable}", content_digest="")
-    verdict = found.verdict if is_cut else "damaged"
-    return replace(found, verdict=verdict, notes=(*found.notes, str(damage)), if_rerun=None)
+        return replace(
+            verification, verdict="interrupted", content_digest="", notes=(*verification.notes, note)
+        )
+    if verification.sound:
+        return replace(verification, verdict="damaged", finding=f"{damage}{unreadable}", content_digest="")
+    verdict = verification.verdict if is_cut else "damaged"
+    return replace(verification, verdict=verdict, notes=(*verification.notes, str(damage)), if_rerun=None)
 
 
 def _states_its_end(path: Path) -> bool:
@@ -406,11 +408,11 @@ def _check_loop(recording: Recording) -> Verification:
     if not verification.sound:
         return verification
     off_table = sum(findings.rewards_off_table for findings in phases.values())
-    found = _compare_totals(recording, verification, off_table, finished)
-    if found.sound and (unlikely := _unlikely(recording, phases)):
+    compared = _compare_totals(recording, verification, off_table, finished)
+    if compared.sound and (unlikely := _unlikely(recording, phases)):
         finding = f"{recording.path}: {unlikely}"
-        return replace(found, verdict="damaged", finding=finding, content_digest="", if_rerun=found)
-    return found
+        return replace(compared, verdict="damaged", finding=finding, content_digest="", if_rerun=compared)
+    return compared
 
 
 def _compare_totals(
@@ -527,71 +529,77 @@ def rerun_loop(
         if recording.maker is not None:
             start = replace(start, changes=_other_versions(recording.maker))
         assumed = recording.maker.assumed if recording.maker else ()
-    found = replace(start, act="rerun", environment="installed", tolerance=tolerance, assumed=assumed)
+    verification = replace(start, act="rerun", environment="installed", tolerance=tolerance, assumed=assumed)
     try:
-        for message in stream_from_child(_rerun, checked.path, found, sample, trust):
+        for message in stream_from_child(_rerun, checked.path, verification, sample, trust):
             if isinstance(message, int):
                 report(message)
             else:
-                found = message
-        reason, is_different = found.reason, found.difference is not None
-        if is_different and not reason and not all(_differs_again(found, trust, k) for k in _HASH_SEEDS):
+                verification = message
+        reason, is_different = verification.reason, verification.difference is not None
+        if (
+            is_different
+            and not reason
+            and not all(_differs_again(verification, trust, k) for k in _HASH_SEEDS)
+        ):
             reason = OUTSIDE
     except CannotRedo as error:
         return replace(checked, changes=start.changes, reason=str(error))
-    if reason or (is_doubted and (found.left_out or not found.sound)):  # it did not decide
-        return replace(checked, changes=start.changes, reason=reason, difference=found.difference)
-    return found
+    if reason or (is_doubted and (verification.left_out or not verification.sound)):  # it did not decide
+        return replace(checked, changes=start.changes, reason=reason, difference=verification.difference)
+    return verification
 
 
-def _differs_again(found: Verification, trust: bool, hash_seed: int) -> bool:
+def _differs_again(verification: Verification, trust: bool, hash_seed: int) -> bool:
     """Return whether another process finds the same difference."""
-    messages = stream_from_child(_first_again, found.path, found, trust, hash_seed=hash_seed)
-    return [message for message in messages if not isinstance(message, int)] == [found.difference]
+    messages = stream_from_child(_first_again, verification.path, verification, trust, hash_seed=hash_seed)
+    return [message for message in messages if not isinstance(message, int)] == [verification.difference]
 
 
-def _rerun(path: Path, found: Verification, sample: int | None, trust: bool) -> None:
+def _rerun(path: Path, verification: Verification, sample: int | None, trust: bool) -> None:
     """Report the number of steps taken, and at last the result; runs in a child process."""
     with open_recording(path) as recording:
         if sample is None:
-            found = _rerun_all(recording, found, trust)
+            verification = _rerun_all(recording, verification, trust)
         else:
-            found = _rerun_sample(recording, found, sample, trust)
-        if found.difference is not None:
-            finding = str(found.difference)
+            verification = _rerun_sample(recording, verification, sample, trust)
+        if verification.difference is not None:
+            finding = str(verification.difference)
             reason = why_uncertain(recording, trust)
-            found = replace(found, verdict="differs", finding=finding, reason=reason)
-    if found.verdict == "consistent":
-        found = replace(found, verdict="reproduced")
-    report_progress(found)
+            verification = replace(verification, verdict="differs", finding=finding, reason=reason)
+    if verification.verdict == "consistent":
+        verification = replace(verification, verdict="reproduced")
+    report_progress(verification)
 
 
-def _rerun_all(recording: Recording, found: Verification, trust: bool) -> Verification:
+def _rerun_all(recording: Recording, verification: Verification, trust: bool) -> Verification:
     from runner.replay.engine import Rerun  # loads Gymnasium
 
     total = {phase: recording.phase(phase).steps.total() for phase in schema.PHASES}
     left = total.copy()
-    with closing(Rerun(recording, trust, found.tolerance, report_progress)) as rerun:
+    with closing(Rerun(recording, trust, verification.tolerance, report_progress)) as rerun:
         for steps in rerun.all():
             if len(steps):
                 after = total[steps.phase] - 1 - int(steps.recorded["step"][-1])
                 left[steps.phase] = min(left[steps.phase], after)
-            found = replace(
-                found,
-                episodes=found.episodes + int(np.count_nonzero(steps.recorded["t"] == 0)),
-                steps=found.steps + len(steps),
+            verification = replace(
+                verification,
+                episodes=verification.episodes + int(np.count_nonzero(steps.recorded["t"] == 0)),
+                steps=verification.steps + len(steps),
                 difference=steps.difference,
             )
         ended = sum(recording.phase(phase).episodes.count() for phase in schema.PHASES)
-        found = replace(found, left_out=rerun.skipped, unfinished=max(0, found.episodes - ended))
-    if found.difference is None and "content_digest" not in recording.result:
-        found = replace(found, cut_off=sum(left.values()))
-    if found.difference is None and not found.steps:
+        verification = replace(
+            verification, left_out=rerun.skipped, unfinished=max(0, verification.episodes - ended)
+        )
+    if verification.difference is None and "content_digest" not in recording.result:
+        verification = replace(verification, cut_off=sum(left.values()))
+    if verification.difference is None and not verification.steps:
         raise CannotRedo("No reset had a seed, and the state of the random generators was not recorded.")
-    return found
+    return verification
 
 
-def _rerun_sample(recording: Recording, found: Verification, sample: int, trust: bool) -> Verification:
+def _rerun_sample(recording: Recording, verification: Verification, sample: int, trust: bool) -> Verification:
     """Rerun some episodes, at even distances, of training and evaluation together."""
     from runner.replay.environment import rerun  # loads Gymnasium
 
@@ -601,32 +609,36 @@ def _rerun_sample(recording: Recording, found: Verification, sample: int, trust:
         for number in range(recording.phase(phase).episodes.count())
     ]
     places = np.unique(np.linspace(0, len(ended) - 1, min(sample, len(ended))).round().astype(int))
-    found = replace(found, of_episodes=len(ended))
+    verification = replace(verification, of_episodes=len(ended))
     reason = "No episode ended."
     for phase, number in (ended[place] for place in places):
-        taken = found.steps
+        taken = verification.steps
 
         def report(steps: int, taken: int = taken) -> None:
             report_progress(taken + steps)
 
         try:
-            episode = rerun(recording, phase, [number], trust=trust, tolerance=found.tolerance, report=report)
+            episode = rerun(
+                recording, phase, [number], trust=trust, tolerance=verification.tolerance, report=report
+            )
             for steps in episode:
-                found = replace(found, steps=found.steps + len(steps), difference=steps.difference)
+                verification = replace(
+                    verification, steps=verification.steps + len(steps), difference=steps.difference
+                )
         except CannotRedo as error:
             reason = str(error)
             steps_left_out = len(recording.phase(phase).episode(number))
-            found = replace(found, left_out=found.left_out + steps_left_out)
+            verification = replace(verification, left_out=verification.left_out + steps_left_out)
             continue
-        found = replace(found, episodes=found.episodes + 1)
-        if found.difference is not None:
-            return found
-    if not found.episodes:
+        verification = replace(verification, episodes=verification.episodes + 1)
+        if verification.difference is not None:
+            return verification
+    if not verification.episodes:
         raise CannotRedo(reason)
-    return found
+    return verification
 
 
-def _first_again(path: Path, found: Verification, trust: bool) -> None:
+def _first_again(path: Path, verification: Verification, trust: bool) -> None:
     """Report the first difference of the episode that differs, if it differs again; runs in a child process.
 
     The clock is months ahead, so that an environment that depends on it, however coarsely, is found out.
@@ -634,7 +646,7 @@ def _first_again(path: Path, found: Verification, trust: bool) -> None:
     from runner.replay.environment import rerun  # loads Gymnasium
 
     _advance_clocks()
-    first = found.difference
+    first = verification.difference
     assert first is not None
     assert not isinstance(first, Diverged)
     episodes = None if first.episode is None else [first.episode]
@@ -644,7 +656,7 @@ def _first_again(path: Path, found: Verification, trust: bool) -> None:
             first.phase,
             episodes,
             trust=trust,
-            tolerance=found.tolerance,
+            tolerance=verification.tolerance,
             report=report_progress,
         ):
             if steps.difference is not None:
@@ -677,9 +689,11 @@ def _version(distribution: str) -> str:
 # --- comparisons ------------------------------------------------------------------------------------
 
 
-def _with_difference(found: Verification, error: Diverged, verdict: Verdict = "damaged") -> Verification:
+def _with_difference(
+    verification: Verification, error: Diverged, verdict: Verdict = "damaged"
+) -> Verification:
     """Return a verification with a difference as its finding."""
-    return replace(found, verdict=verdict, finding=str(error), difference=error)
+    return replace(verification, verdict=verdict, finding=str(error), difference=error)
 
 
 def _compare_names(recording: Recording, learners: list[str] | None = None) -> None:
@@ -714,12 +728,14 @@ def _compare_values(path: str, found: object, expected: object) -> None:
         raise Diverged("environment.json", path, found, expected)
 
 
-def _compare_result(found: Verification, recording: Recording, expected: Json) -> Verification:
+def _compare_result(verification: Verification, recording: Recording, expected: Json) -> Verification:
     """Compare the result in a recording with the computed one."""
     for key, value in expected.items():
         stated = recording.result.get(key)
         if key == "last_evaluation" and stated and "mean_return" not in stated:  # of an older version
             stated = {**stated, "mean_return": value["mean_return"]} if value else stated
         if stated != value:
-            return _with_difference(found, Diverged("metadata result", key, recording.result.get(key), value))
-    return replace(found, content_digest=expected["content_digest"])
+            return _with_difference(
+                verification, Diverged("metadata result", key, recording.result.get(key), value)
+            )
+    return replace(verification, content_digest=expected["content_digest"])

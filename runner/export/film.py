@@ -197,11 +197,11 @@ def _with_palette(film: Path) -> Iterator[VideoFrame]:
     import av
 
     graph = av.filter.Graph()
-    counted, shown = (graph.add("movie", filename=str(film)) for _ in range(2))
+    counted, frames = (graph.add("movie", filename=str(film)) for _ in range(2))
     colours = graph.add("palettegen")
     coloured = graph.add("paletteuse", dither="none", diff_mode="rectangle")
     counted.link_to(colours)
-    shown.link_to(coloured)
+    frames.link_to(coloured)
     colours.link_to(coloured, 0, 1)
     coloured.link_to(graph.add("buffersink"))
     graph.configure()
@@ -360,9 +360,9 @@ def _resized(pixels: Pixels, size: tuple[int, int]) -> Image.Image:
     return picture.resize(size, Image.Resampling.NEAREST if exact else Image.Resampling.LANCZOS)
 
 
-def _lines(shown: Pictures, picture: EpisodePicture) -> list[str]:
+def _lines(pictures: Pictures, picture: EpisodePicture) -> list[str]:
     """Return the text below a picture without a note."""
-    step = f"step {picture.t:,} of {shown.steps:,}"
+    step = f"step {picture.t:,} of {pictures.steps:,}"
     if not picture.t:
         return [step, "the episode begins"]
     total = sum(picture.returns)
@@ -371,7 +371,7 @@ def _lines(shown: Pictures, picture: EpisodePicture) -> list[str]:
     else:
         by_agent = (
             f"{spoken(name)} {reward:+.3g}"
-            for name, reward in zip(shown.learners, picture.rewards, strict=True)
+            for name, reward in zip(pictures.learners, picture.rewards, strict=True)
         )
         rewards = f"sum {total:+.5g}; {', '.join(by_agent)}"
     return [f"{step}: {picture.action}", rewards, ", ".join(filter(None, [picture.events, picture.ended]))]

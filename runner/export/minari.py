@@ -306,7 +306,7 @@ def _steps(
             for part in np.split(rows, np.flatnonzero(np.diff(rows["episode"])) + 1):
                 is_last = int(part["step"][-1]) in lengths
                 ended += ((environment, steps) for steps in _extend(recording, parts, part, is_last))
-        yield from sorted(ended, key=lambda found: int(found[1]["step"][-1]))
+        yield from sorted(ended, key=lambda episode: int(episode[1]["step"][-1]))
     yield from ((environment, np.concatenate(parts)) for environment, parts in open_parts.items() if parts)
 
 

@@ -145,8 +145,8 @@ class Pictures:
         self.learners = recording.agents
         self.steps = len(recording.phase(phase).episode(episode))
         # Read once: what draws the pictures takes the steps at the same time as their descriptions do.
-        seen, shown = tee(observations_of(recording, phase, episode))
-        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust, seen=shown)
+        seen, to_paint = tee(observations_of(recording, phase, episode))
+        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust, seen=to_paint)
         self.note = ""
         self._pictures = self._generate(moments_of(recording, phase, episode, seen))
 
@@ -325,14 +325,14 @@ def paint_scene(recording: Recording, seen: Iterator[Seen]) -> Painted:
 def paint_recorded(recording: Recording, phase: str, episode: int, seen: Iterator[Seen]) -> Painted:
     """Show the last frame that was recorded up to each step."""
     last: Message = {}
-    shown: Pixels | None = None
+    pixels: Pixels | None = None
     steps = (step for _, step in seen if step is not None)
     for frame in recorded_frames(recording, phase, episode, steps=steps):
-        if shown is None or frame is not last:
+        if pixels is None or frame is not last:
             where = f"{recording.path}: the frame at {frame['log_time']} ns"
             last = frame
-            shown = _like(np.asarray(decoded(frame["data"], where)), shown)
-        yield shown
+            pixels = _like(np.asarray(decoded(frame["data"], where)), pixels)
+        yield pixels
 
 
 def decoded(data: bytes, where: str, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Image.Image:
@@ -363,11 +363,11 @@ def _like(pixels: Pixels, before: Pixels | None) -> Pixels:
 
 def paint_redrawn(recording: Recording, phase: str, episode: int, trust: bool, first: int) -> Painted:
     """Draw each state by the environment, from the one after `first` steps on; see `redrawn`."""
-    shown: Pixels | None = None
+    pixels: Pixels | None = None
     with closing(redrawn(recording, phase, [episode], trust, first)) as pictures:
         for _, _, frame in pictures:
-            shown = _like(frame, shown)
-            yield shown
+            pixels = _like(frame, pixels)
+            yield pixels
 
 
 def redrawn(

@@ -172,8 +172,8 @@ def actions_at(recording: Recording, at: EpisodeRef) -> dict[str, str]:
         return step_actions_in_words(recording, at.phase)(step)
     mdp = recording.mdp
     mdp.check_steps(np.asarray(step).reshape(1), str(recording.path), schema.PHASE_NAMES[at.phase])
-    chosen = zip(mdp.agents, numbered_actions(mdp), agent_actions(mdp, int(step["action"])), strict=True)
-    return {agent: names[number] for agent, names, number in chosen}
+    per_agent = zip(mdp.agents, numbered_actions(mdp), agent_actions(mdp, int(step["action"])), strict=True)
+    return {agent: names[number] for agent, names, number in per_agent}
 
 
 def _action_in_words(recording: Recording, phase: str, agent: str) -> Callable[[Value], str]:

@@ -75,8 +75,8 @@ def logs(name: str, convert: Callable[..., object], arguments: str, **layout: ob
     def method(self: Any, *given: object, **named: object) -> None:
         by_name = dict(zip(names, given, strict=False)) | named
         tag, value, step = map(by_name.get, names[:3])
-        chosen = {key: by_name.get(key, default) for key, default in layout.items()}
-        self.script.log(tag, Media(convert, value, **chosen), step)
+        media_arguments = {key: by_name.get(key, default) for key, default in layout.items()}
+        self.script.log(tag, Media(convert, value, **media_arguments), step)
 
     method.__name__ = name
     method.__doc__ = f"Log a value; takes {', '.join(names)}."

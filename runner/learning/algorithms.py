@@ -306,16 +306,16 @@ class WolfPhcSchedules(NamedTuple):
 def drawn(model: Model, tables: Tables, i: int, state: int, u: float) -> int:
     """Return the action of learner i's policy that u in [0, 1) selects; never one of probability 0."""
     row = tables.offset[i] + state * model.width[i]
-    chosen = 0
+    choice = 0
     total = 0.0
     for action in range(model.width[i]):
         probability = tables.extra[POLICY, row + action]
         if probability > 0.0:
-            chosen = action
+            choice = action
             total += probability
             if u < total:
                 break
-    return chosen
+    return choice
 
 
 @numba.njit(cache=True)

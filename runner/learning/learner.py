@@ -313,16 +313,16 @@ def _segments(config: ExperimentConfig, mdp: Mdp) -> list[Segment]:
 
 def _replacement(config: ExperimentConfig, mdp: Mdp, step: int) -> Ints32:
     """Return the joint action to take instead of each one, [J], where branches set it; else empty."""
-    chosen = {
+    actions_by_agent = {
         agent: action
         for branch in config.branches
         if branch.step == step
         for agent, action in branch.actions.items()
     }
-    if not chosen:
+    if not actions_by_agent:
         return CHOSEN
     actions = mdp.own_actions.copy()
-    for agent, action in chosen.items():
+    for agent, action in actions_by_agent.items():
         number = agent_of(mdp, agent)
         actions[:, number] = own_action(mdp, number, action)
     replacement: Ints32 = np.ravel_multi_index(tuple(actions.T), mdp.action_counts).astype(np.int32)

@@ -104,14 +104,14 @@ class Relation(ds.Dataset):  # type: ignore[misc]
         """Return what DuckDB uses of a scanner, which would read ahead in threads of its own."""
         names = columns or self._columns.names
         condition = Condition(filter, self._columns)
-        shown = _selected(self._columns, lambda name: name in names)
+        projected = _selected(self._columns, lambda name: name in names)
         read = _selected(self._columns, lambda name: name in names or condition.mentions(name))
         batches = self._read(read, condition)
         rows = batches if filter is None else (batch.filter(filter) for batch in batches)
         return SimpleNamespace(
-            projected_schema=shown,
+            projected_schema=projected,
             to_reader=lambda: pa.RecordBatchReader.from_batches(
-                shown, (batch.select(shown.names) for batch in rows)
+                projected, (batch.select(projected.names) for batch in rows)
             ),
         )
 

@@ -107,7 +107,7 @@ class EpisodeIndex:
         """
         kind = kind_of(next(iter(files)))
         folder = self.folder / "packs"
-        chosen = list[Path]()
+        readable_packs = list[Path]()
         loose = set(files)
         alike = sorted((p.stat().st_mtime_ns, p) for p in self._files.values() if kind_of(p) == kind)
         cuts = [k for k, (_, p) in enumerate(alike, 1) if not int(p.stem[-2 * _HEX : -_HEX], 16) % _PACKED]
@@ -119,11 +119,11 @@ class EpisodeIndex:
                 if not pack.exists():
                     self._write(pack, f"FROM {in_files(packed)}", "ROW_GROUP_SIZE 30720")
                 self.read.add(pack)
-                chosen.append(pack)
+                readable_packs.append(pack)
                 loose.difference_update(packed)
         for other in set(folder.glob(f"{kind}-*")) - packs.keys():
             other.unlink(missing_ok=True)
-        return [*chosen, *loose]
+        return [*readable_packs, *loose]
 
     def _write(self, path: Path, rows: str, options: str, check: Callable[[], None] = lambda: None) -> None:
         """Write rows into a file, unless `check` raises an error when all are there."""

@@ -148,12 +148,12 @@ class Found:
             rows.append(
                 (hit.run_id, hit.name, hit.at, *numbers, END_WORDS[hit.ended], events, ", ".join(hit.marks))
             )
-        shown = [
+        columns = [
             (heading, *cells)
             for heading, *cells in zip(headings, *rows, strict=True)
             if any(cells) or heading not in cut
         ]
-        headings, *rows = zip(*shown, strict=True)
+        headings, *rows = zip(*columns, strict=True)
         return Grid(headings, rows, left=("run", "end", *cut), cut=cut)
 
     def as_json(self) -> Json:
@@ -195,14 +195,14 @@ def find(
         raise RunnerError(f"limit: found {limit!r}, expected a whole number from 1, or None for all.")
     if phase not in (None, *PHASES):
         raise RunnerError(f"phase: found {phase!r}, expected train or eval.")
-    chosen = parse(runs)
+    run_filter = parse(runs)
     condition = expression.strip()
     if are_words(condition):
         words = parse(condition).condition
         condition = "True"
-        chosen = chosen.also(words) if words is not None else chosen
+        run_filter = run_filter.also(words) if words is not None else run_filter
     for _ in range(2):
-        search = _Search(SelectedRuns(recordings, chosen, report), memory)
+        search = _Search(SelectedRuns(recordings, run_filter, report), memory)
         # a file may be missing where another search replaced an index, as its recording grows
         with contextlib.suppress(FileNotFoundError), contextlib.closing(search.database):
             return search.answer(expression, condition, phase, sort, limit)

@@ -67,16 +67,16 @@ class SelectedRuns:
     """The runs that a query is about, and how far it has read them.
 
     Args:
-        chosen: the filter that they match.
+        run_filter: the filter that they match.
         report: called with how far it has read, a few times a second.
     """
 
-    def __init__(self, recordings: Recordings, chosen: Filter, report: Tell) -> None:
+    def __init__(self, recordings: Recordings, run_filter: Filter, report: Tell) -> None:
         if not isinstance(recordings, list | tuple):
             recordings = [recordings_folder(recordings)]
         self._roots = recordings
-        self._chosen = chosen
-        self.rows = look(recordings, lambda index: index.select(chosen, columns=_ROW))
+        self._filter = run_filter
+        self.rows = look(recordings, lambda index: index.select(run_filter, columns=_ROW))
         self._report = report
         self._reported = time.monotonic()
         self._read_runs: set[str] = set()
@@ -143,7 +143,7 @@ class SelectedRuns:
         """Yield some columns of the runs, without a condition."""
         del condition
         stored = ["id AS run", *(name for name in needed.names if name != "run")]
-        rows = look(self._roots, lambda index: index.select(self._chosen, columns=stored), cached=True)
+        rows = look(self._roots, lambda index: index.select(self._filter, columns=stored), cached=True)
         rows = [row | {"tags": (row.get("tags") or "").split()} for row in rows]
         yield from _table(rows, dict(zip(needed.names, needed.types, strict=True))).to_batches()
 
@@ -192,11 +192,13 @@ class SelectedRuns:
             kinds.pop(left_out, None)
         own_names: dict[str, str] = {}
         for stored_name in kinds:  # DuckDB ignores case
-            shown = stored_name
-            while shown.casefold() in map(str.casefold, own_names):
-                shown += "_"
-            own_names[shown] = stored_name
-        columns = pa.schema([(shown, kinds[stored_name]) for shown, stored_name in own_names.items()])
+            unique_name = stored_name
+            while unique_name.casefold() in map(str.casefold, own_names):
+                unique_name += "_"
+            own_names[unique_name] = stored_name
+        columns = pa.schema(
+            [(unique_name, kinds[stored_name]) for unique_name, stored_name in own_names.items()]
+        )
         return Relation(columns, partial(self._batches, name, rows, own_names))
 
     def _batches(

@@ -313,13 +313,13 @@ class Extras(Mapping[str, DType]):
             for block in self.blocks(int(steps[0]), int(steps[-1]) + 1):
                 rows = np.minimum(np.searchsorted(steps, block["step"]), n - 1)
                 wanted = steps[rows] == block["step"]
-                rows, chosen = rows[wanted], block[wanted]
-                for name in chosen["values"].dtype.names:
-                    given[name][rows], part = chosen["given"][name], chosen["values"][name]
+                rows, block_rows = rows[wanted], block[wanted]
+                for name in block_rows["values"].dtype.names:
+                    given[name][rows], part = block_rows["given"][name], block_rows["values"][name]
                     if not values[name].dtype.hasobject:
                         values[name][rows] = part
                         continue
-                    is_given = chosen["given"][name]
+                    is_given = block_rows["given"][name]
                     for row, value in zip(rows[is_given].tolist(), part[is_given], strict=True):
                         values[name][row] = value
                         size += len(value) if isinstance(value, str) else value.nbytes

@@ -101,15 +101,15 @@ def origin_in(config: JsonView) -> Origin | None:
     return parse_origin(settings.get("origin")) if isinstance(settings, Mapping) else None
 
 
-def parse_origin(found: object) -> Origin | None:
+def parse_origin(recorded: object) -> Origin | None:
     """Return the origin with these fields, among others; None if one is missing or of another type."""
-    if not isinstance(found, Mapping) or "checkpoint" in found:  # an evaluated checkpoint is no branch
+    if not isinstance(recorded, Mapping) or "checkpoint" in recorded:  # an evaluated checkpoint is no branch
         return None
     import msgspec
 
-    kind: type[Origin] = BranchOrigin if "phase" in found else TrainingOrigin
+    kind: type[Origin] = BranchOrigin if "phase" in recorded else TrainingOrigin
     with contextlib.suppress(msgspec.ValidationError, UnicodeEncodeError):  # a text may have half a character
-        origin = msgspec.convert(found, kind)
+        origin = msgspec.convert(recorded, kind)
         numbers = (value for value in vars(origin).values() if isinstance(value, int))
         return origin if all(0 <= number <= _MAX_NUMBER for number in numbers) else None
     return None

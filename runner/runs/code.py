@@ -271,10 +271,10 @@ def _fitting_patch(repository: Repository, sources: _Sources) -> str:
     for path, part in patch_parts(repository.patch).items():
         name = f"the changes of {path}"
         if sources.has_room(name, len(part)):  # redaction takes seconds for megabytes
-            shown = redacted_text(part)
-            size = len(shown.encode())
+            redacted = redacted_text(part)
+            size = len(redacted.encode())
             if sources.has_room(name, size):
-                fitting.append(shown)
+                fitting.append(redacted)
                 sources.budget -= size
     return "".join(fitting)
 

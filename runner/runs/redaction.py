@@ -161,18 +161,18 @@ def is_secret_name(name: str) -> bool:
 
 def redacted_arguments(arguments: Sequence[str], variables: Mapping[str, str] = os.environ) -> list[str]:
     """Return the arguments of a command with secrets replaced by `[redacted]`."""
-    shown: list[str] = []
+    safe: list[str] = []
     is_value_secret = False
     for argument in arguments:
         name, equals, value = argument.partition("=")
-        if is_value_secret and not argument.startswith("--") and not _stays(shown[-1], argument):
-            shown.append(REDACTED)
+        if is_value_secret and not argument.startswith("--") and not _stays(safe[-1], argument):
+            safe.append(REDACTED)
         elif equals and is_secret_name(name) and not _stays(name, value) and "://" not in name:
-            shown.append(f"{name}={REDACTED}")
+            safe.append(f"{name}={REDACTED}")
         else:
-            shown.append(redacted_text(argument, variables))
+            safe.append(redacted_text(argument, variables))
         is_value_secret = argument.startswith("-") and not equals and is_secret_name(argument)
-    return shown
+    return safe
 
 
 def _stays(name: str, value: str) -> bool:

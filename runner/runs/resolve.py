@@ -59,12 +59,12 @@ def find_run(
     candidates = matches(quick=True) or matches(quick=False)
     if not candidates:
         raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
-    chosen = choose(name, candidates, newest)
-    if chosen.name == name != chosen.run_id:
+    match = choose(name, candidates, newest)
+    if match.name == name != match.run_id:
         count = sum(candidate.name == name for candidate in candidates)
         if count > 1:
-            report(f"{count:,} runs are named {name}: the newest is taken, {chosen.run_id}.")
-    return chosen.run(folder)
+            report(f"{count:,} runs are named {name}: the newest is taken, {match.run_id}.")
+    return match.run(folder)
 
 
 def run_of_id(run_id: str, recordings: Path) -> Run | None:
@@ -89,8 +89,8 @@ def find_runs(name: str, recordings: Path, report: Tell) -> list[Run]:
     from runner.runs.catalogue.index import look
 
     if is_expression(name) and not os.path.lexists(name):
-        chosen = parse(name)
-        matches = look([recordings], lambda index: index.candidates(chosen), report)
+        run_filter = parse(name)
+        matches = look([recordings], lambda index: index.candidates(run_filter), report)
         if not matches:
             raise RunNotFound(f"no run in {recordings} matches {name}. `dualtaxi ls` lists the runs.")
         return [candidate.run(recordings) for candidate in reversed(matches)]

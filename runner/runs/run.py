@@ -459,8 +459,8 @@ def command_for(run: Run, verb: str, *options: str) -> str:
 def command_in(folder: Path, *words: str) -> str:
     """Return a command line, with --recordings if the folder of runs is not the default."""
     is_default = folder.absolute() == recordings_folder().absolute()
-    chosen = () if is_default else ("--recordings", shlex.quote(os.fspath(folder)))
-    return " ".join(("dualtaxi", *words, *chosen))
+    option = () if is_default else ("--recordings", shlex.quote(os.fspath(folder)))
+    return " ".join(("dualtaxi", *words, *option))
 
 
 # --- the runs of a folder, and the locks on them -------------------------------------------------------

@@ -104,7 +104,7 @@ def own_mark(recording: Path, environment: EnvironmentMaker | JsonView) -> Trust
     """Return the mark next to a recording if it covers an environment; None if it does not."""
     marks = (mark_of(recording.parent, name) for name in (MARK_FILE, _restored_name(recording)))
     digest = hashlib.sha256(_canonical(environment).encode()).hexdigest()
-    return next((found for found in marks if digest in found.environments), None)
+    return next((mark for mark in marks if digest in mark.environments), None)
 
 
 def copy_mark(folder: Path, restored: Path) -> None:

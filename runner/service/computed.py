@@ -102,9 +102,14 @@ def records(path: Path, kind: RecordKind, rows: range, limit: int) -> bytes:
         else:
             recording.require_job("a report of training", "Its metrics can be had all the same.")
             everything = [record.as_json() for record in training_records(recording)]
-        shown = everything[rows.start : rows.stop]
-        require_few(len(shown), limit)
-        page = {"run_id": recording.run_id, "start": rows.start, "total": len(everything), "records": shown}
+        in_range = everything[rows.start : rows.stop]
+        require_few(len(in_range), limit)
+        page = {
+            "run_id": recording.run_id,
+            "start": rows.start,
+            "total": len(everything),
+            "records": in_range,
+        }
         return as_json(page)
 
 
@@ -154,16 +159,16 @@ def film(path: Path, title: str, step: EpisodeRef, ending: str) -> bytes:
         raise RunnerError(f"format: found {ending[:20]!r}, expected one of {', '.join(FORMATS)}.")
     with tempfile.TemporaryDirectory() as folder, open_recording(path) as recording:
         file = Path(folder, f"film{ending}")
-        shown = step.resolved(recording)
-        pictures = Pictures(recording, shown.phase, shown.number_in(recording))
-        if shown.t > pictures.steps:
-            raise shown.no_step(recording, pictures.steps, shown.t)
-        if (steps := pictures.steps - shown.t) > MAX_FILM_STEPS:
+        episode = step.resolved(recording)
+        pictures = Pictures(recording, episode.phase, episode.number_in(recording))
+        if episode.t > pictures.steps:
+            raise episode.no_step(recording, pictures.steps, episode.t)
+        if (steps := pictures.steps - episode.t) > MAX_FILM_STEPS:
             raise RunnerError(
                 f"found {steps:,} steps to film, expected at most {MAX_FILM_STEPS:,}: begin at a later step, "
                 "or use `dualtaxi export film`, which has no limit."
             )
-        shot = Shot(f"{title}: {shown.title}", pictures, shown.t)
+        shot = Shot(f"{title}: {episode.title}", pictures, episode.t)
         write_film(file, shot, usual_speed(pictures.source), None, lambda _: None)
         return file.read_bytes()
 
@@ -210,13 +215,13 @@ def query(settings: ServiceSettings, text: str, runs: str) -> bytes:
     result = sql(text, recordings=settings.recordings, runs=runs)
     with contextlib.closing(result.rows()) as rows:
         first = list(islice(rows, MAX_ROWS + 1))
-    found = {
+    answer = {
         "columns": result.columns.names,
         "rows": first[:MAX_ROWS],
         "more": len(first) > MAX_ROWS,
         "left_out": result.left_out,
     }
-    return settings.without_folders(as_json(found).decode()).encode()
+    return settings.without_folders(as_json(answer).decode()).encode()
 
 
 def find(settings: ServiceSettings, expression: str, runs: str, phase: str, sort: str, limit: int) -> bytes:
@@ -224,7 +229,7 @@ def find(settings: ServiceSettings, expression: str, runs: str, phase: str, sort
     require("pyarrow", extra="sql", purpose="`find`")
     from runner.query import find
 
-    found = find.find(
+    result = find.find(
         expression,
         settings.recordings,
         runs=runs,
@@ -232,7 +237,7 @@ def find(settings: ServiceSettings, expression: str, runs: str, phase: str, sort
         sort=sort,
         limit=limit or MAX_ROWS,
     )
-    return settings.without_folders(as_json(found.as_json()).decode()).encode()
+    return settings.without_folders(as_json(result.as_json()).decode()).encode()
 
 
 def as_json(value: object) -> bytes:
@@ -276,16 +281,16 @@ def what_if_page(path: Path, at: EpisodeRef, action: str | None, start: int, ste
     It is the branch of `action`, None for the recorded one.
     """
     with open_recording(path) as recording:
-        found = what_if(recording, at=at)
+        result = what_if(recording, at=at)
         base = f"/runs/{recording.run_id}/"
-        number = next(row.action for row in found.actions if row.is_recorded)
+        number = next(row.action for row in result.actions if row.is_recorded)
         if action is not None:
             number = joint_action(recording.mdp, action)
-        *before, after = found.sections(base)
+        *before, after = result.sections(base)
         texts = {
             "action": str(number),
             "name": str(actions_in_words(recording.mdp)[number]),
-            "before": str(partials().notes(found.notes) + partials().answer(before, base)),
+            "before": str(partials().notes(result.notes) + partials().answer(before, base)),
             "after": str(partials().answer([after], base)),
         }
         return _branch_part(recording, at, str(number), start, steps, texts)
@@ -420,18 +425,18 @@ def pictures(path: Path) -> bytes:
 def difference(a: Run, b: Run) -> bytes:
     """Return `ShownDifference` as JSON."""
     with open_recording(a.recording) as ours, open_recording(b.recording) as theirs:
-        found = without_ignored(with_seconds(diff(ours, theirs), a, b), ())
-        shown = difference_sections(found, ours, theirs)
-    divergences = {"Training": found.divergence, "Evaluation": found.evaluation_divergence}
+        comparison = without_ignored(with_seconds(diff(ours, theirs), a, b), ())
+        sections = difference_sections(comparison, ours, theirs)
+    divergences = {"Training": comparison.divergence, "Evaluation": comparison.evaluation_divergence}
     known = {title: divergence for title, divergence in divergences.items() if divergence is not None}
     for title, divergence in known.items():
-        shown[title] = replace(shown[title], links=_links([a, b], divergence))
-    body = [section for title, section in shown.items() if title not in ("Metrics", "Q-tables", "Runs")]
+        sections[title] = replace(sections[title], links=_links([a, b], divergence))
+    body = [section for title, section in sections.items() if title not in ("Metrics", "Q-tables", "Runs")]
     first = next(iter(known.values()), None)
-    tables = shown.get("Q-tables", Section("Q-tables", ["There are none to compare."]))
+    tables = sections.get("Q-tables", Section("Q-tables", ["There are none to compare."]))
     tabs = {
-        "divergence": (summary(found), found.notes, partials().answer(body)),
-        "tables": ("", [] if "Q-tables" in shown else found.notes, partials().answer([tables])),
+        "divergence": (summary(comparison), comparison.notes, partials().answer(body)),
+        "tables": ("", [] if "Q-tables" in sections else comparison.notes, partials().answer([tables])),
     }
     return as_json(ShownDifference(tabs, None if first is None else str(first.frame)))
 
@@ -490,11 +495,11 @@ def sweep_part(
     part: Callable[[Results, Path], Iterable[Section]], name: str, recordings: Path, digest: str
 ) -> bytes:
     """Return a part of the page of a sweep as HTML, without the path of the recordings folder."""
-    shown = [
+    sections = [
         replace(section, sentences=[without_folders(text, recordings) for text in section.sentences])
         for section in part(_sweep_results(name, recordings, digest), recordings)
     ]
-    return str(partials().answer(shown)).encode()
+    return str(partials().answer(sections)).encode()
 
 
 def sweep_ranking(results: Results, _: Path) -> Iterator[Section]:

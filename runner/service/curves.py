@@ -169,15 +169,17 @@ def curves_of(
     groups = groups_of(series)
     names = {run.run_id: (letter(number), run.name) for number, run in enumerate(series)}
     panels: list[Panel] = []
-    shown: list[ShownCurve] = []
+    curves: list[ShownCurve] = []
     with contextlib.suppress(NoMetrics):
         for panel in panels_of(groups):
             if not options.metric or panel.metric in options.metric:
                 panels.append(panel)
-                shown += [_shown_curve(panel, curve, options, lines, groups, names) for curve in panel.curves]
+                curves += [
+                    _shown_curve(panel, curve, options, lines, groups, names) for curve in panel.curves
+                ]
     if table:
-        return "".join(csv_lines(*_columns(over.name, shown))).encode()
-    most = max((curve.of for curve in shown if curve.thinned), default=0)
+        return "".join(csv_lines(*_columns(over.name, curves))).encode()
+    most = max((curve.of for curve in curves if curve.thinned), default=0)
     notes = [footnote(groups, panels, options.style), *map(humanize.sentence, duplicates(groups))]
     averaged = " ".join(dict.fromkeys(run.averaged for run in series if run.averaged))
     if most:
@@ -191,9 +193,9 @@ def curves_of(
         over.name,
         [AxisInfo(axis.name, axis.title, axis.label) for axis in offered],
         [CurveGroup(group.label, [run.run_id for run in group.runs], group.left_out) for group in groups],
-        shown,
+        curves,
         averaged,
-        notes if shown else ["No metrics were recorded."],
+        notes if curves else ["No metrics were recorded."],
         logged,
     )
     return as_json(result)

@@ -93,7 +93,7 @@ class PictureStream:
         Those are left out that take long after the first, and all if nobody waits for them.
         """
         pictures: list[bytes] = []
-        shown: list[int] = []
+        picture_numbers: list[int] = []
         end = math.inf
         while self.next < stop and not self._has_ended and time.monotonic() < end:
             self._arrived.clear()  # first, so that no picture arrives unnoticed meanwhile
@@ -101,16 +101,16 @@ class PictureStream:
                 number = self.next
                 made = self._take()
                 if number >= start and made is not None:
-                    if made or not shown:
+                    if made or not picture_numbers:
                         pictures.append(self._last)
-                    shown.append(len(pictures) - 1)
+                    picture_numbers.append(len(pictures) - 1)
                     end = min(end, time.monotonic() + BLOCK_SECONDS)
             elif await is_gone():
                 break
             else:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._arrived.wait(), _LOOK_SECONDS)
-        return Block(pictures, shown, self._note, self._problem if self.next < stop else "")
+        return Block(pictures, picture_numbers, self._note, self._problem if self.next < stop else "")
 
     def _take(self) -> bytes | None:
         """Take what was made next; return a picture, empty if it is the one before; None if it is none."""

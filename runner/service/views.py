@@ -117,9 +117,9 @@ def _add_routes(view: View) -> None:
             asked = {name: text for name, text in form.items() if text}
             shown_page = {"page": number} if number > 1 else {}
             live = link(f"/runs/{run.run_id}/{view.name}/part", asked | shown_page | {"status": run.status})
-        shown = {"view": view, "given": form, "body": body.decode(), "problem": problem, "live": live}
+        values = {"view": view, "given": form, "body": body.decode(), "problem": problem, "live": live}
         status = status_of(problem) if isinstance(problem, RecordingError) else None
-        return run_page(run, view.name, "run_view.html", lambda: shown | _form_values(run, view), status)
+        return run_page(run, view.name, "run_view.html", lambda: values | _form_values(run, view), status)
 
 
 def _add_route_of_runs(view: View) -> None:
@@ -274,7 +274,7 @@ async def find(request: Request, search: SearchOf) -> Response:
 async def find_page(request: Request, search: SearchOf) -> Response:
     """Show the form, and the episodes that match."""
     asked = search.model_dump()
-    shown: dict[str, object] = {
+    values: dict[str, object] = {
         "view": FIND,
         "given": asked,
         "problem": "",
@@ -287,19 +287,19 @@ async def find_page(request: Request, search: SearchOf) -> Response:
             from runner.query.find import Found  # needs the extra
 
             answer = await _answer_query(request, computed.find, *asked.values())
-            found = TypeAdapter(Found).validate_json(answer)
+            result = TypeAdapter(Found).validate_json(answer)
             kept = link("", asked).removeprefix("?")
-            links = [link(hit.replay, {"found": kept}) for hit in found.hits]
-            shown |= {"found": found, "left_out": found.left_out, "links": links}
+            links = [link(hit.replay, {"found": kept}) for hit in result.hits]
+            values |= {"found": result, "left_out": result.left_out, "links": links}
     except RunnerError as error:
-        shown["problem"] = error
-    return Page("find.html", shown)
+        values["problem"] = error
+    return Page("find.html", values)
 
 
 @pages.get("/sql")
 async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Response:
     """Show the form, and the answer to a query."""
-    shown: dict[str, object] = {
+    values: dict[str, object] = {
         "view": SQL,
         "given": {"query": query, "runs": runs},
         "problem": "",
@@ -310,10 +310,10 @@ async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Respon
         if query.strip():
             answer = json.loads(await _answer_query(request, computed.query, query, runs))
             rows = [tuple(map(cell_of, row)) for row in answer["rows"]]
-            shown |= answer | {"grid": Grid(tuple(answer["columns"]), rows)}
+            values |= answer | {"grid": Grid(tuple(answer["columns"]), rows)}
     except RunnerError as error:
-        shown["problem"] = error
-    return Page("sql.html", shown)
+        values["problem"] = error
+    return Page("sql.html", values)
 
 
 async def _answer_query(request: Request, function: Callable[..., bytes], *asked: Hashable) -> bytes:

@@ -381,7 +381,7 @@ def effects_sections(results: Results) -> list[Section]:
     effects = results.effects
     if not effects:
         return []
-    shown = [effect for effect in effects if len(effect.parameters) == 1 or effect.share >= MIN_SHARE]
+    effects_shown = [effect for effect in effects if len(effect.parameters) == 1 or effect.share >= MIN_SHARE]
     rows = [
         (
             " x ".join(effect.parameters),
@@ -389,7 +389,7 @@ def effects_sections(results: Results) -> list[Section]:
             f"{100 * effect.share:.0f} %",
             f"{100 * effect.low:.0f} to {100 * effect.high:.0f} %",
         )
-        for effect in shown
+        for effect in effects_shown
     ]
     if results.is_whole_grid:
         source = "over the grid, all of whose points were completed; the interval is over resampled seeds"
@@ -406,12 +406,12 @@ def effects_sections(results: Results) -> list[Section]:
         rest = max(0.0, 1.0 - sum(effect.share for effect in effects))
         note += f": about {100 * rest:.0f} % are left to {several} parameters together"
     notes = [f"{note}."]
-    if hidden := len(effects) - len(shown):
+    if hidden := len(effects) - len(effects_shown):
         notes.append(f"{hidden} pairs of less than {100 * MIN_SHARE:.0f} % are left out.")
     return [Section("What mattered", notes, [Grid(("parameter", "", "share", "95 %"), rows)])]
 
 
-def _heading(results: Results, shown: int) -> list[str]:
+def _heading(results: Results, trials: int) -> list[str]:
     sweep, ranking = results.sweep, results.ranking
     states = [trial.state for trial in results.suggested]
     counts = [f"{states.count(state)} {state}" for state in get_args(State) if state in states]
@@ -422,7 +422,7 @@ def _heading(results: Results, shown: int) -> list[str]:
         f"{counted(len(sweep.seeds), 'seed')} each. Objective: {sweep.objective.description}.",
         *([f"{duplicates} trials repeated earlier values, and are listed with them."] if duplicates else []),
         *([f"{len(tied)} trials tie for the best; trial {tied[0].number} is the first."] if tied[1:] else []),
-        *([f"The best {shown} of {len(ranking):,}; --all shows all."] if shown < len(ranking) else []),
+        *([f"The best {trials} of {len(ranking):,}; --all shows all."] if trials < len(ranking) else []),
     ]
 
 

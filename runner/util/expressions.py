@@ -157,9 +157,9 @@ class Parser(ABC, Generic[Part]):
 
     def _lines(self, start: int, length: int) -> str:
         first = max(0, start - _AROUND)
-        shown = self.text[first : start + _AROUND]
+        line = self.text[first : start + _AROUND]
         marks = "^" * min(length, _AROUND)
-        return f"\n  {shown}\n  {' ' * (start - first)}{marks}"
+        return f"\n  {line}\n  {' ' * (start - first)}{marks}"
 
     def text_of(self, node: ast.expr) -> str:
         """Return a node's own text."""

@@ -119,18 +119,18 @@ def compare(
 
     require_scipy()
     over = axis_of(axis)
-    read_at, chosen = moment_of(moment, parse_target(target) if target else None, metrics, over)
+    read_at, metric_names = moment_of(moment, parse_target(target) if target else None, metrics, over)
     with progress.stage("reading runs") as report:
-        series = series_of((run.recording for run in runs), over, chosen)
+        series = series_of((run.recording for run in runs), over, metric_names)
         report("computing intervals")
         if normalise is not None:
-            tasks = compare_algorithms(series, scores_of(normalise), by, chosen, read_at)
+            tasks = compare_algorithms(series, scores_of(normalise), by, metric_names, read_at)
             contents = f"{len(tasks.algorithms)} groups in {len(tasks.tasks)} environments"
             page = partial(render_tasks, tasks)
             return ReadyAnswer(asdict(tasks), task_sections(tasks), page, contents, tasks.notes)
         groups, notes = grouped(series, by)
         require_two(groups, by)
-        compared = compare(groups, metrics_of(groups, chosen), read_at, notes)
+        compared = compare(groups, metrics_of(groups, metric_names), read_at, notes)
     count = sum(len(group.runs) for group in groups)
     contents = f"{counted(len(compared.metrics), 'metric')} of {count} runs in {len(groups)} groups"
     page = partial(render_comparison, compared, groups)

@@ -107,31 +107,31 @@ def find(
     from runner.query import find as query
 
     with without_pandas(), progress.stage("reading") as report:
-        found = query.find(
+        result = query.find(
             expression, folders, runs=runs, phase=phase, sort=sort, limit=limit or None, report=report
         )
-    marked = None if mark is None else found.mark(mark, tags=tags)
+    marked = None if mark is None else result.mark(mark, tags=tags)
 
     def say_how_many() -> None:
-        progress.say(found.sentence)
-        if len(found.hits) < found.count:
-            progress.say(f"Shown are the first {len(found.hits):,}; --limit 0 shows all.")
+        progress.say(result.sentence)
+        if len(result.hits) < result.count:
+            progress.say(f"Shown are the first {len(result.hits):,}; --limit 0 shows all.")
         if marked is not None:
-            had = len(found.hits) - marked
+            had = len(result.hits) - marked
             progress.say(f"Marked {counted(marked, 'episode')}; {had:,} had this mark.")
 
     def sections() -> Iterator[Section]:
-        if found.hits:
-            yield Section("", grids=[found.grid])
+        if result.hits:
+            yield Section("", grids=[result.grid])
         say_how_many()
 
     def lines() -> Iterator[str]:
-        for (run, of_phase), episodes in found.episodes.items():
+        for (run, of_phase), episodes in result.episodes.items():
             yield f"{run} {of_phase} {','.join(map(str, episodes))}\n"
         say_how_many()
 
-    data = found.as_json() | ({} if marked is None else {"marked": marked})
-    return ReadyAnswer(data, sections(), lines={"quiet": lines()}, remarks=_reasons(found))
+    data = result.as_json() | ({} if marked is None else {"marked": marked})
+    return ReadyAnswer(data, sections(), lines={"quiet": lines()}, remarks=_reasons(result))
 
 
 FIND: Final = View(

@@ -70,10 +70,10 @@ def episodes(
     else:
         numbers = in_order(recording, phase, order)[rows.start : rows.stop]
         columns = columns_of_episodes(recording, recording.phase(phase).episodes.selected(numbers))
-    shown = [name for name in columns if name not in _HIDDEN]
+    names = [name for name in columns if name not in _HIDDEN]
     if recording.environment["penalty_below"] is None:
-        shown.remove("penalties")
-    headings = {name: event_in_words(name) for name in shown}
+        names.remove("penalties")
+    headings = {name: event_in_words(name) for name in names}
     for agent in recording.agents:
         name = f"return.{agent}"
         headings[name] = "return" if len(recording.agents) == 1 else event_in_words(name)
@@ -271,19 +271,19 @@ def console(
     matching = [
         line for line in lines if search.casefold() in line.text.casefold() and stream in (_BOTH, line.stream)
     ]
-    shown = matching[-limit:]
-    data = {"lines": [asdict(line) for line in shown], "found": len(matching), "total": len(lines)}
-    if not shown:
+    last_lines = matching[-limit:]
+    data = {"lines": [asdict(line) for line in last_lines], "found": len(matching), "total": len(lines)}
+    if not last_lines:
         return ReadyAnswer(data, [Section("Output", ["No line was found." if lines else _NONE])])
     sentence = counted(len(matching), "line")
-    if len(shown) < len(matching):
-        sentence = f"The last {len(shown):,} of {sentence}"
+    if len(last_lines) < len(matching):
+        sentence = f"The last {len(last_lines):,} of {sentence}"
     if len(matching) < len(lines):
         sentence += f" found, of {len(lines):,}"
-    streams = [line.stream or "note" for line in shown]
+    streams = [line.stream or "note" for line in last_lines]
     rows = [
         (duration(line.seconds), f"{line.position:,}", name, line.text)
-        for line, name in zip(shown, streams, strict=True)
+        for line, name in zip(last_lines, streams, strict=True)
     ]
     grid = Grid(("time", "about step", "stream", "output"), rows, streams=streams)
     return ReadyAnswer(data, [Section("Output", [f"{sentence}."], [grid])])

@@ -154,8 +154,8 @@ class Listing(Answer):
         rows = [*self._noted(found)]
         if rows:
             spare = () if columns else _OPTIONAL
-            shown = columns or _informative(rows, len(self._recordings))
-            yield Section("", grids=[_grid(rows, shown, spare)])
+            columns_shown = columns or _informative(rows, len(self._recordings))
+            yield Section("", grids=[_grid(rows, columns_shown, spare)])
 
     def _noted(self, rows: Iterable[Row]) -> Iterator[Row]:
         """Yield rows, noting their number and the problems of damaged runs."""
@@ -268,8 +268,8 @@ def ls(
     """  # noqa: D301 - Click's mark for preformatted text
     from runner.runs.catalogue.filters import parse
 
-    shown, matching = columns_of(columns) if columns else None, parse(" ".join(words))
-    return Listing(folders, matching, shown, sort, limit, offset, progress.say)
+    names, matching = columns_of(columns) if columns else None, parse(" ".join(words))
+    return Listing(folders, matching, names, sort, limit, offset, progress.say)
 
 
 LS: Final = View(
@@ -395,9 +395,9 @@ def du(
     from runner.runs.catalogue.index import look
     from runner.runs.catalogue.usage import usage_of
 
-    chosen, searched = parse(" ".join(words)), ", ".join(map(str, folders))
+    run_filter, searched = parse(" ".join(words)), ", ".join(map(str, folders))
     return DiskUsage(
-        lambda count: usage_of(lambda work: look(folders, work, progress.say), chosen, count),
+        lambda count: usage_of(lambda work: look(folders, work, progress.say), run_filter, count),
         folders,
         limit,
         f"No run in {searched} matches." if words else "No runs yet.",

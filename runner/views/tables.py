@@ -279,11 +279,11 @@ def values(
         needed = {"--episode or --eval": at, "--checkpoint": checkpoint, "--policy": policy}
         lacking = [name for name, value in needed.items() if value is None]
         raise ConfigError(f"found no {', no '.join(lacking)}; see `dualtaxi values --help`.")
-    chosen = find_checkpoint(run.checkpoints(), checkpoint, f"run {run.run_id}")
+    checkpoint_used = find_checkpoint(run.checkpoints(), checkpoint, f"run {run.run_id}")
     with open_recording(run.recording) as recording, progress.stage("computing values"):
         at = at.resolved(recording)
         number = at.number_in(recording)
-        along = values_along(recording, at.phase, number, chosen, policy, trust)
+        along = values_along(recording, at.phase, number, checkpoint_used, policy, trust)
     columns: dict[str, list[object]] = {"t": list(range(len(along.rewards)))}
     columns |= _columns("action", along.actions) | _columns("reward", along.rewards.sum(axis=1))
     for name, returned in along.values.items():
@@ -293,12 +293,12 @@ def values(
         "run_id": run.run_id,
         "phase": at.phase,
         "episode": number,
-        "checkpoint": chosen.as_json(),
+        "checkpoint": checkpoint_used.as_json(),
         "policy": policy,
         "steps": [dict(zip(columns, row, strict=True)) for row in rows],
     }
-    shown = [tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows]
-    grid = Grid(tuple(columns), shown, left=(), cut=())
+    cells = [tuple(f"{x:.4g}" if isinstance(x, float) else str(x) for x in row) for row in rows]
+    grid = Grid(tuple(columns), cells, left=(), cut=())
     return ReadyAnswer(data, [Section("", grids=[grid])], lambda: "".join(csv_lines(columns, rows)))
 
 

@@ -73,86 +73,99 @@ def verify(
     with progress.bytes("reading") as report:
         damage = damage_of(path, report)
     with progress.episodes("verifying", (run.episodes_to_do or 0) if run else 0) as report:
-        found = check(path, damage, bool(rerun), report, trust)
-    if found.can_be_rerun and rerun is not False:
-        with progress.count("steps rerun", 0 if sample else found.train_steps + found.eval_steps) as report:
-            found = rerun_loop(found, sample, tolerance, trust, report)
-    code = ExitCode.DIFFERENT if not found.sound or (rerun and found.reason) else ExitCode.OK
-    return ReadyAnswer(_as_json(found), [Section("", facts=_rows(found, run))], exit_code=code)
+        verification = check(path, damage, bool(rerun), report, trust)
+    if verification.can_be_rerun and rerun is not False:
+        with progress.count(
+            "steps rerun", 0 if sample else verification.train_steps + verification.eval_steps
+        ) as report:
+            verification = rerun_loop(verification, sample, tolerance, trust, report)
+    code = ExitCode.DIFFERENT if not verification.sound or (rerun and verification.reason) else ExitCode.OK
+    return ReadyAnswer(_as_json(verification), [Section("", facts=_rows(verification, run))], exit_code=code)
 
 
-def _rows(found: Verification, run: Run | None) -> dict[str, str]:
+def _rows(verification: Verification, run: Run | None) -> dict[str, str]:
     """Return a verdict and all that belongs to it, as text by name."""
-    rows = {"recording": str(found.path), "verdict": _verdict(found), "first": found.finding}
-    rows["environment"] = str(found.composition or "")
-    if found.verdict == "interrupted" and run is not None and run.can_train_again:
+    rows = {
+        "recording": str(verification.path),
+        "verdict": _verdict(verification),
+        "first": verification.finding,
+    }
+    rows["environment"] = str(verification.composition or "")
+    if verification.verdict == "interrupted" and run is not None and run.can_train_again:
         rows["next"] = f"`{command_for(run, 'resume')}` continues from there"
-    if found.reason:
-        rows["reason"] = f"cannot be rerun: {found.reason}"
-        rows["for example"] = str(found.difference or "")
-    elif found.act == "checked" and found.can_be_rerun and found.sound:
+    if verification.reason:
+        rows["reason"] = f"cannot be rerun: {verification.reason}"
+        rows["for example"] = str(verification.difference or "")
+    elif verification.act == "checked" and verification.can_be_rerun and verification.sound:
         rows["reason"] = "not rerun, as --no-rerun demands"
-    notes = [f"{name}: its arguments were assumed, as they could not be recorded" for name in found.assumed]
-    if found.left_out:
+    notes = [
+        f"{name}: its arguments were assumed, as they could not be recorded" for name in verification.assumed
+    ]
+    if verification.left_out:
         notes.append(
-            f"{counted(found.left_out, 'step')} left out: the random generators before them are not known"
+            f"{counted(verification.left_out, 'step')} left out: "
+            "the random generators before them are not known"
         )
-    if found.cut_off:
-        notes.append(f"the last {counted(found.cut_off, 'step')} left out: their resets were not written")
-    rows["note"] = "\n".join([*notes, *found.notes])
-    if found.sound:
-        rows["digest"] = found.content_digest or f"{UNKNOWN} (written when a run ends properly)"
-        rows["not compared"] = found.not_compared
-    if found.verdict == "differs" or (found.act == "retrained" and found.environment == "installed"):
+    if verification.cut_off:
+        notes.append(
+            f"the last {counted(verification.cut_off, 'step')} left out: their resets were not written"
+        )
+    rows["note"] = "\n".join([*notes, *verification.notes])
+    if verification.sound:
+        rows["digest"] = verification.content_digest or f"{UNKNOWN} (written when a run ends properly)"
+        rows["not compared"] = verification.not_compared
+    if verification.verdict == "differs" or (
+        verification.act == "retrained" and verification.environment == "installed"
+    ):
         rows["changed"] = "\n".join(
             f"{key}: {then or 'unknown'} then, {now or 'unknown'} here"
-            for key, (then, now) in found.changes.items()
+            for key, (then, now) in verification.changes.items()
         )
         rows["changed"] = rows["changed"] or "nothing: the same code, packages and platform as recorded"
     return rows
 
 
-def _verdict(found: Verification) -> str:
+def _verdict(verification: Verification) -> str:
     """Return a verdict, with what was compared, in a sentence."""
-    steps = counted(found.steps, "step")
-    if found.verdict == "damaged":
-        return found.verdict
-    if found.verdict == "interrupted" and not found.train_steps + found.eval_steps:
+    steps = counted(verification.steps, "step")
+    if verification.verdict == "damaged":
+        return verification.verdict
+    if verification.verdict == "interrupted" and not verification.train_steps + verification.eval_steps:
         compared = "nothing was recorded yet"
-    elif found.act == "retrained":
-        compared = f"retrained with the {found.environment} environment"
-        if found.sound:
-            compared += f": {counted(found.episodes, 'episode')}, {steps} with evaluations, every byte"
-    elif found.act == "rerun":
-        of = found.of_episodes
-        episodes = counted(found.episodes, "episode")
+    elif verification.act == "retrained":
+        compared = f"retrained with the {verification.environment} environment"
+        if verification.sound:
+            compared += f": {counted(verification.episodes, 'episode')}, {steps} with evaluations, every byte"
+    elif verification.act == "rerun":
+        of = verification.of_episodes
+        episodes = counted(verification.episodes, "episode")
         if of is not None:
-            episodes = f"{found.episodes:,} of {counted(of, 'episode')}"
-        if found.unfinished:
-            episodes += f" ({found.unfinished:,} unfinished)"
-        exactness = f"within {found.tolerance:g}" if found.tolerance else "every byte"
+            episodes = f"{verification.episodes:,} of {counted(of, 'episode')}"
+        if verification.unfinished:
+            episodes += f" ({verification.unfinished:,} unfinished)"
+        exactness = f"within {verification.tolerance:g}" if verification.tolerance else "every byte"
         compared = f"reran {episodes}, {steps}, {exactness}"
     else:
         compared = "only the file was checked, which agrees with itself"
-    return f"{found.verdict}: {compared}"
+    return f"{verification.verdict}: {compared}"
 
 
-def _as_json(found: Verification) -> Json:
+def _as_json(verification: Verification) -> Json:
     """Return a verdict and all that belongs to it, as JSON."""
     left_out = ("composition", "can_be_rerun", "if_rerun")
     texts = ("reason", "finding", "content_digest", "not_compared")
     plain = (str, int, float, list, dict, type(None))
     return {
-        **{name: value for name, value in vars(found).items() if name not in left_out},
-        **{name: getattr(found, name) or None for name in texts},
-        "path": str(found.path.absolute()),
-        "environment": None if found.composition is None else found.composition.as_json(),
-        "difference": found.difference
+        **{name: value for name, value in vars(verification).items() if name not in left_out},
+        **{name: getattr(verification, name) or None for name in texts},
+        "path": str(verification.path.absolute()),
+        "environment": None if verification.composition is None else verification.composition.as_json(),
+        "difference": verification.difference
         and {
             key: value if isinstance(value, plain) else str(value)
-            for key, value in vars(found.difference).items()
+            for key, value in vars(verification.difference).items()
         },
-        "changes": {key: {"then": then, "here": here} for key, (then, here) in found.changes.items()},
+        "changes": {key: {"then": then, "here": here} for key, (then, here) in verification.changes.items()},
     }
 
 

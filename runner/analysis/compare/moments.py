@@ -157,7 +157,7 @@ def uneven_ends(groups: Sequence[Group], metric: str, line: str) -> Iterator[str
 
 
 def moment_of(
-    moment: str, target: tuple[str, float] | None, chosen: Sequence[str], axis: Axis = EPISODES
+    moment: str, target: tuple[str, float] | None, metrics: Sequence[str], axis: Axis = EPISODES
 ) -> tuple[Moment, Sequence[str]]:
     """Return the moment that options stand for, and the metrics: a target names its own.
 
@@ -168,7 +168,7 @@ def moment_of(
         RunnerError: it is none of these, or both are given.
     """
     if target is not None:
-        if moment != "last" or chosen:
+        if moment != "last" or metrics:
             raise RunnerError(
                 "target: it names its metric and when it is read, so it excludes metric and moment; "
                 "drop it or them."
@@ -177,12 +177,12 @@ def moment_of(
         return Moment("crossing", level=level, axis=axis), (metric,)
     for kind in _OF_WHOLE_RUNS:
         if moment == kind:
-            return Moment(kind, axis=axis), chosen
+            return Moment(kind, axis=axis), metrics
     if moment.isascii() and moment.isdecimal():
-        return Moment("position", number=int(moment), axis=axis), chosen
+        return Moment("position", number=int(moment), axis=axis), metrics
     with contextlib.suppress(ValueError):
         if not axis.whole and 0 <= (number := float(moment)) < math.inf:
-            return Moment("position", number=number, axis=axis), chosen
+            return Moment("position", number=number, axis=axis), metrics
     raise RunnerError(f"moment: found {moment!r}, expected last, best, area, or a number of {axis.label}.")
 
 

@@ -114,12 +114,12 @@ def compare_algorithms(
     series: Sequence[RunSeries],
     table: Mapping[str, Bounds] | None,
     by: str | None = None,
-    chosen: Sequence[str] = (),
+    metrics: Sequence[str] = (),
     moment: Moment = Moment("last"),  # noqa: B008 - frozen
 ) -> TaskComparison:
     """Return the comparison of runs, grouped over environments, by the metric chosen or the return."""
     groups, notes = grouped(series, by, across_tasks=True)
-    return compare_tasks(groups, metric_of_tasks(groups, chosen), moment, table, notes)
+    return compare_tasks(groups, metric_of_tasks(groups, metrics), moment, table, notes)
 
 
 def compare_tasks(
@@ -190,14 +190,14 @@ def compare_tasks(
     )
 
 
-def metric_of_tasks(groups: Sequence[Group], chosen: Sequence[str]) -> tuple[str, str]:
+def metric_of_tasks(groups: Sequence[Group], metrics: Sequence[str]) -> tuple[str, str]:
     """Return the metric and line that environments are compared by: the one chosen, or the return.
 
     Raises:
         RunnerError: several are chosen, or the metric has several lines, or no run has it.
     """
-    pairs = metrics_of(groups, chosen)
-    if not chosen:
+    pairs = metrics_of(groups, metrics)
+    if not metrics:
         pairs = [pair for pair in pairs if pair[0].endswith("mean_return")] or pairs[:1]
     if len(pairs) > 1:
         names = [full_name(*pair) for pair in pairs]

@@ -66,8 +66,8 @@ def code_changes(a: Recording, b: Recording) -> list[FileChange]:
             lines = _patches(parts[0].get(path), parts[1].get(path))
         if lines:
             signs = Counter(line[:1] for line in lines if not line.startswith(("+++", "---")))
-            shown = lines[: MAX_LINES if len(changes) < MAX_FILES else 0]
-            changes.append(FileChange(path, signs["+"], signs["-"], shown, len(lines) - len(shown)))
+            kept_lines = lines[: MAX_LINES if len(changes) < MAX_FILES else 0]
+            changes.append(FileChange(path, signs["+"], signs["-"], kept_lines, len(lines) - len(kept_lines)))
     return changes
 
 

@@ -285,13 +285,13 @@ def _q_rows(cause: Cause | None, most: int) -> list[Grid]:
     if cause is not None:
         for row in cause.rows:
             orders = [sorted(range(len(values)), key=lambda j: -values[j]) for values in (row.a, row.b)]
-            shown = dict.fromkeys(j for order in orders for j in order[:most])
+            actions_in_row = dict.fromkeys(j for order in orders for j in order[:most])
             cells = []
-            for j in shown:
+            for j in actions_in_row:
                 greedy = " and ".join(name for name, order in zip("AB", orders, strict=True) if j == order[0])
                 name = f"{row.actions[j]} (greedy in {greedy})" if greedy else row.actions[j]
                 cells.append((name, f"{row.a[j]:.6g}", f"{row.b[j]:.6g}"))
-            of = f", the highest of {len(row.actions)}" if len(row.actions) > len(shown) else ""
+            of = f", the highest of {len(row.actions)}" if len(row.actions) > len(actions_in_row) else ""
             grids.append(Grid((f"Q-values of {spoken(row.agent)} there{of}", "A", "B"), cells))
     return grids
 

@@ -154,7 +154,7 @@ _MAX_GIF_FPS: Final = 50
 @export_command.command("film", short_help="A film of an episode: MP4, WebM, GIF or WebP.")
 def film_command(
     run: Run = recorded_run,
-    chosen: EpisodeRef = episode_options,
+    reference: EpisodeRef = episode_options,
     grid: tuple[int, int] | None = option(
         "--grid",
         type=GRID,
@@ -210,27 +210,27 @@ def film_command(
         path = to.path(run)
         format_of(path)
         require_new(path, to.force)
-        shown = _ranked(recording, grid) if grid else [chosen.resolved(recording)]
-        speed = fps or film.usual_speed(source_of(recording, shown[0].phase, trust)[0])
+        episodes = _ranked(recording, grid) if grid else [reference.resolved(recording)]
+        speed = fps or film.usual_speed(source_of(recording, episodes[0].phase, trust)[0])
         if path.suffix.lower() == ".gif" and speed > _MAX_GIF_FPS:
             raise click.UsageError(f"--fps: found {speed:g}, expected at most {_MAX_GIF_FPS} of a GIF.")
         opened: list[Pictures] = []
 
         def shots() -> Iterator[film.Shot]:
-            for episode in shown:
+            for episode in episodes:
                 opened.append(Pictures(recording, episode.phase, episode.number_in(recording), trust))
                 yield film.Shot(f"{run.title}: {episode.title}", opened[-1], episode.t)
 
         lengths = [
-            len(recording.phase(episode.phase).episode(episode.number_in(recording))) for episode in shown
+            len(recording.phase(episode.phase).episode(episode.number_in(recording))) for episode in episodes
         ]
-        if shown[0].t > lengths[0]:
-            raise shown[0].no_step(recording, lengths[0], shown[0].t)
+        if episodes[0].t > lengths[0]:
+            raise episodes[0].no_step(recording, lengths[0], episodes[0].t)
         longest = (
             max(lengths) if whole or not grid else min(max(lengths), int(_GRID_LENGTHS * median(lengths)))
         )
         cut = sum(length > longest for length in lengths)
-        frames = sum(min(length, longest) + 1 for length in lengths) - shown[0].t
+        frames = sum(min(length, longest) + 1 for length in lengths) - episodes[0].t
         with count_line("frames", frames) as progress, new_file(path, to.force) as temporary:
             if grid:
                 made = film.write_grid(temporary, shots(), grid[1], speed, width, progress, longest + 1)
@@ -242,13 +242,16 @@ def film_command(
     for note in notes:
         say(note)
     if cut:
-        say(f"{cut} of {len(shown)} episodes are longer than the film, {longest:,} steps; --whole shows all.")
-    what = shown[0].title if len(shown) == 1 else f"{len(shown)} episodes"
+        say(
+            f"{cut} of {len(episodes)} episodes are longer than the film, {longest:,} steps; "
+            "--whole shows all."
+        )
+    what = episodes[0].title if len(episodes) == 1 else f"{len(episodes)} episodes"
     facts = f"{made.frames:,} frames of {made.size[0]}x{made.size[1]}, {size(path.stat().st_size)}"
     reply = written(
         f"{path}: {what}, {opened[0].source}, {facts}",
         path,
-        episodes=[episode.title for episode in shown],
+        episodes=[episode.title for episode in episodes],
         source=str(opened[0].source),
         frames=made.frames,
     )

@@ -57,7 +57,7 @@ _POLL_SECONDS: Final = 0.02
 @click.command("play", cls=Command, forms=("json",))
 def play_command(
     run: Run = recorded_run,
-    chosen: EpisodeRef = episode_options,
+    reference: EpisodeRef = episode_options,
     speed: float = option(
         "--speed",
         type=Number(0, kind=float, above=True),
@@ -90,7 +90,7 @@ def play_command(
     from runner.recording.reader import open_recording
 
     with open_recording(run.recording) as recording:
-        at = chosen.resolved(recording)
+        at = reference.resolved(recording)
         played = ShownEpisode(recording, at, f"{run.title}: {at.title}")
         remarks = []
         if not recording.tabular and Values(recording).image:

@@ -175,11 +175,11 @@ def _text(run: Run, number: int) -> Iterator[Part]:
     if number > 0:
         yield ""
     if records:
-        shown = spread(records)
-        yield evaluations_grid(shown, successes)
-        if len(shown) < len(records):
+        spread_records = spread(records)
+        yield evaluations_grid(spread_records, successes)
+        if len(spread_records) < len(records):
             show = command_for(run, "show")
-            yield f"{len(shown)} of {len(records)} evaluations; `{show}` has all."
+            yield f"{len(spread_records)} of {len(records)} evaluations; `{show}` has all."
         yield ""
     yield _result(run, records[-1].episode if records else None)
 

@@ -341,11 +341,11 @@ def _thinned(x: Floats, y: Floats) -> tuple[Floats, Floats]:
         return x, y
     column = np.rint(x * _POINTS_PER_UNIT).astype(np.int64)
     starts = np.flatnonzero(np.diff(column, prepend=column[0] - 1))
-    chosen: list[int] = []
+    kept: list[int] = []
     for start, stop in itertools.pairwise([*starts.tolist(), len(x)]):
         inside = y[start:stop]
-        chosen += sorted({start, start + int(inside.argmin()), start + int(inside.argmax()), stop - 1})
-    return x[chosen], y[chosen]
+        kept += sorted({start, start + int(inside.argmin()), start + int(inside.argmax()), stop - 1})
+    return x[kept], y[kept]
 
 
 def _log_ticks(low: float, high: float) -> list[float]:

@@ -253,16 +253,16 @@ def _draw_curve(chart: Chart, panel: Panel, curve: Curve, groups: int, style: Cu
     line = panel.lines.index(curve.line)
     number = line if groups == 1 and len(panel.lines) > 1 else curve.group
     colour = series_colour(number)
-    shown = visible(curve.places, curve.middle, style)
-    if (curve.high > curve.low)[shown].any():
-        low = np.maximum(curve.low[shown], chart.y.low) if style.log_y else curve.low[shown]
-        chart.band(curve.places[shown], low, curve.high[shown], colour, opacity=0.2)
+    inside = visible(curve.places, curve.middle, style)
+    if (curve.high > curve.low)[inside].any():
+        low = np.maximum(curve.low[inside], chart.y.low) if style.log_y else curve.low[inside]
+        chart.band(curve.places[inside], low, curve.high[inside], colour, opacity=0.2)
     if style.lines and len(curve.runs) > 1:
         for run in curve.runs:
             is_visible = visible(curve.places, run, style)
             chart.line(curve.places[is_visible], run[is_visible], colour, line, width=0.6, opacity=0.5)
     if style.smooth:
-        chart.line(curve.places[shown], curve.middle[shown], colour, line, width=0.8, opacity=0.35)
+        chart.line(curve.places[inside], curve.middle[inside], colour, line, width=0.8, opacity=0.35)
     values = _shown(panel, curve, style)
     places, values = curve.places[~np.isnan(values)], values[~np.isnan(values)]
     if not len(places):

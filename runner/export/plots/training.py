@@ -132,10 +132,10 @@ def _plot(panel: _Panel, seconds: Floats, duration: float) -> Figure:
     for number, values in enumerate(usable.values()):
         is_known = ~np.isnan(values)
         places = seconds[is_known] / divisor
-        shown = values[is_known]
-        chart.line(places, shown, series_colour(number), number)
+        known_values = values[is_known]
+        chart.line(places, known_values, series_colour(number), number)
         if len(places) < 3:  # a line through one point is invisible
-            chart.markers(places, shown, series_colour(number), series_marker(number), 1.7)
+            chart.markers(places, known_values, series_colour(number), series_marker(number), 1.7)
     if len(usable) > 1:
         draw_legend(chart, chart.x.start, y.end - 8, list(usable), [*map(series_colour, range(len(usable)))])
     return Figure(chart.svg())

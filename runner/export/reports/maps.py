@@ -141,7 +141,7 @@ def situations(mdp: Mdp, state: int) -> list[Choice]:
     if any(len(texts) != len(mdp.scene["things"]) for texts in names):  # a label has a comma in it
         return []
     parts = zip(mdp.scene["things"], zip(*names, strict=True), names[state], strict=True)
-    return [Choice(thing["label"], list(dict.fromkeys(texts)), chosen) for thing, texts, chosen in parts]
+    return [Choice(thing["label"], list(dict.fromkeys(texts)), selected) for thing, texts, selected in parts]
 
 
 def situation_in_words(mdp: Mdp, state: int, free: Sequence[int]) -> str:

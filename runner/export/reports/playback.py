@@ -205,11 +205,11 @@ def playback_of(recording: Recording, at: EpisodeRef, limit: int = MAX_STEPS, fi
             return _loop_playback(recording, at, limit, first)
         number = at.number_in(recording)
         steps = steps_of(recording, at.phase, number)
-        shown = steps[first : first + limit]
-        if not len(shown):
+        part = steps[first : first + limit]
+        if not len(part):
             raise at.no_step(recording, len(steps), max(first, at.t))
-        recording.mdp.check_steps(shown, str(recording.path))
-        values = _values(recording, shown, at)
+        recording.mdp.check_steps(part, str(recording.path))
+        values = _values(recording, part, at)
         ended = ending_of(recording, at.phase, number)
         return tabular_playback(recording, at, steps, ended, values, first, limit)
 
@@ -221,8 +221,8 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
     """
     names_text = " and ".join(names)
     title = playback.title
-    shown = len(playback.reward)
-    part = "" if shown == playback.length else f" Shown are the first {shown:,} steps."
+    length = len(playback.reward)
+    part = "" if length == playback.length else f" Shown are the first {length:,} steps."
     return replace(
         playback,
         title=f"{capitalised(names_text)}: {title[0].lower()}{title[1:]}",
@@ -250,8 +250,8 @@ def tabular_playback(
     mdp = recording.mdp
     agents = recording.agents
     drawing = svg.drawing_of(recording.mdp)
-    shown = steps[first : first + limit]
-    distinct, state_of = np.unique(np.append(shown["state"], shown["next_state"][-1]), return_inverse=True)
+    part = steps[first : first + limit]
+    distinct, state_of = np.unique(np.append(part["state"], part["next_state"][-1]), return_inverse=True)
     grid = None
     if drawing is not None:
         grid = PlayerGrid(
@@ -259,14 +259,14 @@ def tabular_playback(
         )
     states = [str(word) for word in states_in_words(mdp)[distinct]]
     named = agent_actions_in_words(mdp)
-    actions = shown["action"].tolist()
+    actions = part["action"].tolist()
     taken = [actions] * len(values)
     if len(values) > 1:  # each learner has a table of its own actions
         taken = [
             list(actions_of_agent)
             for actions_of_agent in zip(*(agent_actions(mdp, action) for action in actions), strict=True)
         ]
-    time = _frame_times((shown["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
+    time = _frame_times((part["log_time"] // schema.STEP_NANOSECONDS).astype(np.int64))
     before = steps["rewards"][:first].sum(axis=0).tolist() if first else []
     return Playback(
         title=at.heading,
@@ -276,14 +276,14 @@ def tabular_playback(
         end=ENDINGS[ended],
         agents=[spoken(agent) for agent in agents],
         before=[_short(value) for value in before],
-        reward=_short_rows(shown["rewards"]),
+        reward=_short_rows(part["rewards"]),
         actions=[_words("", "action", [named[action] for action in actions])],
         texts=[Words("", "state", states, state_of.tolist())],
         time=time,
         logged=_logged_near(recording, at.phase, time),
         events=[event_in_words(name) for name in mdp.event_names],
-        event=events_of(mdp, shown).tolist(),
-        explored=shown["explored"].tolist(),
+        event=events_of(mdp, part).tolist(),
+        explored=part["explored"].tolist(),
         choices=[actions_in_words(mdp).tolist()] if len(agents) == 1 else numbered_actions(mdp),
         values=[_highest(*table) for table in zip(values, taken, strict=True)],
         grid=grid,
@@ -313,10 +313,10 @@ def _highest(values: Floats, taken: list[int]) -> dict[str, object]:
     row_of: list[int] = []
     for row, action in zip(values, taken, strict=True):
         best = np.argsort(-row, kind="stable")[:MAX_VALUES].tolist()
-        shown = best if action in best else [*best[:-1], action]
+        choices = best if action in best else [*best[:-1], action]
         if len(row) <= MAX_VALUES:
-            shown = sorted(shown)
-        pairs = tuple((int(choice), _short(float(row[choice]))) for choice in shown)
+            choices = sorted(choices)
+        pairs = tuple((int(choice), _short(float(row[choice]))) for choice in choices)
         row_of.append(rows.setdefault(pairs, len(rows)))
     return {
         "rows": list(rows),
@@ -353,11 +353,11 @@ def _loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int)
         paid = steps["rewards"].astype(np.float64)
         earlier, seen = np.searchsorted(steps["t"], [first, first - 1]).tolist()
         before += paid[:earlier].sum(axis=0)
-        shown = steps[earlier:]
+        window = steps[earlier:]
         rewards.append(paid[earlier:])
-        log_times.append(shown["log_time"].astype(np.int64))
-        numbers.append(shown["step"])
-        actions += map(in_words, shown)
+        log_times.append(window["log_time"].astype(np.int64))
+        numbers.append(window["step"])
+        actions += map(in_words, window)
         if seen < len(steps):
             after = observed(recording, steps[seen:])
             observations.append([part.column(after) for part in parts])
@@ -428,7 +428,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
     """Return what is shown of the observations, and a sentence on each thing that is not."""
     agents = recording.agents if len(recording.agents) > 1 else ()
     leaves = leaves_of(recording.spaces["observation"], f"{recording.path}: the observation space")
-    shown = []
+    parts = []
     notes = []
     unseen = 0
     known = observation_names(recording)
@@ -439,7 +439,7 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         skip = 1 if agent else 0
         name = ".".join(leaf.path[skip:])
         if leaf.dtype is None:
-            shown.append(_ShownPart(agent, (name,), leaf))
+            parts.append(_ShownPart(agent, (name,), leaf))
             continue
         shape = leaf.dtype.shape
         count = math.prod(leaf.dtype.shape)
@@ -452,10 +452,10 @@ def _shown_parts(recording: Recording) -> tuple[list[_ShownPart], list[str]]:
         unseen += count - taken
         names = tuple(islice(number_names(leaf, "", skip, known), taken))
         if names:
-            shown.append(_ShownPart(agent, names, leaf))
+            parts.append(_ShownPart(agent, names, leaf))
     if unseen:
         notes.append(f"{unseen:,} more numbers of each observation are in the recording")
-    return shown, notes
+    return parts, notes
 
 
 def _sizes(shape: tuple[int, ...]) -> str:
@@ -473,9 +473,9 @@ def _frames(
     for i, part in enumerate(parts):
         columns = [observation[i] for observation in observations]
         if part.leaf.dtype is None:
-            shown = [text for column in columns for text in column]
-            unknown = [""] * (frames - len(shown))
-            texts.append(_words(part.agent, part.names[0] or "observation", unknown + shown))
+            column_texts = [text for column in columns for text in column]
+            unknown = [""] * (frames - len(column_texts))
+            texts.append(_words(part.agent, part.names[0] or "observation", unknown + column_texts))
             continue
         numbers = np.concatenate(columns).astype(np.float64)
         for name, series_values in zip(part.names, numbers.T.tolist(), strict=True):
@@ -498,8 +498,8 @@ def _extras(
     for name, values in by_name.items():
         agent = next((candidate for candidate in agents if name.startswith(f"{candidate}/")), "")
         if values.dtype.hasobject:
-            shown = [_shortened(value) for value in filled(values).tolist()]
-            texts.append(_words(agent, name.removeprefix(f"{agent}/"), [*shown, ""]))
+            cells = [_shortened(value) for value in filled(values).tolist()]
+            texts.append(_words(agent, name.removeprefix(f"{agent}/"), [*cells, ""]))
             continue
         shape = values.shape[1:]
         columns = values.reshape(len(steps), -1)

@@ -56,7 +56,7 @@ def require_packages() -> None:
 
 def render_report(
     recordings: Sequence[Path],
-    chosen: Sequence[EpisodeRef] = (),
+    references: Sequence[EpisodeRef] = (),
     progress: Tell = lambda _: None,
     axis: Axis = EPISODES,
     style: CurveStyle = PLAIN,
@@ -73,7 +73,7 @@ def render_report(
         progress(f"reading run {count} of {len(recordings)}")
         with open_recording(path) as recording:
             series.append(read_series(recording, axis))
-            runs.append(_run(recording, chosen, progress))
+            runs.append(_run(recording, references, progress))
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
@@ -107,10 +107,10 @@ def render_report(
     return page, [*notes, *values_left_out(series)]
 
 
-def _run(recording: Recording, chosen: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
+def _run(recording: Recording, references: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
     details = describe_recording(run_at(recording.path), recording)
     records = details.evaluations
-    episodes = _episodes(recording, chosen)
+    episodes = _episodes(recording, references)
     player = _player(recording, episodes, progress)
     notes = shortcomings(recording)
     if not recording.has_actions:
@@ -187,7 +187,7 @@ def _lead(recording: Recording, last: EvaluationRecord | None) -> Iterator[str]:
         )
 
 
-def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[EpisodeRef, list[str]]:
+def _episodes(recording: Recording, references: Sequence[EpisodeRef]) -> dict[EpisodeRef, list[str]]:
     """Return the episodes to show, each with the reasons for it.
 
     They are the chosen ones; the typical, the best and the worst one of the last evaluation, or else of the
@@ -197,7 +197,7 @@ def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[Episod
         return {}
     last = last_whole_evaluation(recording)
     ended = recording.train.episodes.count()
-    reasons = [(at.resolved(recording), "chosen") for at in chosen]
+    reasons = [(at.resolved(recording), "chosen") for at in references]
     if last is not None:
         worst, typical, best = ranked(recording, "eval", last.start, last.stop)
         reasons += [(typical, "typical trial"), (best, "best trial"), (worst, "worst trial")]
@@ -218,19 +218,19 @@ def _episodes(recording: Recording, chosen: Sequence[EpisodeRef]) -> dict[Episod
 
 def _player(recording: Recording, episodes: Mapping[EpisodeRef, list[str]], progress: Tell) -> Player | None:
     """Return what the page replays; None if no episode can be."""
-    shown = []
+    playbacks = []
     for at, names in episodes.items():
         try:
-            shown.append((at, titled(playback_of(recording, at), names)))
+            playbacks.append((at, titled(playback_of(recording, at), names)))
         except RecordingError:  # its steps may have been cut off, or never recorded
             if "chosen" in names:
                 raise
-    if not shown:
+    if not playbacks:
         return None
     picture = ""
     key = ""
     is_broad = False
-    first = shown[0][1]
+    first = playbacks[0][1]
     scene = recording.environment["scene"]
     if first.grid is not None and scene is not None:
         drawing = svg.SvgDrawing(scene)
@@ -240,15 +240,15 @@ def _player(recording: Recording, episodes: Mapping[EpisodeRef, list[str]], prog
         is_broad = drawing.width > svg.BROAD
     data = []
     has_frames = False
-    for i, (at, episode) in enumerate(shown, 1):
+    for i, (at, episode) in enumerate(playbacks, 1):
         images = Thumbnails()
         if episode.grid is None:
-            progress(f"pictures of episode {i} of {len(shown)}")
+            progress(f"pictures of episode {i} of {len(playbacks)}")
             images = thumbnails(recording.path, at.phase, at.number_in(recording), len(episode.reward) + 1)
             images.picture_note = images.picture_note or picture_note(recording, at.phase)[1]
         has_frames = has_frames or bool(images.pictures)
         data.append(episode.as_json() | asdict(images))
-    titles = [episode.title for _, episode in shown]
+    titles = [episode.title for _, episode in playbacks]
     return Player(titles, picture, key, embedded(data), has_frames, is_broad)
 
 

@@ -184,25 +184,25 @@ class LoopTracks:
         sources = {number: pictures.source_of(recording, phase, trust, number) for number in episodes}
         notes = sorted({f"No {phase} pictures: {reason}" for _, reason in sources.values() if reason})
         redrawable = pictures.PictureSource.REDRAWN
-        chosen = [number for number, (source, _) in sources.items() if source is redrawable]
+        numbers = [number for number, (source, _) in sources.items() if source is redrawable]
         number = 0
         try:
-            if chosen:
-                for number, t, pixels in redrawn(recording, phase, chosen, trust):
+            if numbers:
+                for number, t, pixels in redrawn(recording, phase, numbers, trust):
                     if t == 0:
                         after = [
                             time // schema.STEP_NANOSECONDS for time in log_times_of(recording, phase, number)
                         ]
                         times = [after[0] - 1, *after]
                         place = self._of_phase.episode(number).place
-                        count = f"{chosen.index(number) + 1:,} of {len(chosen):,}"
+                        count = f"{numbers.index(number) + 1:,} of {len(numbers):,}"
                         self._writer.stage(f"drawing {phase} episode {count}")
                     if self._is_later(place, times[t]):
                         yield self._frame(place, times[t], _picture(encoded_picture(pixels)))
                     if t == len(after):  # nothing is shown until the next picture
                         yield self._frame(place, times[t] + recording.environments, rr.Clear(recursive=False))
         except CannotRedo as error:
-            notes.append(f"No {phase} pictures from episode {number or chosen[0]} on: {error}")
+            notes.append(f"No {phase} pictures from episode {number or numbers[0]} on: {error}")
         for note in notes:
             selection.warnings.append(note)
             yield Track("log", view=LOG, row=(self._writer.last, rr.TextLog(note, level="WARN")))
@@ -216,10 +216,10 @@ class LoopTracks:
         self._pictured[environment] = step
         return before < step
 
-    def _frame(self, environment: int, step: int, shown: rr.AsComponents) -> Track:
+    def _frame(self, environment: int, step: int, picture: rr.AsComponents) -> Track:
         entity = _entity(self._phase, self._environment(environment), "frame")
         view = TrackView(self._phase, entity.replace("/", " "), rrb.Spatial2DView)
-        return Track(entity, view=view, row=(step, shown))
+        return Track(entity, view=view, row=(step, picture))
 
     def _environment(self, number: int) -> str:
         return f"env_{number}" if self._recording.environments > 1 else ""

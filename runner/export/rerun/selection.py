@@ -144,28 +144,28 @@ def select(recording: Recording, request: Request) -> Selection:
         selection.warnings.append("Observations and actions vary in size (texts): they are not drawn.")
     train, evals = (episodes_of(recording, phase) for phase in schema.PHASES)
     available, where = evaluations_with_steps(recording), str(recording.path)
-    chosen = [evaluation_after(available, after, where) for after in sorted(set(request.evaluations))]
+    selected = [evaluation_after(available, after, where) for after in sorted(set(request.evaluations))]
     numbers = _asked_episodes(request, len(train.start), where)
     whole_ranges([(number, number + 1) for number in request.trials], len(evals.start), "eval", where)
     asked = {"train": numbers, "eval": np.array(request.trials, int)}
     if not request.everything:
-        trials = asked["eval"] if request.trials else _trials(chosen)
+        trials = asked["eval"] if request.trials else _trials(selected)
         spans = train.steps_of(numbers), evals.steps_of(trials)
         times = [
             time_of(phase.steps.one(step))
-            for phase, shown in zip(recording.phases, spans, strict=True)
-            if shown
-            for step in (shown[0][0], shown[-1][-1])
+            for phase, ranges in zip(recording.phases, spans, strict=True)
+            if ranges
+            for step in (ranges[0][0], ranges[-1][-1])
         ]
         selection.focus = (min(times), max(times)) if times else None
     if request.is_default:
         numbers = np.union1d(numbers, _default_episodes(train.lengths))
     if is_job:
-        chosen += available if request.everything else available[-1:] if request.is_default else []
-        chosen = [evaluation for evaluation in available if evaluation in chosen]
-    selection.by_phase = {"train": train.steps_of(numbers), "eval": evals.steps_of(_trials(chosen))}
+        selected += available if request.everything else available[-1:] if request.is_default else []
+        selected = [evaluation for evaluation in available if evaluation in selected]
+    selection.by_phase = {"train": train.steps_of(numbers), "eval": evals.steps_of(_trials(selected))}
     if is_job:
-        _describe_job(selection, request, numbers, len(train.start), available, chosen)
+        _describe_job(selection, request, numbers, len(train.start), available, selected)
         if unknown := _steps_without_values(recording, selection.by_phase["train"]):
             selection.warnings.append(
                 f"{unknown:,} of these training steps are exported without Q-values: steps before them were "
@@ -311,7 +311,7 @@ def _select_drawn(
     """Choose the episodes that are drawn: those asked for, by default a few of each environment."""
     n = recording.environments
     total = 0
-    shown = min(n, MAX_MEMBERS)
+    members = min(n, MAX_MEMBERS)
     for phase in schema.PHASES:
         if not recording.phase(phase).steps:
             continue
@@ -321,10 +321,10 @@ def _select_drawn(
         if n > 1:
             places = recording.phase(phase).episodes.array(0, len(lengths))["environment"]
         if request.is_default:
-            for environment in range(shown):
+            for environment in range(members):
                 in_environment = np.flatnonzero(places == environment)
                 numbers.append(
-                    in_environment[_default_episodes(lengths[in_environment], FRAME_STEPS // shown)]
+                    in_environment[_default_episodes(lengths[in_environment], FRAME_STEPS // members)]
                 )
         selection.drawn[phase] = np.unique(np.concatenate(numbers)).tolist()
         total += len(lengths)
@@ -352,9 +352,9 @@ def locate(run: Run, request: Request, step: EpisodeRef | None) -> Location:
     """
     with open_recording(run.recording) as recording:
         if step is None:
-            shown = select(recording, request).by_phase
-            phase = next((phase for phase in ("eval", "train") if shown[phase]), "")
-            time = time_of(recording.phase(phase).steps.one(shown[phase][-1].start)) if phase else 0
+            by_phase = select(recording, request).by_phase
+            phase = next((phase for phase in ("eval", "train") if by_phase[phase]), "")
+            time = time_of(recording.phase(phase).steps.one(by_phase[phase][-1].start)) if phase else 0
             return Location(time, request)
         require_steps(recording, "look at")
         step = step.resolved(recording)

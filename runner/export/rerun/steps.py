@@ -375,8 +375,8 @@ class ValueTracks:
         bars[:, :, 0, 0] = BAR_LEFT
         bars[:, :, 1, 0] = BAR_LEFT + np.ceil((q - low[:, agent]) * scale[:, agent]) / _BAR_FRACTION
         bars[..., 1] = self._y[:, None]
-        shown = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
-        yield Track(f"{self._phase}/q", batch.times, [*scalars(q), *shown])
+        labels_and_bars = [*columns(rr.Points2D, class_ids=classes), *columns(rr.LineStrips2D, strips=bars)]
+        yield Track(f"{self._phase}/q", batch.times, [*scalars(q), *labels_and_bars])
         if len(rows := batch.map_rows):  # the points never change, but are cleared with the rest
             points = repeated(self._points, len(rows))
             yield Track(f"{self._phase}/q", batch.at(rows), columns(rr.Points2D, positions=points))
@@ -449,7 +449,7 @@ class MapTracks:
             return
         times = batch.at(batch.map_rows)
         maps = (batch.value_maps, batch.greedy_maps)
-        values, greedy = (shown[:, self._learner][:, self._order] for shown in maps)
+        values, greedy = (agent_map[:, self._learner][:, self._order] for agent_map in maps)
         with np.errstate(all="ignore"):
             low, high = np.nanmin(values, axis=1), np.nanmax(values, axis=1)
         ranges = np.stack((low, np.where(high > low, high, low + 1)), axis=1).astype(np.float64)
@@ -468,6 +468,6 @@ class MapTracks:
             for time, context in zip(times["step"].tolist(), contexts, strict=True)
         ]
         moves = columns(rr.Arrows2D, vectors=vectors)
-        for part, shown in (("", image), ("/moves", moves), ("/stops", stops)):
-            yield Track(path + part, times, shown)
+        for part, image_or_labels in (("", image), ("/moves", moves), ("/stops", stops)):
+            yield Track(path + part, times, image_or_labels)
         yield text_track(f"{path}/label", times, (placements.width / 2, MAP_LABEL_Y), labels)

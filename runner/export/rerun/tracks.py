@@ -122,9 +122,9 @@ class Writer:
             if view := track.view:
                 self.views.setdefault((view.group, view.name), (view, {}))[1][entity] = None
             if track.row:
-                step, shown = track.row
+                step, components = track.row
                 self.stream.set_time("step", sequence=step)
-                self.stream.log(entity, shown)
+                self.stream.log(entity, components)
             if track.times:
                 steps = track.times["step"]
                 if "episode" in track.times:
@@ -237,9 +237,9 @@ def _alone(run: Writer) -> rrb.Container:
     columns: list[tuple[Shown, float]] = []
     values = _group(run, VALUES)
     if left:
-        shown, heights = zip(*left, strict=True)
+        rows, heights = zip(*left, strict=True)
         is_wide = values or max(run.recording.environments, len(run.recording.agents)) > 1
-        columns.append((rrb.Vertical(*shown, row_shares=heights), 3.0 if is_wide else 2.0))
+        columns.append((rrb.Vertical(*rows, row_shares=heights), 3.0 if is_wide else 2.0))
     if values:
         table, *maps = values
         below: list[Shown] = [rrb.Horizontal(*maps)] if len(maps) > 1 else [*maps]
@@ -253,9 +253,9 @@ def _compared(jobs: Sequence[Writer]) -> rrb.Container:
     last = max(job.last for job in jobs)
     plots = []
     for title in dict.fromkeys(PLOTS.values()):
-        if shown := [job.views[OVERVIEW, title] for job in jobs if (OVERVIEW, title) in job.views]:
-            entities = [entity for _, of_job in shown for entity in of_job]
-            plots.append(_drawn(shown[0][0], "/", entities, last))
+        if views := [job.views[OVERVIEW, title] for job in jobs if (OVERVIEW, title) in job.views]:
+            entities = [entity for _, of_job in views for entity in of_job]
+            plots.append(_drawn(views[0][0], "/", entities, last))
     halves = [
         rrb.Horizontal(*grid, rrb.Tabs(*_group(job, VALUES, "events")), name=job.title)
         for job in jobs

@@ -79,28 +79,28 @@ class CatalogueIndex:
         folders = self._database.execute(f"SELECT problem FROM runs WHERE {where}", self.roots)
         return [problem for (problem,) in folders]
 
-    def select(self, chosen: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> list[IndexRow]:
+    def select(self, run_filter: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> list[IndexRow]:
         """Return the rows that match a filter; arguments as for `rows`."""
-        return list(self.rows(chosen, *order, columns=columns))
+        return list(self.rows(run_filter, *order, columns=columns))
 
-    def rows(self, chosen: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> Iterator[IndexRow]:
+    def rows(self, run_filter: Filter, *order: Sql, columns: Sequence[str] = ("*",)) -> Iterator[IndexRow]:
         """Yield the rows that match a filter, the newest first.
 
         Args:
             order: what to sort by before the age.
             columns: the stored columns that are needed; all by default.
         """
-        self._check_settings(chosen)
-        return _as_rows(self._query(", ".join(columns), chosen, _ordered(*order, _ALL_NEWEST)))
+        self._check_settings(run_filter)
+        return _as_rows(self._query(", ".join(columns), run_filter, _ordered(*order, _ALL_NEWEST)))
 
-    def count(self, chosen: Filter = ANY_RUN) -> int:
+    def count(self, run_filter: Filter = ANY_RUN) -> int:
         """Return how many rows match a filter."""
-        self._check_settings(chosen)
-        return int(self._query("COUNT(*)", chosen).fetchone()[0])
+        self._check_settings(run_filter)
+        return int(self._query("COUNT(*)", run_filter).fetchone()[0])
 
     def page(
         self,
-        chosen: Filter,
+        run_filter: Filter,
         *order: Sql,
         limit: int | None,
         offset: int = 0,
@@ -112,16 +112,16 @@ class CatalogueIndex:
             limit: the maximum number of rows; None for all.
         """
         if limit is None:
-            every = self.select(chosen, *order, columns=columns)
+            every = self.select(run_filter, *order, columns=columns)
             return every[offset:], len(every)
-        self._check_settings(chosen)
+        self._check_settings(run_filter)
         ordered = _ordered(*order, _NEWEST)
-        if chosen.condition is None:  # counted in an index of SQLite, without reading the rows
+        if run_filter.condition is None:  # counted in an index of SQLite, without reading the rows
             part = Sql(f"{ordered.text} LIMIT ? OFFSET ?", (*ordered.values, limit, offset))
-            places = self._query("root, entry", chosen, part).fetchall()
-            total = self.count(chosen)
+            places = self._query("root, entry", run_filter, part).fetchall()
+            total = self.count(run_filter)
         else:  # a filter may be slow: it is evaluated once for each row
-            places = self._query("root, entry", chosen, ordered).fetchall()
+            places = self._query("root, entry", run_filter, ordered).fetchall()
             places, total = places[offset : offset + limit], len(places)
         select = f"SELECT {', '.join(columns)} FROM runs WHERE root = ? AND entry = ?"
         return [row for place in places for row in _as_rows(self._database.execute(select, place))], total
@@ -238,10 +238,10 @@ class CatalogueIndex:
         """Return the newest runs, of a name if one is given."""
         return self._names(Sql("name = ?", (text(name),)) if name else None, limit)
 
-    def candidates(self, chosen: Filter) -> list[Candidate]:
+    def candidates(self, run_filter: Filter) -> list[Candidate]:
         """Return the runs that match a filter, the newest first."""
-        self._check_settings(chosen)
-        return self._names(chosen.condition)
+        self._check_settings(run_filter)
+        return self._names(run_filter.condition)
 
     def _names(self, condition: Sql | None, limit: int = -1) -> list[Candidate]:
         columns = "root, entry, id AS run_id, name, seed, created AS milliseconds"
@@ -253,22 +253,22 @@ class CatalogueIndex:
         """The condition on a root to be one of these folders, whose parameters they are."""
         return f"IN ({', '.join('?' * len(self.roots))})"
 
-    def _query(self, columns: str, chosen: Filter, part: Sql = Sql("")) -> sqlite3.Cursor:  # noqa: B008 - frozen
+    def _query(self, columns: str, run_filter: Filter, part: Sql = Sql("")) -> sqlite3.Cursor:  # noqa: B008 - frozen
         """Select columns of the runs that match a filter; `part` follows the condition."""
-        condition = chosen.condition or Sql("TRUE")
+        condition = run_filter.condition or Sql("TRUE")
         return self._database.execute(
             f"SELECT {columns} FROM runs WHERE root {self._is_here} AND id IS NOT NULL "
             f"AND {condition.text} {part.text}",
             (*self.roots, *condition.values, *part.values),
         )
 
-    def _check_settings(self, chosen: Filter) -> None:
+    def _check_settings(self, run_filter: Filter) -> None:
         """Refuse a filter with a path that no configuration has.
 
         Raises:
             RunnerError: it has one; the message suggests a similar path.
         """
-        for path, lines in sorted(chosen.settings):
+        for path, lines in sorted(run_filter.settings):
             kind = Sql("json_type(settings, ?) IS NOT NULL", (setting_path(path),))
             if self._query("1", Filter(kind), Sql("LIMIT 1")).fetchone() or not self.count():
                 continue

@@ -213,15 +213,15 @@ class Criteria:
 
 def unwanted(index: CatalogueIndex, criteria: Criteria, now: float) -> tuple[list[IndexRow], Counter[str]]:
     """Return the rows that meet the criteria, and how many more do but are protected, by reason."""
-    chosen = criteria.filter
+    run_filter = criteria.filter
     if criteria.older_than is not None:
         latest = int((now - criteria.older_than) * 1000)
-        chosen = chosen.also(Sql("created < ?", (latest,)))
+        run_filter = run_filter.also(Sql("created < ?", (latest,)))
     if criteria.keep_last is not None:
-        chosen = chosen.also(Sql(_OLDER, (json.dumps(index.roots), criteria.keep_last)))
+        run_filter = run_filter.also(Sql(_OLDER, (json.dumps(index.roots), criteria.keep_last)))
     going = []
     staying = Counter[str]()
-    for row in index.select(chosen, columns=_COLUMNS):
+    for row in index.select(run_filter, columns=_COLUMNS):
         if criteria.statuses and row["status"] not in criteria.statuses:
             continue
         if row["status"] == "running":

@@ -176,7 +176,7 @@ class Sums:
 
 def usage_of(
     read: Callable[[Callable[[CatalogueIndex], list[IndexRow]]], list[IndexRow]],
-    chosen: Filter,
+    run_filter: Filter,
     limit: int | None,
 ) -> tuple[list[Usage], Sums]:
     """Return the runs that use most of the disk, the largest first, and the sums over all runs.
@@ -189,7 +189,7 @@ def usage_of(
     """
     exports = cached(CACHED_EXPORTS) + cached(CACHED_TABLES) + cached(CACHED_EPISODES)
     restored = cached(CACHED_RECORDINGS)
-    rows = read(lambda index: index.with_same_as(index.select(chosen, columns=_COLUMNS)))
+    rows = read(lambda index: index.with_same_as(index.select(run_filter, columns=_COLUMNS)))
     checkpoints = {root: Store(Path(root)).sizes() for root in {row["root"] for row in rows}}
     sums = Sums()
 

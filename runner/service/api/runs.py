@@ -74,11 +74,11 @@ async def list_runs(
 
     def make() -> bytes:
         condition, order = parse(filter), order_of(sort)
-        shown = columns_of(columns) if columns else DEFAULT_JSON
+        names = columns_of(columns) if columns else DEFAULT_JSON
 
         def work(index: CatalogueIndex) -> Json:
             rows, total = index.page(condition, *order, limit=limit, offset=offset)
-            runs = [row_as_json(row, shown) for row in index.with_same_as(rows)]
+            runs = [row_as_json(row, names) for row in index.with_same_as(rows)]
             return {"runs": runs, "total": total, "offset": offset, "limit": limit}
 
         return json.dumps(catalogue.read(work), ensure_ascii=False).encode()

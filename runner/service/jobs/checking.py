@@ -211,8 +211,8 @@ def check_branch(run: Run, question: BranchQuestion) -> CheckedJob:
     from runner.debugging.branch import MAX_STEPS, branches_training, default_name  # slow to import
 
     at = EpisodeRef.parse(question.at)
-    chosen = question.overrides, question.episodes, question.policy, question.seed
-    is_trained = branches_training(run, at, *chosen, MAX_STEPS)
+    changes = question.overrides, question.episodes, question.policy, question.seed
+    is_trained = branches_training(run, at, *changes, MAX_STEPS)
     with open_recording(run.recording) as recording:
         if is_trained:
             action: Any = question.action

@@ -412,13 +412,13 @@ def _sweep_reporter(channel: JobChannel) -> Callable[[SweepStatus], None]:
     def report(status: SweepStatus) -> None:
         nonlocal last
         best = status.best
-        shown = None
+        best_trial = None
         if best is not None:
             if best.number != last:
                 last = best.number
                 channel.send(LogEvent(f"trial {best.number} is the best so far: {best.value:g}"))
             # A level that was never reached is infinite or None; JSON has no infinity.
-            shown = BestTrial(best.number, finite(best.value), best.values)
+            best_trial = BestTrial(best.number, finite(best.value), best.values)
         event = SweepProgress(
             done=status.done,
             runs=status.runs,
@@ -426,7 +426,7 @@ def _sweep_reporter(channel: JobChannel) -> Callable[[SweepStatus], None]:
             pruned=status.pruned,
             failed=status.failed,
             bytes=status.bytes,
-            best=shown,
+            best=best_trial,
         )
         channel.send(event)
 

@@ -97,13 +97,13 @@ def chosen_runs(
     Raises:
         RunnerError: there are fewer than two of them, or too many.
     """
-    named = [found for text in name or () for found in catalogue.find_all(text)]
-    runs = {found.folder: found for found in [*map(catalogue.find, run or ()), *named]}
+    named = [match for text in name or () for match in catalogue.find_all(text)]
+    runs = {match.folder: match for match in [*map(catalogue.find, run or ()), *named]}
     if not 2 <= len(runs) <= MAX_RUNS:
         raise RunnerError(
             f"found {counted(len(runs), 'run')}, expected 2 to {MAX_RUNS}: select them in the table of runs."
         )
-    return [recorded_run(found) for found in runs.values()]
+    return [recorded_run(match) for match in runs.values()]
 
 
 ChosenRuns = Annotated[list[Run], Depends(chosen_runs)]

@@ -288,7 +288,7 @@ async def what_if(
 def _values(recording: Recording, run: Run, at: EpisodeRef, catalogue: Catalogue) -> dict[str, object]:
     """Return the values of the page of an episode but its stage."""
     episodes, is_job = recording.train.known_episodes(), recording.can_train_again
-    evaluations = {found.after: found.trials for found in evaluations_of(recording)}
+    evaluations = {evaluation.after: evaluation.trials for evaluation in evaluations_of(recording)}
     count = episodes if at.after is None else evaluations.get(at.after, 0)
     base = f"/runs/{run.run_id}"
 
@@ -364,13 +364,13 @@ def _environments(run: Run, at: EpisodeRef) -> dict[str, object]:
     """Return the values of the page: an episode, and the other environments' episodes at its first step."""
     base = f"/runs/{run.run_id}/replay"
     with open_recording(run.recording) as recording:
-        shown = at.number_in(recording)
-        steps = recording.phase(at.phase).episode(shown)
+        shown_number = at.number_in(recording)
+        steps = recording.phase(at.phase).episode(shown_number)
         turns = steps.table.round_of(steps.first)
         # The first trial of the evaluation, within which trials are numbered.
-        first = shown - at.episode
+        first = shown_number - at.episode
         panels = []
-        for environment, number in _episodes_at(recording, at.phase, steps, shown)[:MAX_PANELS]:
+        for environment, number in _episodes_at(recording, at.phase, steps, shown_number)[:MAX_PANELS]:
             begun = steps.table.round_of(recording.phase(at.phase).episode(number).first)
             path = replace(at, episode=number - first, t=0).episode_path
             name = "trial" if at.after is not None else "episode"

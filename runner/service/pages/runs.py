@@ -141,8 +141,8 @@ def _values(
     catalogue: Catalogue, text: str, sort: str, columns: str, by_name: bool, number: int
 ) -> dict[str, object]:
     condition, order = parse(text), order_of(sort)
-    shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
-    is_usual = list(shown) == list(USUAL)
+    names_shown = columns_of(columns) if columns.strip(", ") else list(USUAL)
+    is_usual = list(names_shown) == list(USUAL)
 
     def work(index: CatalogueIndex) -> tuple[list[tuple[IndexRow, int]], int, int, int]:
         offset, all_runs = (number - 1) * ROWS, index.count()
@@ -155,19 +155,28 @@ def _values(
     counted, pages_of, total, all_runs = catalogue.read(work)
     rows = [row for row, _ in counted]
     grouping = "" if by_name or text else "none"
-    query = {"filter": text, "sort": sort, "columns": "" if is_usual else ",".join(shown), "group": grouping}
+    query = {
+        "filter": text,
+        "sort": sort,
+        "columns": "" if is_usual else ",".join(names_shown),
+        "group": grouping,
+    }
     if is_usual and any(row["mean_return"] is not None for row in rows):
-        shown = [*shown[: shown.index("mean_length")], "mean_return", *shown[shown.index("mean_length") :]]
+        names_shown = [
+            *names_shown[: names_shown.index("mean_length")],
+            "mean_return",
+            *names_shown[names_shown.index("mean_length") :],
+        ]
     folded = FOLDED if is_usual else ()
     table = RunsTable(
-        headings=[_heading(column, query, column in folded) for column in shown],
-        rows=[(row, runs, [_cell(row, column, runs) for column in shown]) for row, runs in counted],
+        headings=[_heading(column, query, column in folded) for column in names_shown],
+        rows=[(row, runs, [_cell(row, column, runs) for column in names_shown]) for row, runs in counted],
         total=total,
         all_runs=all_runs,
         paging=Paging(number, pages_of, ROWS, link("/runs", query)),
         other_grouping="" if text else link("/runs", {**query, "group": "none" if by_name else "name"}),
     )
-    return _search(text, sort, shown, query["columns"], table)
+    return _search(text, sort, names_shown, query["columns"], table)
 
 
 def _search(

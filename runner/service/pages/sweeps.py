@@ -131,13 +131,13 @@ def explanation(pair: Part, metric: Part, settings: SettingsOf) -> Response:
     """Show an explanation."""
     result = found_explanation(pair, metric, settings)
     first, *others = drawn_sections(result)
-    shown = [replace(first, title="", links=_links(result)), *others]
-    return Page("explanation.html", {"title": first.title, "answer": shown})
+    sections = [replace(first, title="", links=_links(result)), *others]
+    return Page("explanation.html", {"title": first.title, "answer": sections})
 
 
-def _links(found: Explanation) -> list[Link]:
+def _links(explanation: Explanation) -> list[Link]:
     """Return the replays of the first step that the strongest setting changed, without and with it."""
-    first = found.first_step
+    first = explanation.first_step
     if first is None or first.episode is None:
         return []
     step = EpisodeRef(first.episode, first.t or 0)
