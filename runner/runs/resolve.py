@@ -53,10 +53,7 @@ def find_run(
         return run
     from runner.runs.catalogue.index import look
 
-    def matches(quick: bool) -> list[Candidate]:
-        return look([folder], lambda index: matching(name, index, exclude), report, quick=quick)
-
-    candidates = matches(quick=True) or matches(quick=False)
+    candidates = look([folder], lambda index: matching(name, index, exclude), report)
     if not candidates:
         raise look([folder], lambda index: not_found(name, index, folder), report, cached=True)
     match = choose(name, candidates, newest)
@@ -94,7 +91,7 @@ def find_runs(name: str, recordings: Path, report: Tell) -> list[Run]:
         if not matches:
             raise RunNotFound(f"no run in {recordings} matches {name}. `dualtaxi ls` lists the runs.")
         return [candidate.run(recordings) for candidate in reversed(matches)]
-    runs = look([recordings], lambda index: of_name(name, index), report, quick=True)
+    runs = look([recordings], lambda index: of_name(name, index), report)
     return [candidate.run(recordings) for candidate in runs] or [find_run(name, recordings, report=report)]
 
 
@@ -102,7 +99,7 @@ def run_with_id(run_id: str, recordings: Path) -> Run | None:
     """Return the run with an id, whatever its folder is called; None if there is none."""
     from runner.runs.catalogue.index import look
 
-    candidates = look([recordings], lambda index: matching(run_id, index), quick=True)
+    candidates = look([recordings], lambda index: matching(run_id, index))
     place = next((recordings / run.entry for run in candidates if run.run_id == run_id), None)
     return run_in(place) if place else None
 
@@ -185,7 +182,7 @@ def completions(beginning: str, recordings: Path) -> dict[str, str]:
                 meanings[f"{name}{LATEST}"] = "the newest of this name"
         return {text: meaning for text, meaning in meanings.items() if text.startswith(beginning)}
 
-    return look([recordings], work, quick=True)
+    return look([recordings], work)
 
 
 def _is_path(name: str) -> bool:

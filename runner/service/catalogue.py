@@ -23,8 +23,8 @@ MIN_INTERVAL: Final = 1.0
 INTERVAL_FACTOR: Final = 20
 """The interval between scans in units of their duration: they take a twentieth of the time."""
 MAX_INTERVAL: Final = 5.0
-FULL_INTERVAL: Final = 60.0
-"""Time between scans that also find files changed in place, which take three times as long."""
+MAX_AGE: Final = 60.0
+"""`can_list` starts a scan if the last one began longer ago."""
 FIRST_SCAN_SECONDS: Final = 1.0
 """How long `can_list` waits for the first scan."""
 NEVER: Final = float("-inf")
@@ -43,7 +43,6 @@ class Catalogue:
         self._started = NEVER
         self._changed = NEVER
         self._scanned = NEVER
-        self._fully_scanned = NEVER
         self._duration = 0.0
         self._scanned_version = NOTHING
 
@@ -79,7 +78,7 @@ class Catalogue:
 
     def can_list(self) -> bool:
         """Return whether runs can be listed, according to the last scan; waits for the first scan only."""
-        if self._scanned == NEVER or time.monotonic() - self._started > FULL_INTERVAL:
+        if self._scanned == NEVER or time.monotonic() - self._started > MAX_AGE:
             self.start_scan()
         latest = self._scan
         try:
@@ -126,14 +125,10 @@ class Catalogue:
 
     def _do_scan(self) -> None:
         began = time.monotonic()
-        is_full = began - self._fully_scanned > FULL_INTERVAL
-        look(self.roots, lambda _: None, self._log, quick=not is_full)
+        look(self.roots, lambda _: None, self._log)
         self._scanned_version = version() or NOTHING
         self._scanned = began
-        if is_full:
-            self._fully_scanned = began
-        else:
-            self._duration = time.monotonic() - began
+        self._duration = time.monotonic() - began
 
 
 def _refuse_path(name: str) -> None:

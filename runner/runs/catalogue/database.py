@@ -46,7 +46,6 @@ STORED: Final = {
     "root": "TEXT NOT NULL",  # the recordings folder, absolute
     "entry": "TEXT NOT NULL",  # the run's folder in it
     "fingerprint": "TEXT NOT NULL",  # changes with every change of its files
-    "mark": "TEXT NOT NULL",  # changes when a file in it is created, replaced or removed
     # whether they had not just changed; if they had, they may change again with the same time
     "stable": "INTEGER NOT NULL",
     "problem": "TEXT",
@@ -195,7 +194,7 @@ _APPLICATION: Final = 0x44546178  # "DTax"
 _SCHEMA: Final = (
     f"CREATE TABLE runs ({', '.join(' '.join(column) for column in STORED.items())}, "
     "PRIMARY KEY (root, entry)) WITHOUT ROWID",
-    "CREATE INDEX runs_states ON runs (root, entry, fingerprint, mark, stable, status)",
+    "CREATE INDEX runs_states ON runs (root, entry, fingerprint, stable, status)",
     "CREATE INDEX runs_ids ON runs (id)",
     "CREATE INDEX runs_digests ON runs (digest)",
     "CREATE INDEX runs_parents ON runs (parent)",
@@ -296,23 +295,17 @@ def pragma(database: sqlite3.Connection, name: str) -> int:
 
 @contextlib.contextmanager
 def transaction(database: sqlite3.Connection, kind: Literal["DEFERRED", "IMMEDIATE"]) -> Iterator[None]:
-    """Make the block a transaction, or a part of the transaction in progress."""
-    if database.in_transaction:
-        yield
-        return
+    """Make the block a transaction."""
     database.execute(f"BEGIN {kind}")
     with database:
         yield
 
 
-def write_rows(database: sqlite3.Connection, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write whole rows, replacing rows of the same folders; within a transaction."""
+def write_row(database: sqlite3.Connection, row: Mapping[str, Any]) -> None:
+    """Write a whole row, replacing the one of the same folder; its whole numbers have 64 bits with a sign."""
     places = ", ".join(f":{name}" for name in STORED)
-    database.executemany(f"INSERT OR REPLACE INTO runs VALUES ({places})", map(_storable, rows))
-
-
-def _storable(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row as SQLite takes it: its whole numbers have 64 bits with a sign."""
-    names = [name for name, kind in STORED.items() if kind == "REAL" and row[name] is not None]
     seed = None if row["seed"] is None else row["seed"] - SEED_SHIFT
-    return {**row, **{name: float(row[name]) for name in names}, "seed": seed}
+    reals = {
+        name: float(row[name]) for name, kind in STORED.items() if kind == "REAL" and row[name] is not None
+    }
+    database.execute(f"INSERT OR REPLACE INTO runs VALUES ({places})", {**row, **reals, "seed": seed})

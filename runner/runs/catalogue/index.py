@@ -1,11 +1,7 @@
 """The index of recordings folders, brought up to date before each query.
 
-A query runs in the transaction in which the index was seen to agree with the folders. Where the index file
-cannot be used, the folders are read without it.
-
-A quick check notices runs that are new or gone, files that were created, replaced or removed, as all commands
-do, and runs that are running: a stat of each run's folder takes 3 us. A whole one, with a stat of each run's
-files, takes 10 us, and also notices files that were changed in place. Files are read where something changed.
+A stat of each run's files, 10 us a run, shows which runs changed; these are read. Where the index file cannot
+be used, the folders are read without it.
 """
 
 from __future__ import annotations
@@ -32,13 +28,12 @@ from runner.runs.catalogue.database import (
     identity,
     index_path,
     open_index,
-    pragma,
     renew,
     row_of,
     text,
     transaction,
     version,
-    write_rows,
+    write_row,
 )
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
 from runner.runs.run import RECORDING_FILE, RUN_FILE, check_folder_name, run_entries, run_in
@@ -283,7 +278,6 @@ def look(
     report: Tell = lambda _: None,
     rebuild: bool = False,
     cached: bool = False,
-    quick: bool = False,
 ) -> Result:
     """Return the result of some work on the index of these folders, which is brought up to date before.
 
@@ -291,7 +285,6 @@ def look(
         work: called once, or once more if the index turns out to be damaged.
         rebuild: read all runs again.
         cached: use the index as it is, without checking the folders.
-        quick: miss files that were changed in place.
     """
     paths = (os.path.abspath(root) for root in roots)  # noqa: PTH100 - links stay as they are
     places = list(dict.fromkeys(paths))
@@ -301,10 +294,10 @@ def look(
         before, seen = version(), identity()
         try:
             with contextlib.closing(open_index(report)) as database:
-                if cached and before is not None and before.file == (version() or before).file:
-                    with transaction(database, "DEFERRED"):
-                        return work(CatalogueIndex(database, places))
-                return _look(database, places, work, quick, rebuild)
+                if not cached or before is None or before.file != (version() or before).file:
+                    update(database, places, rebuild)
+                with transaction(database, "DEFERRED"):
+                    return work(CatalogueIndex(database, places))
         except (sqlite3.OperationalError, OSError) as error:
             if getattr(error, "sqlite_errorcode", None) == sqlite3.SQLITE_READONLY_DBMOVED:
                 continue  # another process replaced it
@@ -315,7 +308,8 @@ def look(
             renew(seen)
             cached = False
     with contextlib.closing(create(":memory:")) as database:
-        return _look(database, places, work, quick, rebuild)
+        update(database, places)
+        return work(CatalogueIndex(database, places))
 
 
 def order_of(text: str) -> list[Sql]:
@@ -344,29 +338,6 @@ def _sort_keys(text: str) -> list[tuple[Sql, bool]]:
     return keys
 
 
-def _look(
-    database: sqlite3.Connection,
-    roots: Sequence[str],
-    work: Callable[[CatalogueIndex], Result],
-    quick: bool,
-    rebuild: bool,
-) -> Result:
-    folders = Folders(database, roots, quick)
-    index = CatalogueIndex(database, roots)
-    if rebuild:
-        folders.expire()
-    before = pragma(database, "data_version")
-    differences = folders.differences()
-    if not differences:
-        with transaction(database, "DEFERRED"):
-            if pragma(database, "data_version") == before or not folders.differences():
-                return work(index)
-    folders.apply(differences)
-    with transaction(database, "IMMEDIATE"):
-        folders.apply(folders.differences())  # mostly none: what other processes did in the meantime
-        return work(index)
-
-
 def _as_rows(cursor: sqlite3.Cursor) -> Iterator[IndexRow]:
     names = [column[0] for column in cursor.description]
     for values in cursor:
@@ -392,105 +363,62 @@ def _begins(column: str, beginning: str) -> Sql:
 _STABLE_NS: Final = 2 * 10**9
 """Files that changed this recently may change again with the same time: they are read again next time."""
 _RUN_FILES: Final = (RUN_FILE, LABELS_FILE, RECORDING_FILE)
-_BATCH: Final = 2000
-"""Rows in memory at once, written in one transaction."""
 _EMPTY: Final[dict[str, object]] = dict.fromkeys(STORED)
 
 
-class _FolderChanges(NamedTuple):
-    """How a recordings folder differs from the index; runs are given by the names of their folders."""
+def update(database: sqlite3.Connection, roots: Sequence[str], rebuild: bool = False) -> None:
+    """Read the runs of these folders that changed since they were written to the index, and write them.
 
-    root: str
-    changed: list[str]
-    """Runs that are new, changed, or whose process was killed."""
-    gone: list[str]
-    """Runs that were removed."""
-
-
-class Folders:
-    """Some recordings folders, compared with the index."""
-
-    def __init__(
-        self,
-        database: sqlite3.Connection,
-        roots: Sequence[str],
-        quick: bool = False,
-    ) -> None:
-        self._database = database
-        self._roots = roots
-        self._quick = quick
-        self._tokens: dict[str, dict[str, str]] = {}
-        """By root and entry, the token of each run's folder at the first check, or when it was read."""
-        self._read: dict[str, set[str]] = {root: set() for root in roots}
-
-    def differences(self) -> list[_FolderChanges]:
-        """Return how the folders, as they were at the first call, differ from the index as it is now."""
-        all_differences = [self._difference(root) for root in self._roots]
-        return [difference for difference in all_differences if difference.changed or difference.gone]
-
-    def apply(self, found: Sequence[_FolderChanges]) -> None:
-        """Read what changed and write it to the index, a transaction for each batch."""
-        for root, changed, gone in found:
-            changed.sort()  # in the order of the table, which then grows at its end
-            for start in range(0, len(changed), _BATCH):
-                rows = [self._row(root, entry) for entry in changed[start : start + _BATCH]]
-                with transaction(self._database, "IMMEDIATE"):
-                    write_rows(self._database, rows)
-            with transaction(self._database, "IMMEDIATE"):
-                removed = [(root, entry) for entry in gone]
-                self._database.executemany("DELETE FROM runs WHERE root = ? AND entry = ?", removed)
-
-    def expire(self) -> None:
-        """Have all runs of these folders read again, and delete the rows of folders that no longer exist."""
-        with transaction(self._database, "IMMEDIATE"):
-            for (root,) in self._database.execute("SELECT DISTINCT root FROM runs").fetchall():
+    Args:
+        rebuild: read all runs, and delete the rows of folders that no longer exist.
+    """
+    if rebuild:
+        with transaction(database, "IMMEDIATE"):
+            for (root,) in database.execute("SELECT DISTINCT root FROM runs").fetchall():
                 if not os.path.isdir(root):  # noqa: PTH112
-                    self._database.execute("DELETE FROM runs WHERE root = ?", (root,))
-            expired = "UPDATE runs SET fingerprint = '', mark = '' WHERE root = ?"
-            self._database.executemany(expired, [(root,) for root in self._roots])
+                    database.execute("DELETE FROM runs WHERE root = ?", (root,))
+            expired = "UPDATE runs SET fingerprint = '' WHERE root = ?"
+            database.executemany(expired, [(root,) for root in roots])
+    for root in roots:
+        if changed := changed_entries(database, root):
+            with transaction(database, "IMMEDIATE"):  # no other process writes what it read before
+                for entry in changed:
+                    _index(database, root, entry)
 
-    def _difference(self, root: str) -> _FolderChanges:
-        """Return the difference of one folder; entries without files of a run are left out, or gone."""
-        stored = "mark" if self._quick else "fingerprint"
-        indexed: dict[str, str] = dict(
-            self._database.execute(f"SELECT entry, {stored} FROM runs WHERE root = ?", (root,))
-        )
-        if root not in self._tokens:  # as the folders are at the first check
-            entries = [entry for entry in run_entries(Path(root)) if entry.isprintable()]
-            self._tokens[root] = {entry: self._token(root, entry) for entry in entries}
-        tokens = self._tokens[root]
-        changed = [entry for entry, token in tokens.items() if indexed.get(entry) != token]
-        unsteady = (
-            "SELECT entry, status, stable FROM runs WHERE root = ? AND (status = 'running' OR NOT stable)"
-        )
-        for entry, status, stable in self._database.execute(unsteady, (root,)):
-            if indexed.get(entry) != tokens.get(entry) or entry in self._read[root]:
-                continue
-            # The recording of a running one grows in place.
-            if not stable or self._quick or (status == "running" and not _is_running(root, entry)):
-                changed.append(entry)
-        there = [entry for entry in changed if _state_of(root, entry) is not None]
-        missing = {*indexed} - {*tokens} | {*changed} - {*there}
-        gone = [entry for entry in missing if entry in indexed and _state_of(root, entry) is None]
-        return _FolderChanges(root, there, gone)
 
-    def _token(self, root: str, entry: str) -> str:
-        if self._quick:
-            return _mark(root, entry)[0]
-        seen = _state_of(root, entry)
-        return "" if seen is None else seen.fingerprint
+def changed_entries(database: sqlite3.Connection, root: str) -> list[str]:
+    """Return the names of the runs' folders that are new, changed or gone, or whose process was killed."""
+    known = "SELECT entry, fingerprint, stable, status FROM runs WHERE root = ?"
+    indexed = {entry: row for entry, *row in database.execute(known, (root,))}
+    entries = sorted(entry for entry in run_entries(Path(root)) if entry.isprintable())
+    changed = list(indexed.keys() - set(entries))
+    for entry in entries:
+        state = _state_of(root, entry)
+        fingerprint, is_stable, status = indexed.get(entry, (None, True, ""))
+        is_same = fingerprint == (state.fingerprint if state else None)
+        # The recording of a running one grows in place.
+        if not (is_same and is_stable) or (status == "running" and not _is_running(root, entry)):
+            changed.append(entry)
+    return changed
 
-    def _row(self, root: str, entry: str) -> dict[str, object]:
-        mark, changed = _mark(root, entry)  # before the files: later changes are found next time
-        seen = _state_of(root, entry) or _FileState("", 0, None)
-        stable = max(changed, seen.changed) + _STABLE_NS < time.time_ns()
-        self._tokens[root][entry] = mark if self._quick else seen.fingerprint
-        self._read[root].add(entry)
-        place = {"root": root, "entry": entry, "fingerprint": seen.fingerprint, "mark": mark}
-        if run := run_in(Path(root, entry)):
-            return _EMPTY | place | {"stable": stable} | row_of(run, seen.size)
-        problem = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run."
-        return _EMPTY | place | {"stable": stable, "problem": problem}
+
+def _index(database: sqlite3.Connection, root: str, entry: str) -> None:
+    """Write the row of a run's folder, or delete it if the folder has no files of a run."""
+    state = _state_of(root, entry)  # before the files are read: later changes are found next time
+    if state is None:
+        database.execute("DELETE FROM runs WHERE root = ? AND entry = ?", (root, entry))
+        return
+    row = _EMPTY | {
+        "root": root,
+        "entry": entry,
+        "fingerprint": state.fingerprint,
+        "stable": state.changed + _STABLE_NS < time.time_ns(),
+    }
+    if run := run_in(Path(root, entry)):
+        row |= row_of(run, state.size)
+    else:
+        row["problem"] = f"{Path(root, entry)}: neither {RUN_FILE} nor {RECORDING_FILE} can be read as a run."
+    write_row(database, row)
 
 
 class _FileState(NamedTuple):
@@ -518,15 +446,6 @@ def _state_of(root: str, entry: str) -> _FileState | None:
         changed = max(changed, facts.st_mtime_ns)
         size = facts.st_size if name == RECORDING_FILE else None
     return _FileState(" ".join(marks), changed, size) if marks[0] or marks[2] else None
-
-
-def _mark(root: str, entry: str) -> tuple[str, int]:
-    """Return a token that changes when a file in a folder is created, replaced or removed, and that time."""
-    try:
-        facts = os.stat(f"{root}{os.sep}{entry}")  # noqa: PTH116
-    except OSError:
-        return "", 0
-    return f"{facts.st_mtime_ns}.{facts.st_ino}", facts.st_mtime_ns
 
 
 def _is_running(root: str, entry: str) -> bool:

@@ -19,7 +19,7 @@ from runner.errors import RunNotFound
 from runner.recording.labels import Labels, change_labels, read_labels
 from runner.runs.catalogue import index as index_module
 from runner.runs.catalogue.database import index_path, open_index
-from runner.runs.catalogue.index import MAX_TREE, Folders, look
+from runner.runs.catalogue.index import MAX_TREE, changed_entries, look
 from runner.runs.resolve import find_run
 from runner.runs.run import RECORDING_FILE, RUN_FILE, create_run, list_runs
 from tests.runner.runs.listed import ALL, CONFIG, aged, ids, rows
@@ -71,8 +71,7 @@ def test_only_what_changed_is_read(folder):
     aged(folder)
     changed = list_runs(folder)[2].update(status="failed")
     with contextlib.closing(open_index(pytest.fail)) as database:
-        (difference,) = Folders(database, [str(folder)]).differences()
-    assert difference.changed == [changed.run_id]
+        assert changed_entries(database, str(folder)) == [changed.run_id]
     assert ids(folder, 'status == "failed"') == [changed.run_id]
 
 
@@ -109,7 +108,7 @@ def test_a_run_is_found_in_the_recording_alone_and_keeps_its_labels(folder, reco
     (place / RUN_FILE).unlink()
     alone = rows(folder)[0][0]
     differing = {key for key in whole if whole[key] != alone[key]}
-    assert differing <= {"fingerprint", "mark", "stable", "seconds", "settings"}
+    assert differing <= {"fingerprint", "stable", "seconds", "settings"}
     assert json.loads(whole["settings"]) == json.loads(alone["settings"])
 
 
@@ -117,14 +116,13 @@ def test_an_index_that_another_process_replaces_is_opened_again(folder, monkeypa
     made = [create_run(folder, CONFIG, seed).run_id for seed in range(2)]
     ids(folder)
     made.append(create_run(folder, CONFIG, 2).run_id)
-    differences = Folders.differences
 
-    def replaced_first(self):
-        monkeypatch.setattr(Folders, "differences", differences)
+    def replaced_first(*arguments):
+        monkeypatch.setattr(index_module, "changed_entries", changed_entries)
         index_path().unlink()
-        return differences(self)
+        return changed_entries(*arguments)
 
-    monkeypatch.setattr(Folders, "differences", replaced_first)
+    monkeypatch.setattr(index_module, "changed_entries", replaced_first)
     found, messages = rows(folder)
     assert ({row["id"] for row in found}, messages) == (set(made), [])
     assert index_path().exists()
@@ -188,7 +186,7 @@ def test_a_run_is_found_by_the_names_that_find_it_in_the_folder(folder):
 WRITER = """
 import sys
 from pathlib import Path
-from runner.runs.catalogue.index import MAX_TREE, Folders, look
+from runner.runs.catalogue.index import look
 from runner.runs.catalogue.filters import parse
 from types import SimpleNamespace
 from runner.recording.labels import Labels, change_labels
