@@ -5,29 +5,16 @@
 
 Every replay of recorded steps goes through `StepReplay`. It checks the steps first, because the compiled
 kernel indexes its arrays by what they say, without any check of its own.
-
-A recording has snapshots by episodes, which may lie a hundred million steps apart. The first replay over such
-a stretch saves checkpoints in the user's cache, one every million steps; from then on the tables at any step
-are a short replay away. They can be removed at any time: everything in them follows from the recording.
 """
 
 from __future__ import annotations
 
-import contextlib
-import math
-import os
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import cache
-from pathlib import Path
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 import numpy as np
-import zstandard
-from blake3 import blake3
 
-import runner.learning
 from runner.config import from_mapping
 from runner.environments.mdp import Mdp
 from runner.errors import NotInRecording, RecordingError
@@ -40,7 +27,6 @@ from runner.recording import schema
 from runner.recording.messages import QTable
 from runner.recording.reader import Recording
 from runner.util.arrays import Array, Flags, Floats, Ints, Records
-from runner.util.files import CACHED_TABLES, cache_folder, replacing
 from runner.util.values import JsonView
 
 S = TypeVar("S")
@@ -308,110 +294,6 @@ class DerivedTables(Generic[S]):
         self._next = next(self._snapshots, None)
 
 
-# --- tables in the cache --------------------------------------------------------------------------------
-
-CHECKPOINT_STEPS: Final = 1 << 20
-"""Training steps between checkpoints: replayed in well under half a second."""
-MAX_CACHE_BYTES: Final = 2 * 10**9
-"""The most that all checkpoints of all runs take; beyond it the least recently used are removed."""
-
-
-class TableCache:
-    """The tables of one recording at some steps, its checkpoints, in the user's cache.
-
-    Args:
-        recording: the run; unless it is finished, there are no checkpoints, as it may still change.
-    """
-
-    def __init__(self, recording: Recording) -> None:
-        self._folder = cache_folder() / CACHED_TABLES
-        run_id = re.sub(r"[^\w-]", "_", recording.run_id)[:80]  # whatever the file says, a plain name
-        self._prefix = f"{run_id}-{_key(recording)}" if recording.file.finished else ""
-        self._saved = False
-
-    def nearest(self, step: int, shapes: Sequence[tuple[int, ...]]) -> tuple[int, list[Floats]]:
-        """Return the last checkpoint at or before a step, and its tables; step -1 if there is none.
-
-        Args:
-            shapes: of the tables, in the order of a snapshot.
-        """
-        for at in sorted((at for at in self._steps() if at <= step), reverse=True):
-            tables = self._load(at, shapes)
-            if tables is not None:
-                return at, tables
-        return -1, []
-
-    def save(self, step: int, tables: Sequence[Floats]) -> None:
-        """Save the tables at a step, unless they are there."""
-        path = self._path(step)
-        if not self._prefix or path.exists():
-            return
-        data = b"".join(np.ascontiguousarray(table, "<f8").tobytes() for table in tables)
-        with contextlib.suppress(OSError):  # a cache that cannot be written costs time only
-            self._folder.mkdir(parents=True, exist_ok=True)
-            with replacing(path) as fresh:
-                fresh.write_bytes(zstandard.ZstdCompressor(level=1, write_checksum=True).compress(data))
-            self._saved = True
-
-    def prune(self) -> None:
-        """Remove the least recently used checkpoints, of any run, if they take too much space."""
-        if not self._saved:
-            return
-        self._saved = False
-        with contextlib.suppress(OSError):
-            files = sorted((f.stat().st_mtime, f.stat().st_size, f) for f in self._folder.iterdir())
-            excess = sum(size for _, size, _ in files) - MAX_CACHE_BYTES
-            for _, size, file in files:
-                if excess <= 0:
-                    return
-                file.unlink(missing_ok=True)
-                excess -= size
-
-    def _steps(self) -> list[int]:
-        if not self._prefix or not self._folder.is_dir():
-            return []
-        names = [path.name for path in self._folder.iterdir() if path.name.startswith(self._prefix)]
-        steps = [name.removeprefix(self._prefix).removesuffix(".zst") for name in names]
-        return [int(step) for step in steps if step.isdecimal()]
-
-    def _load(self, step: int, shapes: Sequence[tuple[int, ...]]) -> list[Floats] | None:
-        """Return the tables of a checkpoint; None if it is damaged, and then it is removed."""
-        path = self._path(step)
-        sizes = [math.prod(shape) for shape in shapes]
-        try:
-            data = path.read_bytes()
-            if zstandard.frame_content_size(data) != 8 * sum(sizes):
-                raise ValueError
-            values = np.frombuffer(zstandard.ZstdDecompressor().decompress(data), "<f8")
-            os.utime(path)
-        except (OSError, ValueError, zstandard.ZstdError):
-            with contextlib.suppress(OSError):
-                path.unlink(missing_ok=True)
-            return None
-        parts = np.split(values, np.cumsum(sizes)[:-1])
-        return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-
-    def _path(self, step: int) -> Path:
-        return self._folder / f"{self._prefix}{step:015}.zst"
-
-
-def _key(recording: Recording) -> str:
-    """Return a key of the tables of this file as replayed by this code."""
-    facts = recording.path.stat()
-    parts = [str(recording.path.absolute()), str(facts.st_size), str(facts.st_mtime_ns)]
-    parts += [str(recording.result.get("content_digest")), _code()]
-    return blake3("\n".join(parts).encode()).hexdigest()[:16]
-
-
-@cache
-def _code() -> str:
-    """Return a hash of the code that learns: other code may compute other tables."""
-    digest = blake3()
-    for file in sorted(Path(next(iter(runner.learning.__path__))).glob("*.py")):
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
 # --- the replay ---------------------------------------------------------------------------------------
 
 NEAR_STEPS: Final = 200_000
@@ -425,10 +307,7 @@ class TableReplay(StepReplay):
         super().__init__(recording.config, recording.mdp, recording.seed or 0, str(recording.path))
         self._recording = recording
         self._recorded = recording.train.steps.count()
-        self._cache = TableCache(recording)
-        self._origin: int | None = None
-        """The step from which the recording alone moved the tables; None if they were set by hand."""
-        self._load(*self._nearest(step))
+        self.rewind(*self._nearest(step))
         self.advance(step)
 
     def rows(self, stop: int) -> Floats:
@@ -469,20 +348,11 @@ class TableReplay(StepReplay):
         if gap or not self.step <= step <= self.step + NEAR_STEPS:
             nearest, tables = self._nearest(step)
             if not self.step <= step or nearest > self.step:
-                self._load(nearest, tables)
+                self.rewind(nearest, tables)
         self.advance(step)
 
-    def rewind(self, step: int, tables: list[NamedTables]) -> None:
-        """Set all tables to the tables of a step; from there on no checkpoints are saved."""
-        super().rewind(step, tables)
-        self._origin = None
-
-    def _load(self, step: int, tables: list[NamedTables]) -> None:
-        super().rewind(step, tables)
-        self._origin = step
-
     def _nearest(self, step: int) -> tuple[int, list[NamedTables]]:
-        """Return the last snapshot at or before a step, or a checkpoint between them; and its step."""
+        """Return the last snapshot at or before a step, and its step."""
         nearest = _snapshot_before(self._recording, step, self.learner.kinds)
         if nearest is None:
             raise RecordingError(f"{self._recording.path}: has no Q-table at or before step {step}.")
@@ -492,10 +362,7 @@ class TableReplay(StepReplay):
         )
         if shapes != expected:
             raise RecordingError(f"{self._where}: found Q-tables of shape {shapes}, expected {expected}.")
-        if step - nearest[0] <= CHECKPOINT_STEPS:
-            return nearest
-        at, tables = self._cache.nearest(step, [table.shape for table in self.learner.snapshot()])
-        return (at, name_tables(tables, self.learner.kinds)) if at > nearest[0] else nearest
+        return nearest
 
     def advance(self, stop: int, rows: Floats = NO_ROWS, trace: Trace = NO_TRACE) -> None:
         """Replay up to a later step; `rows` and `trace` are filled as `apply` fills them.
@@ -520,13 +387,7 @@ class TableReplay(StepReplay):
         if stop > max(self._recorded, first):
             raise self._missing(stop)
         if stop > first:
-            for block in self._recording.train.steps.blocks(first, stop):
-                for part in np.split(block, [-self.step % CHECKPOINT_STEPS] if len(block) else []):
-                    yield part
-                    is_far = self._origin is not None and self.step - self._origin >= CHECKPOINT_STEPS
-                    if is_far and self.step % CHECKPOINT_STEPS == 0:  # no snapshot is near before it
-                        self._cache.save(self.step, self.learner.snapshot())
-        self._cache.prune()
+            yield from self._recording.train.steps.blocks(first, stop)
         if self.step < stop:
             raise self._lost(stop)
 

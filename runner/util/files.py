@@ -23,8 +23,6 @@ RUN_SEPARATOR: Final = "+"
 """Separates the ids of several runs in the name of an export; no id contains it."""
 CACHED_RECORDINGS: Final = "restored"
 """The folder of the cache with recordings restored from archives; their names begin with the run's id."""
-CACHED_TABLES: Final = "tables"
-"""The folder of the cache with Q-tables along long runs; their names begin with the run's id."""
 CACHED_EPISODES: Final = "episodes"
 """The folder of the cache with the index of episodes; the names of its files begin with the run's id."""
 _BINARY: Final = getattr(os, "O_BINARY", 0)

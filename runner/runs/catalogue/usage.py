@@ -25,7 +25,6 @@ from runner.util.files import (
     CACHED_EPISODES,
     CACHED_EXPORTS,
     CACHED_RECORDINGS,
-    CACHED_TABLES,
     RUN_SEPARATOR,
     cache_folder,
 )
@@ -187,7 +186,7 @@ def usage_of(
     Args:
         read: calls some work with the index and returns its result, as `look` does.
     """
-    exports = cached(CACHED_EXPORTS) + cached(CACHED_TABLES) + cached(CACHED_EPISODES)
+    exports = cached(CACHED_EXPORTS) + cached(CACHED_EPISODES)
     restored = cached(CACHED_RECORDINGS)
     rows = read(lambda index: index.with_same_as(index.select(run_filter, columns=_COLUMNS)))
     checkpoints = {root: Store(Path(root)).sizes() for root in {row["root"] for row in rows}}
