@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
@@ -29,7 +28,6 @@ from runner.util.extras import missing
 from runner.util.processes import raise_if_out_of_memory
 
 _MAX_DESCRIPTION: Final = 300
-_ENDING: Final = struct.Struct("<d??")
 _ENDS: Final = ("rewards", "terminated", "truncated")
 Fill = Callable[[int, Any], None]
 """Puts down what the environment returned for a step."""
@@ -103,7 +101,6 @@ class Stepper:
         resets = recording.layout.row_dtype(topics.resets)
         ends = [("rewards", "<f8", (len(agents),)), ("terminated", "?"), ("truncated", "?")]
         masks = [(f"agents_{name}", "<u4") for name in _ENDS[1:] if len(agents) > 1]
-        self._ends_dtype = np.dtype(ends)
         self._dtype = np.dtype([(self._after, steps[self._after]), *ends, *masks])
         self._first_dtype = resets["observation"]
 
@@ -114,9 +111,9 @@ class Stepper:
             rows: the recorded steps, [steps of each environment * n].
             resets: step of each environment, and reset, in order; each comes before its step.
         """
-        got, ends = np.zeros(len(rows), self._dtype), np.zeros(len(rows), self._ends_dtype)
+        got = np.zeros(len(rows), self._dtype)
         seen = np.zeros(len(rows), self._first_dtype) if self._has_states else got[self._after]
-        self._actions, self._fill = self.actions(rows), self._filler(seen, ends, got)
+        self._actions, self._fill = self.actions(rows), self._filler(seen, got)
         self._firsts = np.zeros(len(resets), self._first_dtype)
         self._put_first = filler(self._observation, self._firsts)
         returned = Returned(rows, resets, got)
@@ -132,8 +129,6 @@ class Stepper:
             returned.error = error
         if self._has_states:  # states are counted from 0, observations are as they came
             got[self._after] = seen - self.observation_space.start  # type: ignore[attr-defined]
-        for name in _ENDS:
-            got[name] = ends[name]
         if self.ends_once:
             got["truncated"] &= ~got["terminated"]
         return returned
@@ -188,27 +183,21 @@ class Stepper:
         """Return the spaces of observation and action."""
         return self.env.observation_space, self.env.action_space
 
-    def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:  # noqa: ARG002
+    def _filler(self, seen: Array, got: Records) -> Fill:
         """Return a function that puts down steps.
 
         Args:
             seen: [rows], for observations.
-            ends: [rows], for rewards and ends.
-            got: [rows], for what games return besides.
+            got: [rows], for rewards and ends, and what games return besides.
         """
         put = filler(self._observation, seen)
-        pack = _ENDING.pack_into
-        data = ends.view(np.uint8).data
-        size = _ENDING.size
+        rewards, terminated, truncated = (got[name] for name in _ENDS)
 
         def fill(row: int, result: Any) -> None:
-            observation, reward, terminated, truncated, _ = result
+            observation, reward, is_terminated, is_truncated, _ = result
             put(row, observation)
-            try:
-                pack(data, row * size, reward, terminated, truncated)
-            except (struct.error, TypeError):  # an array of one
-                number = float(np.asarray(reward).reshape(()))
-                pack(data, row * size, number, bool(terminated), bool(truncated))
+            rewards[row] = reward
+            terminated[row], truncated[row] = bool(is_terminated), bool(is_truncated)
 
         return fill
 
@@ -295,9 +284,10 @@ class GameStepper(Stepper):
             )
         return game_spaces(self.env)
 
-    def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:
+    def _filler(self, seen: Array, got: Records) -> Fill:
         put = filler(self._observation, seen)
         agents = self.env.possible_agents
+        ends = [got[name] for name in _ENDS]
         masks = [got[name] for name in got.dtype.names or () if name.startswith("agents_")]
 
         def fill(row: int, result: Any) -> None:
@@ -305,7 +295,9 @@ class GameStepper(Stepper):
             put(row, observations)
             over = not self.env.agents
             paid = [float(rewards.get(agent, 0.0)) for agent in agents]
-            ends[row] = (paid, *(over and any(flag.values()) for flag in flags))
+            values = (paid, *(over and any(flag.values()) for flag in flags))
+            for column, value in zip(ends, values, strict=True):
+                column[row] = value
             for mask, flag in zip(masks, flags, strict=False):  # none if there is one agent
                 mask[row] = sum(bool(flag.get(agent)) << i for i, agent in enumerate(agents))
 
@@ -412,11 +404,11 @@ class VectorStepper(Stepper):
         is_one = is_counted or not hasattr(self.env.unwrapped, "envs")
         return arguments | {"seed": first if is_one else [seeds.get(i) for i in range(self.n)]}
 
-    def _filler(self, seen: Array, ends: Records, got: Records) -> Fill:  # noqa: ARG002
+    def _filler(self, seen: Array, got: Records) -> Fill:
         rows = seen.reshape(len(seen) // self.n, self.n, *seen.shape[1:])
         put = filler(self._observation, rows, (self.n,))
         put_last = filler(self._observation, seen)
-        columns = [ends[name].reshape(-1, self.n) for name in _ENDS]
+        columns = [got[name].reshape(-1, self.n) for name in _ENDS]
 
         def fill(step: int, result: Any) -> None:
             observations, *values, infos = result
