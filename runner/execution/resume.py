@@ -144,17 +144,12 @@ def _resume(run: Run, accept_changes: bool, report: Report, stop: Stop, trust: b
             session = _ResumedSession(recording, reference, job, learner, recorder, report, stop)
             done = execute(session, file, run, started, code)
     except BaseException as error:
-        _mark_failed(run, error)
+        with contextlib.suppress(RunnerError):
+            now = run_at(run.folder)
+            if now.file.status == "running":  # it never reached `execute`, which records failures itself
+                now.update(status="failed", summary={"error": truncated_message(error)})
         raise
     return _complete(done, path) if done.status == "finished" else done
-
-
-def _mark_failed(run: Run, error: BaseException) -> None:
-    """Mark the run as failed if it never reached `execute`, which records failures itself."""
-    with contextlib.suppress(RunnerError):
-        now = run_at(run.folder)
-        if now.file.status == "running":
-            now.update(status="failed", summary={"error": truncated_message(error)})
 
 
 def _place(run: Run, described: bool) -> tuple[Path, Index]:

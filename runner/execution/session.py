@@ -263,19 +263,15 @@ class Session:
         self._evaluated += 1
         self._progress.evaluations.append(metrics)
         if plan.exact:
-            self._measure_exactly(metrics)
+            measured = self._exact_evaluator.measure(learner.policy, metrics["discount"])
+            place = {name: metrics[name] for name in ("step", "episode", "evaluation")}
+            self._measure(schema.OPTIMALITY_TOPIC, place | measured)
+            self._progress.evaluations[-1] = metrics | {"optimality": measured}
         self._log(f"evaluation after {episode} episodes: {metrics['success_percent']:.1f} % success")
         return True
 
     def _measure(self, topic: schema.Topic, metrics: Message) -> None:
         self.recorder.message(topic, encode(topic.message, metrics))
-
-    def _measure_exactly(self, metrics: Message) -> None:
-        """Record what the evaluated policy gets from every start state, and the optimum."""
-        exact = self._exact_evaluator.measure(self._learner.policy, metrics["discount"])
-        position = {name: metrics[name] for name in ("step", "episode", "evaluation")}
-        self._measure(schema.OPTIMALITY_TOPIC, position | exact)
-        self._progress.evaluations[-1] = metrics | {"optimality": exact}
 
     @cached_property
     def _exact_evaluator(self) -> ExactEvaluator:

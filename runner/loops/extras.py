@@ -8,7 +8,7 @@ with a first axis of varying length, are put down as bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -90,7 +90,7 @@ class ExtrasWriter:
             recorder.append(schema.EXTRA_COLUMNS_TOPIC, encode(schema.EXTRA_COLUMNS, layout.fields), position)
             recorder.begin_extras(number, layout.message)
         varying = self.layout.varying["spaces"]
-        nothing = _objects([NOTHING] * len(steps))
+        nothing = np.full(len(steps), NOTHING, object)
         for block, part in recorder.fill(schema.extra_topic(phase, self.layout.number), positions):
             block["step"] = steps[part]
             for name in self.described:
@@ -99,7 +99,7 @@ class ExtrasWriter:
                     block["values"][name] = columns[name][part] if name in columns else 0
             if varying:
                 parts = (columns.get(name, nothing)[part].tolist() for name in varying)
-                block["varying"] = _objects(map(b"".join, zip(*parts, strict=True)))
+                block["varying"] = np.fromiter(map(b"".join, zip(*parts, strict=True)), object)
 
 
 class PendingExtras:
@@ -225,7 +225,7 @@ class PendingExtras:
             column = self._writer.described[name]
             whole = _values(name, value, shape)
             if leaf_dtype(column) is None:
-                flat[name] = _objects([encoded(column, item) for item in _listed(whole, shape)])
+                flat[name] = np.fromiter((encoded(column, item) for item in _listed(whole, shape)), object)
                 sizes += [len(item) for item in flat[name].tolist()]
             else:
                 assert isinstance(whole, np.ndarray)
@@ -360,7 +360,7 @@ class PendingExtras:
         self._held += sum(map(len, data))
         if self._held > _MAX_BYTES:
             self._max_rows = min(self._max_rows, row)
-        return _objects(data) if batch else data[0]
+        return np.fromiter(data, object) if batch else data[0]
 
     def commit(self) -> None:
         """Hand all rows to the recorder but the last one, which may be extended."""
@@ -401,11 +401,6 @@ class PendingExtras:
                     column = self._columns[name]
                     column.values[row : row + 1].fill(NOTHING if column.dtype is None else 0)
         return {name: np.repeat(flags, self._n) for name, flags in given.items()}
-
-
-def _objects(items: Iterable[bytes]) -> Array:
-    """Return objects as an array."""
-    return np.fromiter(items, object)
 
 
 def _fixed_size(description: Description | None) -> int:

@@ -179,7 +179,11 @@ class LoopRun:
         self._code.write(self.file, wait=True)
         self._write_makers()
         if self._actions is not None and self._follower is None:  # which has sent the file as it is
-            self._compact()
+            counts = self.recorder.counts
+            if any(counts.get(topic.name, 0) > 1 for topic in ACTION_TOPICS):
+                with contextlib.suppress(OSError):  # without the space for both, it keeps its many chunks
+                    self.file, messages = compacted(self.file, self._options.packing.packing)
+                    counts |= messages
         result = self.recorder.totals(topic_digests) | self.outcomes.summary()
         result |= {
             "episodes": self.recorder.counts["/train/episode"],
@@ -192,14 +196,6 @@ class LoopRun:
         write_result(self.file, status, result, synced=False)
         seconds = round(time.monotonic() - self.started, 3)
         return result | {"seconds": seconds, "bytes": self.file.size}
-
-    def _compact(self) -> None:
-        """Write a recording of actions alone again, in fewer chunks, if there are several."""
-        counts = self.recorder.counts
-        if any(counts.get(topic.name, 0) > 1 for topic in ACTION_TOPICS):
-            with contextlib.suppress(OSError):  # without the space for both, the recording stays as it is
-                self.file, messages = compacted(self.file, self._options.packing.packing)
-                counts |= messages
 
     def write_status(self, status: str, summary: Mapping[str, object]) -> None:
         """Write how the run ended next to its recording, which is synced to disk within seconds."""

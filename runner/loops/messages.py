@@ -454,8 +454,15 @@ class Outcomes:
     def summary(self) -> Json:
         """Return `last_evaluation`, `recent_training` and `logged`, as JSON can hold them."""
         returns, lengths = self._recent.T
+        evaluation = None
+        if self._trials:
+            unknown = np.empty(0)
+            values = {
+                metric.name: metric.of_usable(self._values.get(metric.name, unknown)) for metric in METRICS
+            }
+            evaluation = {"episode": self._evaluated_after, "trials": self._trials, **values}
         return {
-            "last_evaluation": self._evaluation(),
+            "last_evaluation": evaluation,
             "recent_training": {
                 "episodes": len(self._recent),
                 "mean_length": finite_mean(lengths),
@@ -463,10 +470,3 @@ class Outcomes:
             },
             "logged": self._logged,
         }
-
-    def _evaluation(self) -> Json | None:
-        if not self._trials:
-            return None
-        unknown = np.empty(0)
-        values = {metric.name: metric.of_usable(self._values.get(metric.name, unknown)) for metric in METRICS}
-        return {"episode": self._evaluated_after, "trials": self._trials, **values}

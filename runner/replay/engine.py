@@ -14,7 +14,6 @@ import numpy as np
 from runner.environments.interfaces import as_parallel, is_game
 from runner.errors import CannotRedo, shortened
 from runner.recording import schema
-from runner.recording.maker import EnvironmentMaker
 from runner.recording.reader import Recording
 from runner.recording.spaces import Value, decode
 from runner.recording.steps import EpisodeDigests, after_step, is_of_environment
@@ -280,7 +279,14 @@ class Rerun:
         maker = self._recording.phase(phase).maker_of(environment)
         if key in self._steppers:
             return self._steppers[key]
-        env, is_trusted = self._environment(maker, environment)
+        if self._make is not None:
+            env, is_trusted = self._make(), True
+        elif maker is None:
+            raise CannotRedo(why_not_made(maker, self._trust))
+        else:
+            with trusting(self._recording.path, maker, self._trust) as is_trusted:
+                make = make_vector if environment == ALL else make_environment
+                env = make(maker, is_trusted, self.render)
         with using("The environment cannot be used"):
             vector = None if maker is None else maker.vector
             if environment == ALL and vector is not None:
@@ -294,20 +300,14 @@ class Rerun:
         self._steppers[key] = stepper
         return stepper
 
-    def _environment(self, maker: EnvironmentMaker | None, environment: int) -> tuple[object, bool]:
-        """Return an environment, and whether it may get all that is recorded."""
-        if self._make is not None:
-            return self._make(), True
-        if maker is None:
-            raise CannotRedo(why_not_made(maker, self._trust))
-        with trusting(self._recording.path, maker, self._trust) as trust:
-            make = make_vector if environment == ALL else make_environment
-            return make(maker, trust, self.render), trust
-
     def _compared(self, phase: str, environment: int, returned: Returned) -> RerunSteps:
         """Return the steps of an environment up to the first difference."""
         rows, got, starts, done = returned.rows, returned.got, returned.starts, returned.done
-        first = self._first_row(phase, environment, rows[:done], got[:done])
+        names = [name for name in got.dtype.names or () if name in (rows.dtype.names or ())]
+        first = first_difference(rows[:done], got[:done], names, self._tolerance)
+        digest = self._first_digest(phase, environment, rows[:done], got[:done])
+        if digest is not None and (first is None or digest < first[0]):
+            first = digest, "digest"
         failed = self._first_start(starts)
         differing = None
         if first is not None and (failed is None or starts[failed].row > first[0]):
@@ -333,13 +333,6 @@ class Rerun:
             difference = Difference(phase, number, t, step, environment, *values)
         frames = returned.frames[:done]
         return RerunSteps(phase, environment, rows[:done], got[:done], starts, frames, difference)
-
-    def _first_row(self, phase: str, environment: int, rows: Records, got: Records) -> tuple[int, str] | None:
-        """Return the first row that differs, and its first field that does; None if none does."""
-        names = [name for name in got.dtype.names or () if name in (rows.dtype.names or ())]
-        first = first_difference(rows, got, names, self._tolerance)
-        digest = self._first_digest(phase, environment, rows, got)
-        return (digest, "digest") if digest is not None and (first is None or digest < first[0]) else first
 
     def _first_start(self, starts: Sequence[Start]) -> int | None:
         """Return the number of the first reset with another observation; None if all are equal."""

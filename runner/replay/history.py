@@ -9,7 +9,7 @@ import numpy as np
 from runner.learning.watching import Watch
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
-from runner.util.arrays import Ints, Ints32
+from runner.util.arrays import Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +32,16 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     replay = TableReplay(recording)
     widths = np.array(replay.learner.model.width)
     is_action = np.arange(widths.max()) < widths[:, np.newaxis]
-    visits = np.zeros(is_action.shape, np.int64)
+    visits: Ints = np.zeros(is_action.shape, np.int64)
     changed_step = np.full(widths.sum(), -1)
     changed_episode = np.full(widths.sum(), -1)
     watch = _watch_of(replay, state)
     before = replay.begin_watch(watch).q
     for steps in replay.blocks(step):
         changes = replay.watch(steps, watch)
-        _count(visits, replay.learner.model.own_action[steps["action"][steps["state"] == state]])
+        taken = replay.learner.model.own_action[steps["action"][steps["state"] == state]]
+        for i, actions in enumerate(taken.T):
+            visits[i] += np.bincount(actions, minlength=visits.shape[1])
         values = np.concatenate([before, changes.q])
         bits = values.view(np.int64)
         rows, cells = np.nonzero(bits[1:] != bits[:-1])
@@ -69,9 +71,3 @@ def _watch_of(replay: TableReplay, state: int) -> Watch:
         on_path=np.empty((0, states), np.bool_),
         succeeds=np.empty(0, np.bool_),
     )
-
-
-def _count(visits: Ints, actions: Ints32) -> None:
-    """Count each learner's own `actions`, [visits, learners]."""
-    for i in range(len(visits)):
-        visits[i] += np.bincount(actions[:, i], minlength=visits.shape[1])

@@ -151,6 +151,8 @@ MEMORY_BYTES: Final = 4 * 10**9
 """How much a child process may allocate; importing RLlib, which wraps many games, takes 2.1 GB of it."""
 SECONDS: Final = 60.0
 """How long a child process may take for a block of steps, which is meant to take 0.2 s, or to begin."""
+_MAX_ERROR: Final = 500
+"""The most characters of an error of foreign code in a reason."""
 _MAX_OPTIONS: Final = 300
 """The most characters of the options of a reset in a reason."""
 
@@ -212,7 +214,8 @@ def using(failure: str) -> Iterator[None]:
         raise
     except Exception as error:  # foreign code raises anything
         raise_if_out_of_memory()
-        raise CannotRedo(f"{failure}: {type(error).__name__}: {_short(error)}") from error
+        text = " ".join(str(error).split())[:_MAX_ERROR]
+        raise CannotRedo(f"{failure}: {type(error).__name__}: {text}") from error
 
 
 def is_whole_vector(maker: EnvironmentMaker) -> bool:
@@ -521,7 +524,3 @@ def _without_display() -> None:
         os.environ.setdefault("PYOPENGL_PLATFORM", os.environ["MUJOCO_GL"])
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
-
-
-def _short(error: BaseException) -> str:
-    return " ".join(str(error).split())[:500]

@@ -227,11 +227,6 @@ def recorded_frames(
             yield frame
 
 
-def log_times_of(recording: Recording, phase: str, episode: int) -> list[int]:
-    """Return the `log_time` of each step of an episode, in nanoseconds."""
-    return [int(step["log_time"]) for step in transitions_of(recording, phase, episode)]
-
-
 def frames_every(recording: Recording) -> int:
     """Return after how many steps a frame was recorded, as its configuration says."""
     frames = recording.config.get("frames")

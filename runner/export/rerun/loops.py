@@ -27,7 +27,7 @@ from runner.recording.environment import observation_names
 from runner.recording.messages import decode_array, frame_place, media_type
 from runner.recording.reader import Recording
 from runner.recording.spaces import least_number, leaves_of
-from runner.replay.steps import frames_every, log_times_of
+from runner.replay.steps import frames_every, transitions_of
 from runner.util.arrays import Array, Flags, MaskedArray, Records, leaves
 
 MAX_BARS: Final = 16
@@ -191,7 +191,8 @@ class LoopTracks:
                 for number, t, pixels in redrawn(recording, phase, numbers, trust):
                     if t == 0:
                         after = [
-                            time // schema.STEP_NANOSECONDS for time in log_times_of(recording, phase, number)
+                            int(step["log_time"]) // schema.STEP_NANOSECONDS
+                            for step in transitions_of(recording, phase, number)
                         ]
                         times = [after[0] - 1, *after]
                         place = self._of_phase.episode(number).place
