@@ -17,7 +17,7 @@ from google.protobuf.message import DecodeError
 
 from runner.errors import RecordingError
 from runner.recording import schema
-from runner.recording.fields import Field, varint
+from runner.recording.fields import Field
 from runner.recording.layout import HEADER_BYTES, blank_records, constant_bytes, row_dtype
 from runner.recording.schema import LOG_LEVELS, STEP_NANOSECONDS, MessageType
 from runner.recording.spaces import RECORDED_DTYPE
@@ -172,41 +172,23 @@ def decode_rows(message: MessageType, messages: Sequence[Logged]) -> Records:
 def scalar_encoder(name: str, phase: str) -> Callable[[float, int, int], bytes]:
     """Return a function that encodes `dualtaxi.Scalar` messages, from value, step and episode.
 
-    It gives the same bytes as `encode`, in a tenth of the time, because only three numbers change. Neither
-    name nor phase may be empty.
+    It gives the same bytes as `encode`, in a quarter of the time, because only three numbers change.
     """
-    named, phased = name.encode(), phase.encode()
-    head = b"\n" + varint(len(named)) + named
-    middle = b"\x1a" + varint(len(phased)) + phased
-    before_value, before_step = head + b"\x11", middle + b"!"
-    pack = _scalar_struct(len(before_value), len(before_step), "cq").pack
-    pack_first = _scalar_struct(len(before_value), len(before_step), "").pack
-    pack_value, pack_number = _SCALAR_VALUE.pack, _SCALAR_NUMBER.pack
+    before_value, before_step = encode(schema.SCALAR, {"name": name}), encode(schema.SCALAR, {"phase": phase})
+    pack_value, pack_number = struct.Struct("<cd").pack, struct.Struct("<cq").pack
 
     def encode_scalar(value: float, step: int, episode: int) -> bytes:
-        if value and step and episode:
-            return pack(before_value, value, before_step, step, b")", episode)
-        if value and step:
-            return pack_first(before_value, value, before_step, step)
         # Protobuf leaves zeros out, but not a negative one.
-        is_zero = not value and math.copysign(1.0, value) > 0
+        has_value = value or math.copysign(1.0, value) < 0
         return (
-            (head if is_zero else head + pack_value(b"\x11", value))
-            + (middle + pack_number(b"!", step) if step else middle)
+            before_value
+            + (pack_value(b"\x11", value) if has_value else b"")
+            + before_step
+            + (pack_number(b"!", step) if step else b"")
             + (pack_number(b")", episode) if episode else b"")
         )
 
     return encode_scalar
-
-
-_SCALAR_VALUE: Final = struct.Struct("<cd")
-_SCALAR_NUMBER: Final = struct.Struct("<cq")
-
-
-@lru_cache(256)
-def _scalar_struct(before_value: int, before_step: int, after: str) -> struct.Struct:
-    """Return the layout of a `dualtaxi.Scalar`: bytes before its value and step, and format after these."""
-    return struct.Struct(f"<{before_value}sd{before_step}sq{after}")
 
 
 class Scalars(NamedTuple):
@@ -222,69 +204,21 @@ SCALAR_ROW: Final = np.dtype(
     [("series", "<i8"), ("log_time", "<u8"), ("step", "<i8"), ("episode", "<i8"), ("value", "<f8")]
 )
 """A logged value: the number of its series in `Scalars.series`, and the fields of its message."""
-_MAX_LAYOUTS: Final = 64
-"""The most layouts among payloads of one size; beyond these it is quicker to decode them one by one."""
 
 
 def decode_scalars(messages: Sequence[Logged]) -> Scalars:
     """Return `dualtaxi.Scalar` messages, given as log times and payloads.
 
-    Payloads that differ in nothing but the bytes of their numbers are decoded together.
-
     Raises:
         RecordingError: a payload is not such a message.
     """
     numbers: dict[tuple[str, str], int] = {}
-    rows = np.empty(len(messages), SCALAR_ROW)
-    rows["log_time"] = [time for time, _ in messages]
-    sizes = np.array([len(payload) for _, payload in messages])
-    for size in np.unique(sizes).tolist():
-        left = np.flatnonzero(sizes == size)
-        joined = b"".join([messages[k][1] for k in left.tolist()])
-        payloads = np.frombuffer(joined, np.uint8).reshape(len(left), size)
-        for _ in range(_MAX_LAYOUTS):
-            if not len(left):
-                break
-            fields = decode(schema.SCALAR, payloads[0].tobytes())
-            places = _number_places(fields, payloads[0].tobytes())
-            is_constant = np.ones(size, bool)
-            for at in places.values():
-                is_constant[at : at + 8] = False
-            alike = (payloads[:, is_constant] == payloads[0, is_constant]).all(axis=1)
-            same = rows[left[alike]]
-            same["series"] = numbers.setdefault((fields["name"], fields["phase"]), len(numbers))
-            for name in ("step", "episode", "value"):
-                same[name] = fields[name]
-            for name, at in places.items():
-                same[name] = payloads[alike, at : at + 8].view(SCALAR_ROW[name])[:, 0]
-            rows[left[alike]] = same
-            left, payloads = left[~alike], payloads[~alike]
-        for k in left.tolist():
-            time, payload = messages[k]
-            fields = decode(schema.SCALAR, payload)
-            number = numbers.setdefault((fields["name"], fields["phase"]), len(numbers))
-            rows[k] = number, time, fields["step"], fields["episode"], fields["value"]
-    _, first = np.unique(rows["series"], return_index=True)
-    order = np.argsort(first)
-    rows["series"] = np.argsort(order)[rows["series"]]
-    series = list(numbers)
-    return Scalars([series[k] for k in order.tolist()], rows)
-
-
-def _number_places(fields: Message, payload: bytes) -> dict[str, int]:
-    """Return where the numbers of a `dualtaxi.Scalar` begin; nothing if it was not written by `encode`."""
-    places: dict[str, int] = {}
-    if encode(schema.SCALAR, fields) == payload:
-        at = 0
-        for field in schema.SCALAR.fields:
-            value = fields[field.name]
-            if isinstance(value, str):
-                size = len(value.encode())
-                at += 1 + len(varint(size)) + size if size else 0
-            elif payload[at : at + 1] == bytes([field.number << 3 | 1]):  # zeros are left out
-                places[field.name] = at + 1
-                at += 9
-    return places
+    rows = []
+    for time, payload in messages:
+        scalar = _parsed(schema.SCALAR, payload)
+        number = numbers.setdefault((scalar.name, scalar.phase), len(numbers))
+        rows.append((number, time, scalar.step, scalar.episode, scalar.value))
+    return Scalars(list(numbers), np.array(rows, SCALAR_ROW))
 
 
 def decode(message: MessageType, payload: bytes) -> Message:
@@ -300,15 +234,19 @@ def decode(message: MessageType, payload: bytes) -> Message:
             for field in message.fields
             for value in (row[field.name],)
         }
-    try:
-        parsed = message_class(message).FromString(payload)
-    except DecodeError as error:
-        raise RecordingError(f"found a payload that is no {message.full_name} ({error})") from error
+    parsed = _parsed(message, payload)
     return {
         field.name: list(value) if field.repeated else value
         for field in message.fields
         for value in (getattr(parsed, field.stored_name),)
     }
+
+
+def _parsed(message: MessageType, payload: bytes) -> Any:
+    try:
+        return message_class(message).FromString(payload)
+    except DecodeError as error:
+        raise RecordingError(f"found a payload that is no {message.full_name} ({error})") from error
 
 
 def unknown_measures(message: MessageType, schema_data: bytes) -> list[str]:
