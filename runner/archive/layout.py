@@ -114,27 +114,21 @@ EXTRA_PREFIX: Final = "extra_"
 """The prefix of the columns of extras, which are null at a step without them."""
 NULLABLE: Final = frozenset({"data", "seed"})
 """The other nullable columns: the data of a snapshot that a replay computes, and the seed of a reset."""
-ENCODINGS: Final = {
-    **dict.fromkeys(("position", "step", "episode", "first_step", "last_step"), "DELTA_BINARY_PACKED"),
-    **dict.fromkeys(("t", "state", "next_state", "action"), "BYTE_STREAM_SPLIT"),
-    **dict.fromkeys(("explored", "terminated", "success"), "PLAIN"),
-    **dict.fromkeys(("taken", "truncated"), "RLE"),
-}
-"""The encodings of columns of steps and episodes; all others have a dictionary."""
-VALUES: Final = ("action_", "observation", "next_observation", EXTRA_PREFIX)
-"""The prefixes of columns with values of spaces; floats are split by byte."""
 
 
 def encodings_of(columns: pa.Schema) -> dict[str, str]:
     """Return the encodings of the columns without a dictionary; none for a table with lists."""
-    if any(pa.types.is_list(kind) for kind in columns.types):
+    if any(map(pa.types.is_list, columns.types)):
         return {}
-    values = {"value"} | {name for name in columns.names if name.startswith(VALUES)}
-    split = {column.name for column in columns if column.name in values and pa.types.is_floating(column.type)}
-    numbers = (column.name for column in columns if not pa.types.is_string(column.type))
-    special = {name: ENCODINGS[name] for name in numbers if name in ENCODINGS}
-    plain = {column.name for column in columns if pa.types.is_fixed_size_binary(column.type)}
-    return special | dict.fromkeys(split, "BYTE_STREAM_SPLIT") | dict.fromkeys(plain, "PLAIN")
+    encodings = {}
+    for column in columns:
+        if pa.types.is_integer(column.type):
+            encodings[column.name] = "DELTA_BINARY_PACKED"
+        elif pa.types.is_floating(column.type):
+            encodings[column.name] = "BYTE_STREAM_SPLIT"
+        elif pa.types.is_fixed_size_binary(column.type):
+            encodings[column.name] = "PLAIN"
+    return encodings
 
 
 MAX_MANIFEST_BYTES: Final = 1 << 20
