@@ -25,7 +25,6 @@ from runner.environments.naming import agent_actions, agent_of, joint_action, nu
 from runner.errors import ConfigError, RunnerError
 from runner.execution.session import Report, recorded_tables, run_job
 from runner.recording.reader import Recording, open_recording
-from runner.recording.reference import PackedChunks
 from runner.runs.branches import TrainingOrigin, origin_in
 from runner.runs.run import Run, create_run, recordings_folder, unless_empty
 from runner.util.processes import Stop
@@ -105,11 +104,9 @@ def train_branch(parent: Recording, job: Job, run: Run, report: Report, stop: St
         RunnerError: the episodes before the branch are not those of the parent.
     """
     step = job.config.branches[-1].step
-    packing = from_mapping(parent.config).recording.packing
     with unless_empty(run):
-        packed = PackedChunks.before(parent, step) if job.config.recording.packing == packing else None
         initial = recorded_tables(parent)
-        branch = run_job(job, run, report, stop, mdp=parent.mdp, initial=initial, packed=packed)
+        branch = run_job(job, run, report, stop, mdp=parent.mdp, initial=initial)
     _check_beginning(parent, branch, reference_to(parent, step).episode)
     return branch
 

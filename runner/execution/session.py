@@ -41,7 +41,7 @@ from runner.recording.metrics import METRICS, defined_metrics
 from runner.recording.observer import Observer
 from runner.recording.reader import Recording
 from runner.recording.recorder import Recorder
-from runner.recording.reference import PackedChunks, Reference
+from runner.recording.reference import Reference
 from runner.recording.writer import RecordingFile, create_recording
 from runner.replay.steps import last_step
 from runner.replay.tables import named_tables_at, tables_before_training
@@ -85,7 +85,6 @@ def run_job(
     mdp: Mdp | None = None,
     threads: bool = True,
     initial: Sequence[NamedTables] | None = None,
-    packed: PackedChunks | None = None,
 ) -> Run:
     """Train, evaluate and record a job; return its run, finished or interrupted.
 
@@ -110,7 +109,7 @@ def run_job(
             describe(file, job, run, learner, provenance)
             run = run.update(provenance=runs.made_by(provenance))
         beat = code.beat(run, file)
-        recorder = recorder_for(job, learner, file, beat=beat, threads=threads, packed=packed)
+        recorder = recorder_for(job, learner, file, beat=beat, threads=threads)
         return execute(Session(job, learner, recorder, report, stop), file, run, started, code)
 
 
@@ -345,7 +344,6 @@ def recorder_for(
     beat: Callable[[], None] = lambda: None,
     threads: bool = True,
     clock: bool = True,
-    packed: PackedChunks | None = None,
 ) -> Recorder:
     """Return a recorder for a learner's steps into a file, packed as in the job's configuration."""
     options = job.config.recording
@@ -364,7 +362,6 @@ def recorder_for(
         beat=beat,
         threads=threads,
         observer=observer,
-        packed=packed,
     )
 
 

@@ -199,8 +199,8 @@ class LoopRun:
 
     def write_status(self, status: str, summary: Mapping[str, object]) -> None:
         """Write how the run ended next to its recording, which is synced to disk within seconds."""
-        SYNCER.add(self.file.path, partial(_mark_unsynced, self.run.folder))
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
+        SYNCER.add(self.file.path, partial(_mark_unsynced, self.run.folder))
 
     def fold(self) -> Run:
         """Put together what several processes recorded, if this was the last one; return the whole run."""

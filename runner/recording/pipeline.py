@@ -25,7 +25,7 @@ import numpy as np
 
 from runner.recording.digest import ContentHash
 from runner.recording.layout import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, lone_message
-from runner.recording.records import Chunk, Packed, encode_chunk
+from runner.recording.records import Chunk, encode_chunk
 from runner.recording.schema import ACTIONS, RESET, RESET_OPTIONS, RESET_STATE, STEP, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile, storage_error
 from runner.util.arrays import Unsigned
@@ -119,7 +119,6 @@ class Pipeline:
         offsets: Unsigned,
         write: bool = True,
         done: Callable[[], None] = lambda: None,
-        packed: Packed | None = None,
     ) -> None:
         """Send message records of one topic; waits while too much is pending.
 
@@ -128,11 +127,10 @@ class Pipeline:
             log_times: nanoseconds, one a record.
             write: False leaves them out of the file; the digest covers them all the same.
             done: called when they were written, by the thread that writes.
-            packed: as for `encode_chunk`.
         """
         encode = None
         if write and self._file is not None:
-            encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing, packed)
+            encode = partial(encode_chunk, topic, records, log_times, offsets, self._packing)
         self._enqueue(_Work(topic, records, encode, done))
 
     def submit(self, topic: Topic, make: Callable[[], bytes], log_time: int) -> None:

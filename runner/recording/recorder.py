@@ -22,10 +22,9 @@ from runner.recording.layout import Layout, blank_records, lone_message, record_
 from runner.recording.messages import encode, encode_rows
 from runner.recording.observer import Observer
 from runner.recording.pipeline import MAX_BATCH_MESSAGES, MessageBatches, Pipeline
-from runner.recording.reference import PackedChunks, Reference
+from runner.recording.reference import Reference
 from runner.recording.schema import STEP_NANOSECONDS, MessageType, Topic
 from runner.recording.steps import EpisodeDigests, after_step, kept_dtype, packed, turns_of
-from runner.recording.topic_chunks import ChunkSpan
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Array, RecordDType, Records, Unsigned
 from runner.util.packing import Packing
@@ -65,8 +64,6 @@ class _Lane:
     """Number of whole blocks, at most `MAX_BLOCKS`."""
     has_started: bool = False
     """Whether it had its first block, which may be smaller."""
-    span: ChunkSpan | None = None
-    """The packed chunk that may be used for the open block."""
 
 
 class Recorder:
@@ -84,7 +81,6 @@ class Recorder:
             chunks of all topics are written together then, at each flush: whatever ends the process, the file
             has no steps without their resets. The caller calls `write_if_full`, and `flush`.
         observer: what it sees of the time, the machine and the output is recorded.
-        packed: the chunks of another recording, used again for the same messages.
     """
 
     def __init__(
@@ -98,12 +94,10 @@ class Recorder:
         threads: bool = True,
         before: Callable[[], None] | None = None,
         observer: Observer | None = None,
-        packed: PackedChunks | None = None,
     ) -> None:
         packing = replace(packing or Packing(), values=not layout.has_states)
         self._file = file
         self._watchers: dict[MessageType, Watcher] = {}
-        self._packed = packed
         self._grouped = before is not None
         self._chunk_steps = packing.chunk_steps
         self._reference = reference or Reference()
@@ -183,11 +177,6 @@ class Recorder:
             lane.open = self._take_block(lane)
         free = lane.open[lane.filled :]
         limit = self._reference.remaining(topic)
-        if self._packed is not None:  # end where a packed chunk does
-            count = self.counts[topic.name]
-            if lane.span is None or lane.span.stop <= count:
-                lane.span = self._packed.span(topic, count)
-            limit = lane.span.stop - count if lane.span else 0
         return free[:limit] if limit else free
 
     def fill(self, topic: Topic, positions: Unsigned) -> Iterator[tuple[Records, slice]]:
@@ -349,9 +338,7 @@ class Recorder:
             self._watchers[topic.message](topic, rows_of(lane.message, fresh))
         if has_reference:
             self._send_block(lane, write=False)
-        elif (lane.open is not None and lane.filled == len(lane.open)) or (
-            lane.span and lane.span.stop == self.counts[topic.name]
-        ):
+        elif lane.open is not None and lane.filled == len(lane.open):
             if self._grouped and topic.message is schema.STEP:
                 self._is_full |= lane.filled == lane.capacity  # the first, smaller block can wait
             self._send_block(lane)
@@ -380,11 +367,6 @@ class Recorder:
         block = lane.open
         filled = lane.open[: lane.filled]
         lane.open, lane.filled = None, 0
-        packed = None
-        span = lane.span
-        count = self.counts[lane.topic.name]
-        if self._packed and span and span[:2] == (count - len(filled), count):
-            packed = partial(self._packed.data, span.entry)
         is_whole = len(block) == lane.capacity  # the first, smaller one is not used again
         self._pipeline.send(
             lane.topic,
@@ -393,7 +375,6 @@ class Recorder:
             _offsets(len(filled), filled.itemsize),
             write=write and lane.write,
             done=partial(lane.free.put, block) if is_whole else lambda: None,
-            packed=packed,
         )
 
 

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from io import BytesIO
 from itertools import pairwise
 from typing import BinaryIO, Final, NamedTuple, Self
@@ -77,8 +76,6 @@ Place = tuple[int, int]
 """Where a record begins in the file, and how many bytes it has, its head included."""
 Report = Callable[[int, int], None]
 """Called with the bytes that were read, and the size of the file."""
-Packed = Callable[[str, bytes | memoryview], bytes | memoryview | None]
-"""Returns records packed with a compression, if they were packed before."""
 
 
 class MetadataRecord(NamedTuple):
@@ -254,20 +251,18 @@ def encode_chunk(
     log_times: Unsigned,
     offsets: Unsigned,
     packing: Packing,
-    packed: Packed | None = None,
 ) -> Chunk:
     """Return the chunk that holds these whole message records of one topic.
 
     Args:
         log_times: nanoseconds of each, ascending.
         offsets: where each begins in `records`.
-        packed: may return the records packed; by default, and if it does not, they are packed here.
     """
     codec = CODECS[packing.compression]
     name = codec.mcap_name.encode()
     width = len(records) // len(log_times) if topic.message is schema.STEP and packing.values else 0
     size, crc = len(records), crc32(records)
-    data = (packed and packed(codec.mcap_name, records)) or codec.pack(records, packing.level, width)
+    data = codec.pack(records, packing.level, width)
     if topic.message is schema.ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
         data = codec.pack(records, max(codec.levels, default=0), width)
     start, end = int(log_times[0]), int(log_times[-1])
@@ -517,25 +512,6 @@ def metadata_of(body: bytes) -> MetadataRecord:
         raise RecordingError(f"metadata of {len(body):,} bytes, expected {MAX_METADATA_BYTES:,} at most")
     record = Metadata.read(ReadDataStream(BytesIO(body)))
     return MetadataRecord(record.name, dict(record.metadata))
-
-
-def metadata_record(name: str, entries: Mapping[str, str]) -> bytes:
-    """Return a metadata record; the same as the library's, in a tenth of the time: there are many entries."""
-    pairs = _pairs(tuple(entries.items()))
-    body = prefixed(name) + struct.pack("<I", len(pairs)) + pairs
-    return RECORD_HEAD.pack(Opcode.METADATA, len(body)) + body
-
-
-@lru_cache(16)
-def _pairs(entries: tuple[tuple[str, str], ...]) -> bytes:
-    """Return the entries of a metadata record; cached, because the next run has the same packages."""
-    return b"".join(prefixed(text) for pair in entries for text in pair)
-
-
-def prefixed(text: str) -> bytes:
-    """Return a text as MCAP writes it, after its length."""
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
 
 
 def asks_for_indexes(config: dict[str, str]) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,6 @@ from runner.util.packing import MAX_CHUNK_BYTES
 M = TypeVar("M")
 FOREVER: Final = 2**63 - 1
 """A time in nanoseconds, and a number, that no message has."""
-
-
-class ChunkSpan(NamedTuple):
-    """A chunk, and the messages of its topic that it holds, by number."""
-
-    first: int
-    stop: int
-    """One more than the number of its last message."""
-    entry: ChunkEntry
 
 
 @dataclass(eq=False)
@@ -173,13 +164,6 @@ class TopicChunks:
         else:
             row = self._rows_of(number)[-1]
         return row
-
-    def holding(self, number: int) -> ChunkSpan | None:
-        """Return the chunk that holds a message of fixed width; None if there is none."""
-        firsts, ends = self.chunk_numbers
-        k = int(np.searchsorted(ends, number, side="right"))
-        is_held = k < len(ends) and firsts[k] <= number
-        return ChunkSpan(int(firsts[k]), int(ends[k]), self.entry(k)) if is_held else None
 
     def chunks_from(self, field: str, value: int) -> range:
         """Return the chunks from the last that begins below a value of a field that never decreases."""

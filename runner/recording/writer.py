@@ -5,24 +5,21 @@ of a long recording, are encoded by `records`.
 
 The operating system has every byte of a closed file, so a killed process loses none of them. Syncing protects
 them from a power failure; it takes milliseconds a file, and hardly more for many files at once. So finished
-files are synced in groups, off the thread that learns; the end of the interpreter waits for it.
+files are synced by several threads, off the thread that learns; the end of the interpreter waits for them.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import multiprocessing.util
 import os
-import threading
-import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import BinaryIO, Final, Self
 
 from isal.isal_zlib import crc32
-from mcap.records import Attachment, Header
+from mcap.records import Attachment, Header, Metadata
 
 from runner.errors import StorageError
 from runner.recording.index import Beginning, Index, beginning_of, checksum
@@ -36,15 +33,12 @@ from runner.recording.records import (
     asks_for_indexes,
     bytes_of,
     copied_chunk,
-    metadata_record,
 )
 from runner.recording.schema import PROFILE, TOPIC_OF
 from runner.util import __version__
 from runner.util.files import sync
 
 _LIBRARY = f"dualtaxi {__version__}"
-GROUP_SECONDS: Final = 1.0
-"""How long finished files wait for others."""
 _SYNCING_THREADS: Final = 8
 """How many files are synced at once: a journal commits them together."""
 
@@ -110,7 +104,7 @@ class RecordingFile:
 
     def add_metadata(self, name: str, entries: Mapping[str, str]) -> None:
         """Append a metadata record."""
-        self._index.add_metadata(name, self._append(metadata_record(name, entries)))
+        self._index.add_metadata(name, self._append(bytes_of(Metadata(name, dict(entries)))))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Append an attachment; its times are 0, because times of day belong to the provenance."""
@@ -238,78 +232,38 @@ def writing(file: RecordingFile) -> Iterator[None]:
 
 
 class Syncer:
-    """The finished files of this process that are not known to be on disk yet."""
+    """Threads that sync the finished files of this process; the end of the interpreter waits for them."""
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
         """Forget all files, as in a forked process: they belong to the other one."""
-        self._waiting: deque[tuple[Path, Failed]] = deque()  # safe without a lock
-        self._lock = threading.Lock()  # for the fields below; never held while files are synced
-        self._syncing = threading.Lock()  # held until all are on disk: who waits for it waits for them
-        self._thread: threading.Thread | None = None
-        self._is_exiting = False
-        self._ends_with_process = False
+        self._threads = ThreadPoolExecutor(_SYNCING_THREADS, thread_name_prefix="recording-sync")
 
     def add(self, path: Path, failed: Failed) -> None:
-        """Sync a finished file within seconds; at once if the interpreter ends."""
-        self._waiting.append((path.absolute(), failed))
-        with self._lock:
-            if self._thread is None and not self._is_exiting:
-                self._thread = threading.Thread(target=self._serve, name="recording-sync", daemon=True)
-                self._thread.start()
-            if not self._ends_with_process and multiprocessing.parent_process() is not None:
-                # a child of multiprocessing ends without `atexit`
-                multiprocessing.util.Finalize(None, self.exit, exitpriority=0)
-                self._ends_with_process = True
-        if self._is_exiting:
-            self.sync()
+        """Sync a finished file soon; at once if the interpreter is ending."""
+        path = path.absolute()
+        try:
+            self._threads.submit(_sync, path, failed)
+        except RuntimeError:  # no thread can be started
+            _sync(path, failed)
 
     def sync(self) -> None:
         """Return when every file that was added is on disk."""
-        with self._syncing:
-            helpers = []
-            with contextlib.suppress(RuntimeError):  # no thread can be started while the interpreter ends
-                for _ in range(min(_SYNCING_THREADS, len(self._waiting)) - 1):
-                    helper = threading.Thread(target=self._sync_waiting, name="recording-sync", daemon=True)
-                    helper.start()
-                    helpers.append(helper)
-            self._sync_waiting()
-            for helper in helpers:
-                helper.join()
+        self._threads.shutdown()
+        self.clear()
 
-    def exit(self) -> None:
-        """Sync every file before the interpreter ends, and later ones at once."""
-        with self._lock:
-            self._is_exiting = True
-        self.sync()
 
-    def _serve(self) -> None:
-        while True:
-            time.sleep(GROUP_SECONDS)
-            self.sync()
-            with self._lock:
-                if not self._waiting:
-                    self._thread = None
-                    return
-
-    def _sync_waiting(self) -> None:
-        while True:
-            try:
-                path, failed = self._waiting.popleft()
-            except IndexError:
-                return
-            try:
-                sync(path)
-            except FileNotFoundError:
-                continue  # it was removed since
-            except OSError as error:
-                with contextlib.suppress(Exception):  # the other files are synced, whatever comes of this one
-                    failed(error)
+def _sync(path: Path, failed: Failed) -> None:
+    try:
+        sync(path)
+    except FileNotFoundError:
+        pass  # it was removed since
+    except OSError as error:
+        failed(error)
 
 
 SYNCER: Final = Syncer()
-atexit.register(SYNCER.exit)
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=SYNCER.clear)

@@ -1,4 +1,4 @@
-"""Finished loops are synced to disk in groups, and lose nothing before that when their process is killed."""
+"""Finished loops are synced to disk by threads, and lose nothing before that when their process is killed."""
 
 import errno
 import os
@@ -16,7 +16,7 @@ from runner.recording import writer
 from runner.runs.run import run_at
 
 RECORD = """
-import os, signal, sys
+import os, signal, sys, time
 from pathlib import Path
 import gymnasium
 import runner
@@ -43,7 +43,7 @@ def test_a_process_killed_after_close_loses_nothing(tmp_path: Path) -> None:
     done = script(
         tmp_path,
         """
-        writer.GROUP_SECONDS = 3600
+        writer.sync = lambda path: time.sleep(3600)
         for _ in range(3):
             record().close()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -62,7 +62,6 @@ def test_the_interpreter_ends_when_all_is_on_disk(tmp_path: Path) -> None:
     done = script(
         tmp_path,
         """
-        writer.GROUP_SECONDS = 3600
         writer.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
         closed = [record() for _ in range(20)]
         for env in closed:
@@ -80,7 +79,6 @@ def test_a_forked_worker_ends_when_its_loops_are_on_disk(tmp_path: Path) -> None
         tmp_path,
         """
         import multiprocessing
-        writer.GROUP_SECONDS = 3600
         writer.sync = lambda path: os.write(1, f"{path.parent.name}\\n".encode())
         worker = multiprocessing.get_context("fork").Process(target=lambda: record().close())
         worker.start()
