@@ -16,12 +16,12 @@ from runner.analysis.sections import Answer, Grid, Section
 from runner.environments.mdp import Mdp
 from runner.environments.naming import action_names, actions_in_words, numbered, state_of, states_in_words
 from runner.errors import ConfigError, NotInRecording
+from runner.learning.watching import new_watch
 from runner.recording.messages import Snapshot
 from runner.recording.reader import Recording
-from runner.replay.history import StateHistory, history_of
 from runner.replay.steps import last_step, step_of_episode
 from runner.replay.tables import TableReplay
-from runner.util.arrays import Floats
+from runner.util.arrays import Floats, Ints
 from runner.util.humanize import UNKNOWN, number
 from runner.util.values import Json
 
@@ -293,3 +293,50 @@ def _replayed_values(
             if "policy" in named:
                 value["policy"] = float(named["policy"][state, action])
             yield value
+
+
+# --- the history of a state ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class StateHistory:
+    """How often a state was visited, and when its values last changed; arrays [learners, most actions].
+
+    An entry beyond a learner's own actions has no meaning.
+    """
+
+    visits: Ints
+    """How often the learner took the action there."""
+    changed_step: Ints
+    """The step that last changed the value; -1 for never. An update by nothing changes nothing."""
+    changed_episode: Ints
+    """The episode of that step."""
+
+
+def history_of(recording: Recording, state: int, step: int) -> StateHistory:
+    """Return the history of a state's values in the first `step` training steps, by replaying them."""
+    replay = TableReplay(recording)
+    widths = np.array(replay.learner.model.width)
+    is_action = np.arange(widths.max()) < widths[:, np.newaxis]
+    visits = np.zeros(is_action.shape, np.int64)
+    changed_step = np.full(widths.sum(), -1)
+    changed_episode = np.full(widths.sum(), -1)
+    offsets = zip(replay.learner.tables.offset, widths, strict=True)
+    cells = np.concatenate([offset + state * width + np.arange(width) for offset, width in offsets])
+    watch = new_watch(np.arange(replay.learner.mdp.states) == state, cells)
+    before = replay.begin_watch(watch).q
+    for steps in replay.blocks(step):
+        changes = replay.watch(steps, watch)
+        taken = replay.learner.model.own_action[steps["action"][steps["state"] == state]]
+        for i, actions in enumerate(taken.T):
+            visits[i] += np.bincount(actions, minlength=len(visits[i]))
+        values = np.concatenate([before, changes.q])
+        bits = values.view(np.int64)
+        rows, cells = np.nonzero(bits[1:] != bits[:-1])
+        changed_step[cells] = steps["step"][changes.row[rows]]  # of several the last
+        changed_episode[cells] = steps["episode"][changes.row[rows]]
+        before = values[-1:]
+    history = StateHistory(visits, np.full(visits.shape, -1), np.full(visits.shape, -1))
+    history.changed_step[is_action] = changed_step
+    history.changed_episode[is_action] = changed_episode
+    return history

@@ -154,6 +154,6 @@ def restore_to(folder: Path, path: Path | None, digest: str, report: Report) -> 
 
 def _restore(folder: Path, path: Path | None, report: Report = report_progress) -> str:
     """Restore an archive; return its digest."""
-    from runner.archive.restoring import restore
+    from runner.archive.reading import restore
 
     return restore(folder, path, report).digest

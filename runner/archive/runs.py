@@ -13,7 +13,7 @@ from pathlib import Path
 
 from runner.archive.layout import CONTENTS, Manifest
 from runner.archive.places import archive_store, restore_to
-from runner.archive.restoring import restore
+from runner.archive.reading import restore
 from runner.archive.store import ArchiveStore, no_archive, split_place, temporary_folder
 from runner.archive.writing import write_archive
 from runner.errors import RecordingError, RunnerError, StorageError

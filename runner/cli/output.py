@@ -19,7 +19,7 @@ import click
 
 from runner.analysis.sections import Grid, Section, markdown
 from runner.errors import ExitCode
-from runner.export.places import require_new
+from runner.util.files import require_new
 from runner.util.humanize import printable, size
 from runner.util.values import finite
 

@@ -44,8 +44,8 @@ from runner.cli.runs import (
     two_recorded_runs,
 )
 from runner.errors import RunnerError
-from runner.export.places import new_file, require_new
 from runner.runs.run import Run, command_for
+from runner.util.files import new_file, require_new
 from runner.util.humanize import size
 from runner.views.view import ONLY_HERE, PAGE, Input, ShownProgress, View
 

@@ -30,7 +30,7 @@ from runner.config import from_mapping
 from runner.environments.naming import actions_in_words, numbered_actions, states_in_words
 from runner.errors import RecordingError, RunnerError, nearest
 from runner.learning.learner import rules_of
-from runner.learning.watching import Watch, WatchedValues, explorations
+from runner.learning.watching import Watch, WatchedValues, explorations, new_watch
 from runner.recording.reader import Recording
 from runner.replay.tables import TableReplay
 from runner.util.arrays import Flags, Ints, Records
@@ -353,18 +353,8 @@ class JobColumns:
                 f"{self._mdp.states:,} states, expected at most {MAX_CELLS:,} values and {MAX_PATH_STATES:,} "
                 "states on paths; ask for parts of it."
             )
-        paths = len(self._paths), self._mdp.states
-        return Watch(
-            states=states,
-            cells=np.array(cells, np.int64),
-            greedy=np.array(greedy, np.int64).reshape(-1, 2),
-            starts=np.array([quantity.state for quantity in self._paths], np.int64),
-            success=np.uint32(self._mdp.success_mask),
-            path=np.zeros(paths, np.int32),
-            length=np.zeros(len(self._paths), np.int64),
-            on_path=np.zeros(paths, np.bool_),
-            succeeds=np.zeros(len(self._paths), np.bool_),
-        )
+        path_starts = [quantity.state for quantity in self._paths]
+        return new_watch(states, np.array(cells, np.int64), greedy, path_starts, self._mdp.success_mask)
 
     def take(self, block: Records, needed: int) -> Iterator[tuple[Ints, Columns]]:
         """Yield the places in a block after which quantities may have changed, and the values there.

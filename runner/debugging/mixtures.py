@@ -34,7 +34,7 @@ from runner.planning.exact import ExactEvaluator
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
 from runner.runs.branches import training_branches
-from runner.sweep.objective import readings
+from runner.sweep.task import readings
 from runner.sweep.workers import Workers
 from runner.util import __version__
 from runner.util.arrays import Floats

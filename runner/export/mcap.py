@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from runner.errors import RecordingError, RunnerError
-from runner.export.places import new_file
 from runner.recording.code import CODE_ATTACHMENT, CODE_RECORD
 from runner.recording.labels import Labels
 from runner.recording.reader import open_recording
@@ -16,6 +15,7 @@ from runner.recording.rewriting import rewrite
 from runner.recording.schema import CONSOLE_TOPIC
 from runner.runs.importing import EXPORT_RECORD, import_record
 from runner.runs.run import Run
+from runner.util.files import new_file
 
 PRIVATE: Final = ("host", "user", "command", "directory")
 """The entries of provenance that identify persons and places."""

@@ -38,6 +38,28 @@ class Watch(NamedTuple):
     """[P]: whether the path has an event of success."""
 
 
+def new_watch(
+    states: Flags,
+    cells: Ints,
+    greedy: Sequence[tuple[int, int]] = (),
+    starts: Sequence[int] = (),
+    success: int = 0,
+) -> Watch:
+    """Return what to watch, with room for the greedy paths."""
+    paths = len(starts), len(states)
+    return Watch(
+        states,
+        cells,
+        np.array(greedy, np.int64).reshape(-1, 2),
+        np.array(starts, np.int64),
+        np.uint32(success),
+        np.zeros(paths, np.int32),
+        np.zeros(len(starts), np.int64),
+        np.zeros(paths, np.bool_),
+        np.zeros(len(starts), np.bool_),
+    )
+
+
 class WatchedValues(NamedTuple):
     """The watched values after the steps of a block that could change them, a row for each."""
 

@@ -5,7 +5,7 @@
         print(hit.run_id, hit.at, hit.ret)
 
 DuckDB asks the index of episodes, a file for each run; steps are read of those episodes alone that the index
-does not decide. `runner.query.conditions` has the language.
+does not decide. `runner.query.episode_index` has the language.
 """
 
 from __future__ import annotations
@@ -24,9 +24,12 @@ from runner.analysis.episodes import EpisodeRef, mark_steps
 from runner.analysis.sections import Grid
 from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
-from runner.query.conditions import ENDS, EpisodeParser, Facts, NotInRun
 from runner.query.episode_index import (
+    ENDS,
     EpisodeIndex,
+    EpisodeParser,
+    Facts,
+    NotInRun,
     facts_of,
     in_files,
     kind_of,

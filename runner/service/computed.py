@@ -63,7 +63,7 @@ from runner.util.extras import require
 from runner.util.humanize import sentence
 from runner.util.values import finite
 from runner.views.queries import MAX_ROWS
-from runner.views.sweeps import sweep_show
+from runner.views.runs import sweep_show
 from runner.views.view import Given
 
 MAX_FILM_STEPS: Final = 5_000

@@ -1,15 +1,14 @@
 """Sweeps: many runs of one experiment with different values, from a grid, at random or by a search.
 
-model      the contents of a sweep file: parameters, strategies, objective, limits
-loading    reading a sweep file, with located errors
-objective  readings of a metric during a run, and what a run is worth
-task       one run, as a worker does it
-workers    processes of this machine or actors of Ray, which run tasks
-state      a sweep on disk: its resolved file and its lock; progress follows from its runs
-trials     the values to try next, by Optuna, and what is recorded of the trials
-running    a sweep from its start to its end: what it will take, and the loop over batches of runs
-results    ranking, importance, the best configuration
-charts     charts of the trials, one sheet with all of them, and the sweep as a page
+model    the contents of a sweep file: parameters, strategies, objective, limits
+loading  reading a sweep file, with located errors
+task     one run, as a worker does it; its readings of a metric, what it is worth, and pruning
+workers  processes of this machine or actors of Ray, which run tasks
+state    a sweep on disk: its resolved file and its lock; progress follows from its runs
+trials   the values to try next, by Optuna, and what is recorded of the trials
+running  a sweep from its start to its end: what it will take, and the loop over batches of runs
+results  ranking, importance, the best configuration
+charts   charts of the trials, one sheet with all of them, and the sweep as a page
 
 This module loads nothing heavy, so that commands can look for sweeps first.
 """

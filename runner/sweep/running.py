@@ -28,8 +28,7 @@ from runner.runs.run import create_run, new_run, run_in
 from runner.runs.trust_marks import environment_of_job, mark
 from runner.sweep import state, tag_of
 from runner.sweep.model import Sweep, SweepLimits
-from runner.sweep.objective import Curve, curve_of
-from runner.sweep.task import Result, Task
+from runner.sweep.task import Curve, Result, Task, curve_of
 from runner.sweep.trials import JobResults, Search, Trial, Trials, best_of
 from runner.sweep.workers import Workers, worker_pool
 from runner.util.humanize import size

@@ -21,8 +21,7 @@ import numpy as np
 from runner.config import ConfigError
 from runner.sweep import state
 from runner.sweep.model import Parameter, Range, Sweep, count_of, points_of
-from runner.sweep.objective import Curve, pruning_bounds, value_of
-from runner.sweep.task import Result, result_of
+from runner.sweep.task import Curve, Result, pruning_bounds, result_of, value_of
 from runner.util.extras import require
 from runner.util.values import Json
 

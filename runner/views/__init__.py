@@ -34,8 +34,8 @@ _MODULES: Final = {
     "find": "queries",
     "sql": "queries",
     "table": "tables",
-    "sweep show": "sweeps",
-    "sweep ls": "sweeps",
+    "sweep show": "runs",
+    "sweep ls": "runs",
 }
 """The shipped views, each in capitals in its module; those of one run in the order of their tabs."""
 NAMES: Final = tuple(_MODULES)

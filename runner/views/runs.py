@@ -1,4 +1,4 @@
-"""Views of runs: the list of them, all about one, and the disk that they use."""
+"""Views of runs and sweeps: the lists of them, all about one, and the disk that runs use."""
 
 from __future__ import annotations
 
@@ -23,10 +23,11 @@ from runner.runs.catalogue.columns import (
     needed_for,
     with_same_as,
 )
+from runner.sweep import sweeps_in
 from runner.util.humanize import capitalised, first_remarks
 from runner.util.row_text import csv_lines, json_list
 from runner.util.values import Json
-from runner.views.view import NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
+from runner.views.view import EVERYTHING, NO_PROGRESS, ONLY_HERE, ReadyAnswer, ShownProgress, View, view_input
 
 if TYPE_CHECKING:
     from runner.analysis.summary import RunDetails
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from runner.runs.catalogue.index import CatalogueIndex
     from runner.runs.catalogue.usage import Sums, Usage
     from runner.runs.run import Run
+    from runner.sweep.results import Results
 
 ON_A_TERMINAL: Final = 50
 """Runs listed on a terminal by default."""
@@ -406,3 +408,54 @@ def du(
 
 
 DU: Final = View("du", "Disk", du, subject="folders")
+
+
+def sweep_ls(recordings: Path) -> ReadyAnswer:
+    """List the sweeps of a recordings folder.
+
+    Example:
+      dualtaxi sweep ls
+    """
+    names = sweeps_in(recordings)
+    return ReadyAnswer(
+        {"sweeps": names},
+        [Section("", names)] if names else [],
+        lines={"text": [f"{name}\n" for name in names]},
+        remarks=[] if names else ["No sweeps yet. `dualtaxi sweep run FILE` starts one."],
+    )
+
+
+SWEEP_LS: Final = View("sweep ls", "Sweeps", sweep_ls, subject="folder")
+
+
+def sweep_show(
+    sweep: tuple[str, Path],
+    everything: bool = EVERYTHING,
+    progress: ShownProgress = NO_PROGRESS,
+) -> Results:
+    """Rank the trials of the sweep NAME with intervals over seeds, and show which parameters mattered.
+
+    The value of a trial is the median over its seeds, shown with the interquartile mean (IQM) and its 95 %
+    bootstrap interval, for four seeds and more. What mattered is the share of the objective's variance that
+    each parameter explains (functional ANOVA), and each pair in a completed grid. --all lists every trial.
+
+    Examples:
+      dualtaxi sweep show hyperparameters
+      dualtaxi sweep show hyperparameters --write-best best.yaml
+    """
+    from runner.sweep.results import results_of
+
+    with progress.stage("ranking trials"):
+        results = results_of(*sweep)
+    return replace(results, shown=None) if everything else results
+
+
+SWEEP_SHOW: Final = View(
+    "sweep show",
+    "Sweep",
+    sweep_show,
+    subject="sweep",
+    file_ending=".yaml",
+    file_flags=("--write-best",),
+    file_help="Write the best configuration, with fresh seeds; `dualtaxi run` confirms it.",
+)

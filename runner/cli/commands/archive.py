@@ -18,8 +18,8 @@ from runner.cli.parameter_types import PATH, RunName
 from runner.cli.progress import stage_line, steps_line
 from runner.cli.runs import compilation_notice, find, received, recorded_run, run_reply, runs_folder
 from runner.errors import RunnerError
-from runner.export.places import new_file
 from runner.runs.run import Run
+from runner.util.files import new_file
 from runner.util.humanize import size
 from runner.util.row_text import json_lines
 

@@ -25,10 +25,10 @@ from runner.cli.parameter_types import GRID, Number
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import compilation_notice, open_for_export, recorded_run
 from runner.errors import ExitCode
-from runner.export.places import new_file, new_folder, require_new
 from runner.export.plugin import installed_export
 from runner.runs.run import Run
 from runner.util.extras import EXPORTS, require
+from runner.util.files import new_file, new_folder, require_new
 from runner.util.humanize import duration, size
 from runner.util.values import Ranges
 

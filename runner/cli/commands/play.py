@@ -26,8 +26,8 @@ from runner.cli.output import Remark, Reply, console, echo, say
 from runner.cli.parameter_types import FILE, PICTURE_SIZE, STEP, Number, RunName
 from runner.cli.progress import stage_line
 from runner.cli.runs import compilation_notice, find_recorded, recorded_run
-from runner.export.places import require_new
 from runner.runs.run import Run
+from runner.util.files import require_new
 from runner.util.row_text import json_lines
 
 if TYPE_CHECKING:

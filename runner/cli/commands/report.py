@@ -20,8 +20,8 @@ from runner.cli.parameter_types import EPISODE, TRIAL
 from runner.cli.progress import count_line, stage_line
 from runner.cli.runs import find_all_recorded, runs_folder
 from runner.cli.views import option_of
-from runner.export.places import new_file, write_text_new
 from runner.sweep import is_sweep
+from runner.util.files import new_file, write_text_new
 from runner.util.humanize import counted, sentence, size
 from runner.views.compare import AXIS, NORMALISE
 

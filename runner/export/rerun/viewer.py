@@ -16,13 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from runner.errors import RunnerError
-from runner.export.places import new_file
 from runner.export.rerun.selection import Request, Selection, select
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.util import __version__, files
 from runner.util.extras import missing
-from runner.util.files import CACHE_VARIABLE, CACHED_EXPORTS, RUN_SEPARATOR, storage_errors
+from runner.util.files import CACHE_VARIABLE, CACHED_EXPORTS, RUN_SEPARATOR, new_file, storage_errors
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient

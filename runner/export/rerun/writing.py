@@ -14,7 +14,6 @@ import rerun as rr
 
 from runner.drawing import palette
 from runner.environments.naming import spoken
-from runner.export.places import new_file
 from runner.export.rerun.loops import LoopTracks, logged_tracks
 from runner.export.rerun.metrics import mark_tracks, metric_tracks, phase_colours, series_lines
 from runner.export.rerun.scene import GridLabels, background, scene_of
@@ -37,6 +36,7 @@ from runner.recording.reader import open_recording
 from runner.recording.steps import taken
 from runner.runs.run import Run
 from runner.util.arrays import Records, in_blocks
+from runner.util.files import new_file
 
 T = TypeVar("T")
 _BATCH_BYTES: Final = 64 << 20

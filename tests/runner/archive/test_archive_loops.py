@@ -17,7 +17,7 @@ from gymnasium.vector import SyncVectorEnv
 import runner
 from runner.archive import layout, places
 from runner.archive.layout import Manifest, entries_of, read_manifest
-from runner.archive.restoring import restore
+from runner.archive.reading import restore
 from runner.errors import RecordingError
 from runner.execution.verify import verify
 from runner.recording import schema

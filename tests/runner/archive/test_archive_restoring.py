@@ -16,8 +16,7 @@ import pytest
 
 from runner.archive import layout
 from runner.archive.layout import Entry, Manifest, entries_of
-from runner.archive.reading import Archive
-from runner.archive.restoring import restore
+from runner.archive.reading import Archive, restore
 from runner.archive.runs import archive_run
 from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify

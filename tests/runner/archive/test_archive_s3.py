@@ -14,7 +14,7 @@ from pyarrow import parquet as pq
 import runner
 from runner.archive import layout
 from runner.archive.layout import Manifest, entries_of
-from runner.archive.restoring import restore
+from runner.archive.reading import restore
 from runner.archive.runs import archive_run
 from runner.archive.store import ArchiveStore
 from runner.cli import cli

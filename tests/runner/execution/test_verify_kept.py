@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from runner.analysis.qtable import history_of
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.reader import open_recording
-from runner.replay.history import history_of
 from tests.data.make import LOOPS, NAMES, TOGETHER, expectations, loop_expectations
 
 DATA = Path(__file__).parents[2] / "data"

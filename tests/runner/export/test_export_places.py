@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 
-from runner.export.places import new_file
+from runner.util.files import new_file
 
 
 def test_the_next_export_removes_what_killed_ones_left_and_nothing_else(tmp_path):

@@ -13,7 +13,7 @@ from mpe2 import simple_spread_v3
 from PIL import Image
 
 import runner
-from runner.archive.restoring import restore
+from runner.archive.reading import restore
 from runner.errors import CannotRedo, ConfigError
 from runner.export.pictures import Pictures, PictureSource, encoded_pictures
 from runner.recording import schema

@@ -22,7 +22,7 @@ from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.errors import RunnerError
 from runner.query import episode_index
-from runner.query.conditions import EpisodeParser
+from runner.query.episode_index import EpisodeParser
 from runner.query.sql_views import SelectedRuns
 from runner.recording.reader import open_recording
 from runner.runs.resolve import find_run

@@ -8,13 +8,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import runner
+from runner.analysis.qtable import history_of
 from runner.environments.loading import load_mdp
 from runner.errors import RecordingError
 from runner.learning.learner import Learner
 from runner.recording import schema
 from runner.recording.layout import blank_records, layout_of
 from runner.recording.reader import open_recording
-from runner.replay.history import history_of
 from runner.replay.steps import last_step, step_of_episode
 from runner.replay.tables import TableReplay, tables_at
 from tests.runner.altering import altered, without_chunk

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from runner.recording.code import MAX_CODE_BYTES, Code, parse_code
-from runner.runs.code import collect
-from runner.runs.git import NotRecorded, read_repository
+from runner.runs.code import NotRecorded, collect, read_repository
 from tests.runner.runs.repositories import git, new_project
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")

@@ -15,7 +15,7 @@ import pytest
 import zstandard
 from click.testing import CliRunner
 
-from runner.archive.restoring import restore
+from runner.archive.reading import restore
 from runner.cli import cli
 from runner.config import from_mapping
 from runner.config.model import Job

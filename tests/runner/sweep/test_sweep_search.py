@@ -16,8 +16,8 @@ from runner.sweep import state
 from runner.sweep.charts import drawn_trials, parameters_section
 from runner.sweep.loading import from_values
 from runner.sweep.model import STRATEGIES, Objective
-from runner.sweep.objective import curve_of, pruning_bounds, should_prune, value_of
 from runner.sweep.results import results_of
+from runner.sweep.task import curve_of, pruning_bounds, should_prune, value_of
 from runner.sweep.trials import Search, Trials
 
 CURVE = {0: 0.0, 100: 40.0, 200: 80.0, 300: 60.0}
