@@ -318,7 +318,7 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
     replay = TableReplay(recording)
     widths = np.array(replay.learner.model.width)
     is_action = np.arange(widths.max()) < widths[:, np.newaxis]
-    visits = np.zeros(is_action.shape, np.int64)
+    visits: Ints = np.zeros(is_action.shape, np.int64)
     changed_step = np.full(widths.sum(), -1)
     changed_episode = np.full(widths.sum(), -1)
     offsets = zip(replay.learner.tables.offset, widths, strict=True)
@@ -329,7 +329,7 @@ def history_of(recording: Recording, state: int, step: int) -> StateHistory:
         changes = replay.watch(steps, watch)
         taken = replay.learner.model.own_action[steps["action"][steps["state"] == state]]
         for i, actions in enumerate(taken.T):
-            visits[i] += np.bincount(actions, minlength=len(visits[i]))
+            visits[i] += np.bincount(actions, minlength=visits.shape[1])
         values = np.concatenate([before, changes.q])
         bits = values.view(np.int64)
         rows, cells = np.nonzero(bits[1:] != bits[:-1])
