@@ -375,12 +375,19 @@ class PendingExtras:
         """Hand the first n rows to the recorder."""
         if n <= 0:
             return
-        given = self._given(n)
+        given = {name: np.ones(n, np.bool_) for name in self._columns}
+        for row, names in self._partial.items():
+            if row < n:
+                for name in given.keys() - names:  # blank what the row does not have
+                    given[name][row] = False
+                    column = self._columns[name]
+                    column.values[row : row + 1].fill(NOTHING if column.dtype is None else 0)
         columns = {}
         for name, column in self._columns.items():
             columns[name] = column.values[:n].reshape(-1, *column.shape[len(self._batch) :])
         steps = np.add.outer(np.array(self._steps[:n]), np.arange(self._n)).ravel()
-        self._writer.put(self._phase, steps, columns, given)
+        flags = {name: np.repeat(are_given, self._n) for name, are_given in given.items()}
+        self._writer.put(self._phase, steps, columns, flags)
         self._final[self._phase] = int(steps[-1])
         del self._steps[:n]
         left = len(self._steps)
@@ -390,17 +397,6 @@ class PendingExtras:
         self._max_rows = self._room
         self._held = 0
         self._held_row -= n
-
-    def _given(self, n: int) -> dict[str, Flags]:
-        """Return whether each environment's step has a value, by name, in n rows; blank those without one."""
-        given = {name: np.ones(n, np.bool_) for name in self._columns}
-        for row, names in self._partial.items():
-            if row < n:
-                for name in given.keys() - names:
-                    given[name][row] = False
-                    column = self._columns[name]
-                    column.values[row : row + 1].fill(NOTHING if column.dtype is None else 0)
-        return {name: np.repeat(flags, self._n) for name, flags in given.items()}
 
 
 def _fixed_size(description: Description | None) -> int:

@@ -373,10 +373,15 @@ class _Fold:
         phase = topic.phase
         read = self._read[source.number]
         if topic.message in (schema.RESET_OPTIONS, schema.RESET_STATE):
-            for attached in _of_resets(source, topic):
+            tables = source.recording.phase(phase)
+            is_state = topic.message == schema.RESET_STATE
+            for attached in tables.reset_states() if is_state else tables.reset_options():
                 read[topic.name] += 1
-                # Other processes may come between the resets of a call, so each gets its options.
-                alone = attached._replace(resets=1) if isinstance(attached, ResetOptions) else attached
+                alone: ResetState | ResetOptions
+                if isinstance(attached, ResetState):
+                    alone = attached._replace(environment=source.environment + attached.environment)
+                else:  # other processes may come between the resets of a call, so each gets its options
+                    alone = attached._replace(resets=1)
                 after = source.units[phase]["reset"] - attached.reset
                 for unit in source.units[phase][(after >= 0) & (after < attached.resets)]:
                     moved = alone._replace(reset=int(unit["new_reset"]))
@@ -437,15 +442,6 @@ class _Fold:
         elif source is (self._main if topic == schema.CLOCK_TOPIC else self._sources[0]):
             # Of a machine or a process, such as what it printed.
             yield position, encode(topic.message, fields)
-
-
-def _of_resets(source: Source, topic: Topic) -> Iterator[ResetOptions] | Iterator[ResetState]:
-    """Yield what a process recorded of its resets in a topic, with the environments' numbers in the run."""
-    phase = source.recording.phase(topic.phase)
-    if topic.message == schema.RESET_OPTIONS:
-        return phase.reset_options()
-    states = phase.reset_states()
-    return (state._replace(environment=source.environment + state.environment) for state in states)
 
 
 def _kept(name: str, reason: str) -> str:

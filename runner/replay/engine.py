@@ -320,7 +320,7 @@ class Rerun:
             starts = starts[: failed + 1]
             _, reset, value, _ = starts[failed]
             part, was, now = self._observation(reset.observation, value)
-            differing = _place_of_reset(reset), (f"first {part}", was, now)
+            differing = (reset.episode, 0, reset.step), (f"first {part}", was, now)
         elif returned.error is not None:
             text = f"{type(returned.error).__name__}: {returned.error}"
             differing = _failed_at(returned, text), ("error", None, text)
@@ -393,17 +393,14 @@ def _place_of(row: np.void) -> tuple[int, int, int]:
     return int(row["episode"]), int(row["t"]), int(row["step"])
 
 
-def _place_of_reset(reset: RecordedReset) -> tuple[int, int, int]:
-    return reset.episode, 0, reset.step
-
-
 def _failed_at(returned: Returned, text: str) -> tuple[int, int, int]:
     """Return where an environment raised an error: in the first row or reset that it did not return from."""
     rows = returned.rows
     done = returned.done
     waiting = returned.resets[len(returned.starts) :]
     if waiting and (waiting[0][0] <= done or done >= len(rows)):
-        return _place_of_reset(waiting[0][1])
+        _, reset = waiting[0]
+        return reset.episode, 0, reset.step
     if not len(rows):  # another environment of the vector raised it
         raise CannotRedo(f"The vector environment fails: {text}")
     return _place_of(rows[min(done, len(rows) - 1)])
