@@ -11,8 +11,7 @@ import psutil
 from benchmarks.figures import Figure, figure, seconds
 from runner.runs.run import list_runs
 from runner.sweep import state
-from runner.sweep.loading import from_values
-from runner.sweep.model import Sweep
+from runner.sweep.model import Sweep, from_values
 from runner.sweep.running import run_sweep
 from runner.sweep.workers import LocalWorkers, RayWorkers
 

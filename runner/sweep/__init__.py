@@ -1,7 +1,6 @@
 """Sweeps: many runs of one experiment with different values, from a grid, at random or by a search.
 
-model    the contents of a sweep file: parameters, strategies, objective, limits
-loading  reading a sweep file, with located errors
+model    a sweep file: parameters, strategies, objective, limits; reading it, with located errors
 task     one run, as a worker does it; its readings of a metric, what it is worth, and pruning
 workers  processes of this machine or actors of Ray, which run tasks
 state    a sweep on disk: its resolved file and its lock; progress follows from its runs

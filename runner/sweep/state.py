@@ -21,8 +21,7 @@ from runner.execution.resume import require_same_makers
 from runner.execution.session import resolve_initial_q
 from runner.runs.run import Run, acquired, list_runs
 from runner.sweep import FILE, folder_of, sweeps_in, tag_of
-from runner.sweep.loading import from_values
-from runner.sweep.model import Sweep
+from runner.sweep.model import Sweep, from_values
 from runner.util.files import read_object, replacing, storage_errors, write_object
 from runner.util.values import JsonView, flatten
 

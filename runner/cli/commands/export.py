@@ -392,7 +392,7 @@ def tensorboard(
       dualtaxi export tensorboard @latest
       dualtaxi export tensorboard k3v9m2xq -o logs/patient --force
     """
-    from runner.export.scalars import EVENT_FILES, require_tensorboard, write_events
+    from runner.export.tables import EVENT_FILES, require_tensorboard, write_events
 
     require_tensorboard()
     with open_for_export(run) as recording:

@@ -356,7 +356,7 @@ def submit(
       dualtaxi remote submit hyperparameters --server http://localhost:8000 --watch
     """
     from runner.config.shipped import config_path
-    from runner.sweep.loading import self_contained_text
+    from runner.sweep.model import self_contained_text
 
     with server.client() as client:
         file = config_path(file)

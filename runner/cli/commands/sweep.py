@@ -92,7 +92,7 @@ def run(
     """
     from runner.api import interruptible
     from runner.execution.session import resolve_initial_q
-    from runner.sweep.loading import load_sweep
+    from runner.sweep.model import load_sweep
     from runner.sweep.running import plan_of, run_whole_sweep
     from runner.sweep.state import with_resolved_tables
     from runner.sweep.trials import require_optuna

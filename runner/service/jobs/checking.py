@@ -43,7 +43,7 @@ from runner.service.errors import Busy, expecting
 from runner.service.jobs.store import CheckedJob
 from runner.service.processes import ProcessPool
 from runner.sweep import state, sweeps_in
-from runner.sweep.loading import from_text as sweep_from_text
+from runner.sweep.model import from_text as sweep_from_text
 from runner.sweep.trials import Search, require_optuna
 from runner.util.humanize import size
 from runner.util.jsonable import as_json

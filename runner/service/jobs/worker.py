@@ -51,7 +51,7 @@ from runner.service.jobs.store import QueuedJob, read_values
 from runner.service.processes import lower_priority
 from runner.service.settings import without_folders
 from runner.sweep import state
-from runner.sweep.loading import from_values
+from runner.sweep.model import from_values
 from runner.sweep.running import SweepStatus, run_whole_sweep
 from runner.sweep.workers import Workers, worker_pool
 from runner.util.compilation import MESSAGE, announced

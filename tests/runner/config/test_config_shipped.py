@@ -11,7 +11,7 @@ import runner
 from runner.cli import cli
 from runner.config import ConfigError, load
 from runner.config.shipped import SCHEMA_FILE, config_path, shipped, shipped_folder
-from runner.sweep.loading import load_sweep
+from runner.sweep.model import load_sweep
 
 
 @pytest.fixture(autouse=True)

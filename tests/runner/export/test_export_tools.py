@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 import runner
 from runner.cli import cli
-from runner.export.scalars import measures
+from runner.export.tables import measures
 from runner.recording import schema
 from runner.recording.machine import read_clock
 from runner.recording.reader import open_recording

@@ -13,7 +13,7 @@ from runner.errors import ConfigError
 from runner.service.jobs import checking
 from runner.service.jobs.checking import JobChecker, check
 from runner.sweep import state
-from runner.sweep.loading import from_values
+from runner.sweep.model import from_values
 
 TINY = "env: {id: FrozenLake-v1}\nepisodes: 3\nseeds: [0, 1]\n"
 SWEEP = """\

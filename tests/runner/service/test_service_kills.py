@@ -21,7 +21,7 @@ import runner
 from runner.runs.run import list_runs
 from runner.service.jobs.store import JobStore
 from runner.sweep import state
-from runner.sweep.loading import from_values
+from runner.sweep.model import from_values
 from runner.sweep.running import run_sweep
 from runner.sweep.trials import Trials, recorded_trials
 from tests.reliability.jobs import is_worker

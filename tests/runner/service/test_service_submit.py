@@ -12,7 +12,7 @@ from served import Served
 from runner.cli import cli
 from runner.config import load
 from runner.runs.run import list_runs
-from runner.sweep.loading import load_sweep, self_contained_text
+from runner.sweep.model import load_sweep, self_contained_text
 
 TINY = "env: {id: FrozenLake-v1}\nepisodes: 20\nseeds: [0, 1]\n"
 

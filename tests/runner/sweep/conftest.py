@@ -6,7 +6,7 @@ import pytest
 from sweeping import described, swept
 
 from runner.config.document import write_yaml
-from runner.sweep.loading import from_values
+from runner.sweep.model import from_values
 
 
 @pytest.fixture(scope="session")

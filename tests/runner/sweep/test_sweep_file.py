@@ -9,8 +9,7 @@ import pytest
 from sweeping import BASE, described
 
 from runner.config import ConfigError
-from runner.sweep.loading import from_values, load_sweep
-from runner.sweep.model import STRATEGIES
+from runner.sweep.model import STRATEGIES, from_values, load_sweep
 from runner.sweep.running import plan_of
 
 SHIPPED = sorted((Path(__file__).parents[3] / "configs" / "sweeps").glob("*.yaml"))

@@ -9,7 +9,7 @@ import pytest
 from sweeping import described, digests, swept
 
 from runner.runs.run import list_runs
-from runner.sweep.loading import from_values
+from runner.sweep.model import from_values
 from runner.sweep.workers import LocalWorkers, RayWorkers
 
 pytestmark = [

@@ -18,7 +18,7 @@ from runner.export.plots.chart import Markers
 from runner.runs.run import list_runs
 from runner.sweep import state
 from runner.sweep.charts import drawn_trials, learning, panel_of, parameter_chart
-from runner.sweep.loading import from_values
+from runner.sweep.model import from_values
 from runner.sweep.results import fresh_seeds, results_of
 
 

@@ -14,8 +14,7 @@ from runner.recording.reader import open_recording
 from runner.recording.topic_chunks import TopicChunks
 from runner.sweep import state
 from runner.sweep.charts import drawn_trials, parameters_section
-from runner.sweep.loading import from_values
-from runner.sweep.model import STRATEGIES, Objective
+from runner.sweep.model import STRATEGIES, Objective, from_values
 from runner.sweep.results import results_of
 from runner.sweep.task import curve_of, pruning_bounds, should_prune, value_of
 from runner.sweep.trials import Search, Trials

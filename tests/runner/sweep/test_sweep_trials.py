@@ -18,8 +18,7 @@ from runner.runs import provenance
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run, list_runs
 from runner.sweep import state
-from runner.sweep.loading import from_values
-from runner.sweep.model import Objective, Range
+from runner.sweep.model import Objective, Range, from_values
 from runner.sweep.results import ranking, results_of
 from runner.sweep.running import plan_of, run_sweep
 from runner.sweep.task import Task, move_files
