@@ -8,7 +8,7 @@ import errno
 import os
 import shutil
 from collections.abc import AsyncIterator, Mapping
-from functools import cache
+from functools import cache, partial
 from http import HTTPStatus
 from types import MappingProxyType
 from typing import Annotated, Any, Final
@@ -195,8 +195,6 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     with contextlib.ExitStack() as stack:
         os.environ[OWN_ONLY] = "1"  # before any child process
         stack.callback(os.environ.pop, OWN_ONLY, None)
-        stack.callback(app.state.catalogue.close)
-        app.state.catalogue.start_scan()  # the first request need not wait for all of it
         app.state.jobs = stack.enter_context(
             JobQueue(settings.recordings[0], settings.workers, max_unfinished=limits.jobs, ray=settings.ray)
         )
@@ -206,13 +204,10 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         stack.callback(app.state.uploads.close)
         app.state.pictures = PictureStreams()
         stack.callback(app.state.pictures.close)
-        app.state.processes = stack.enter_context(
-            ProcessPool(PROCESSES, limits.work_seconds, limits.work_bytes)
-        )
-        app.state.spooling = anyio.CapacityLimiter(1)
-        app.state.sweep_processes = stack.enter_context(
-            ProcessPool(1, limits.work_seconds, limits.work_bytes, keep_seconds=None)
-        )
+        pool = partial(ProcessPool, seconds=limits.work_seconds, memory_bytes=limits.work_bytes)
+        app.state.processes = stack.enter_context(pool(PROCESSES))
+        app.state.exclusive = stack.enter_context(pool(1))
+        app.state.sweep_processes = stack.enter_context(pool(1, keep_seconds=None))
         logged = {name: getattr(settings, name) for name in ("host", "port", "needs_token", "workers")}
         LOG.info("started", extra={"recordings": list(map(str, settings.recordings)), **logged})
         yield
@@ -235,15 +230,17 @@ async def healthz() -> dict[str, str]:
 def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Response:
     """Check that runs can be read, and recordings and jobs accepted."""
     folder = settings.recordings[0]
-    try:
+    has_space = can_list = False
+    with contextlib.suppress(OSError):
         has_space = shutil.disk_usage(folder).free > MIN_FREE_BYTES
-    except OSError:
-        has_space = False
+    catalogue.changed()
+    with contextlib.suppress(RunnerError):
+        can_list = catalogue.read(lambda index: index.count()) >= 0
     checks = {
         "not_stopping": not request.app.state.stopping.is_set(),
         "recordings_can_be_written": os.access(folder, os.R_OK | os.W_OK | os.X_OK),
         "disk_has_space": has_space,
-        "runs_can_be_listed": catalogue.can_list(),
+        "runs_can_be_listed": can_list,
         "jobs_can_be_started": request.app.state.jobs.pool.is_working,
     }
     ready = all(checks.values())

@@ -7,10 +7,7 @@ import contextlib
 import importlib
 import io
 import json
-import os
-import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -201,10 +198,10 @@ def arrow(path: Path, table: str, phase: Phase, rows: range) -> bytes:
     return bytes(sink.getvalue())
 
 
-def replay(runs: Sequence[Run], request: Request) -> bytes:
+def replay(runs: Sequence[Run], request: Request) -> Path:
     """Return the path of an export for the Rerun viewer, from the user's cache or new."""
     require_rerun("a replay")
-    return os.fsencode(cached_export(runs, request)[0])
+    return cached_export(runs, request)[0]
 
 
 def query(settings: ServiceSettings, text: str, runs: str) -> bytes:
@@ -468,21 +465,10 @@ def viewer_place(run: Run, at: EpisodeRef | None) -> bytes:
 
 
 def load_sweep_libraries() -> None:
-    """Import the libraries that the pages of sweeps need, at a low priority where a thread can have one.
-
-    SciPy, scikit-learn and Optuna take seconds to load, which no request should have to wait for.
-    """
-
-    def load() -> None:
-        if sys.platform == "linux":  # elsewhere a priority is that of a whole process
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 10)
-        for module in ("scipy.stats", "sklearn.ensemble", "optuna.samplers", "runner.sweep.results"):
-            with contextlib.suppress(ImportError):  # the function that needs it explains how to install it
-                importlib.import_module(module)
-
-    thread = threading.Thread(target=load)
-    thread.start()
-    thread.join()
+    """Import SciPy, scikit-learn and Optuna, which take seconds, before the page of a sweep needs them."""
+    for module in ("scipy.stats", "sklearn.ensemble", "optuna.samplers", "runner.sweep.results"):
+        with contextlib.suppress(ImportError):  # the function that needs it explains how to install it
+            importlib.import_module(module)
 
 
 @lru_cache(maxsize=1)
@@ -505,7 +491,11 @@ def sweep_part(
 def sweep_ranking(results: Results, _: Path) -> Iterator[Section]:
     """Yield the ranking of a sweep, with links to its runs, and the best configuration."""
     first, *others = ranking_sections(results)
-    runs = {str(entry.number): _run_links(entry.runs) for entry in results.ranking}
+    address = Markup('<a href="/runs/{0}" title="{0}">{1}</a>')
+    runs = {
+        str(entry.number): Markup(" ").join(address.format(run, seed) for seed, run in entry.runs.items())
+        for entry in results.ranking
+    }
     grids = [
         Grid((*grid.headings, "runs, by seed"), [(*row, runs[row[0]]) for row in grid.rows])
         for grid in first.grids
@@ -514,13 +504,6 @@ def sweep_ranking(results: Results, _: Path) -> Iterator[Section]:
     yield from others
     if results.best_yaml:
         yield best_section(results)
-
-
-def _run_links(runs: Mapping[int, str]) -> str:
-    links = [
-        Markup('<a href="/runs/{0}" title="{0}">{1}</a>').format(run, seed) for seed, run in runs.items()
-    ]
-    return Markup(" ").join(links)
 
 
 def sweep_importance(results: Results, _: Path) -> Iterable[Section]:

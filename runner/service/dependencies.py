@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Annotated, Final, TypeVar
 
-from anyio import CapacityLimiter
 from fastapi import Depends, Query, Request, Response
 from fastapi import Path as InPath
 from pydantic import TypeAdapter
@@ -20,11 +20,11 @@ from runner.errors import RecordingError
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
-from runner.service.errors import Busy, Refused
+from runner.service.errors import Refused
 from runner.service.jobs.queue import JobQueue
 from runner.service.pictures import PictureStreams
 from runner.service.processes import ProcessPool
-from runner.service.response_cache import ALWAYS, ResponseCache
+from runner.service.response_cache import ResponseCache
 from runner.service.settings import ServiceSettings
 from runner.service.uploads import Uploads
 
@@ -59,10 +59,8 @@ async def owner_of(request: Request) -> str:
 
 
 OwnerOf = Annotated[str, Depends(owner_of)]
-MAX_WAITING: Final = 16
-"""Calls with large temporary files that may wait for the one that runs."""
 _LOOK_SECONDS: Final = 0.5
-"""How often a request that waits for such a call looks whether its client is still there."""
+"""How often a request that waits for an exclusive call looks whether its client is still there."""
 RunName = Annotated[
     str,
     InPath(
@@ -179,32 +177,25 @@ class Computation:
     """Functions of runs and recordings, called in a child process for a request, their results cached."""
 
     def __init__(
-        self, cache: ResponseCache, processes: ProcessPool, spooling: CapacityLimiter, request: Request
+        self, cache: ResponseCache, processes: ProcessPool, exclusive: ProcessPool, request: Request
     ) -> None:
         self._cache = cache
         self._processes = processes
-        self._spooling = spooling
+        self._exclusive = exclusive
         self._request = request
 
     async def __call__(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> bytes:
         """Return the result of a function.
 
-        With `alone` it writes large temporary files: one such call runs at a time, of those that wait for it
-        all beyond `MAX_WAITING` are refused as `Busy`, and it ends when nobody waits for it any more.
+        With `alone` it writes large temporary files: one such call runs at a time, and it ends when nobody
+        waits for it any more.
 
         Raises:
             ClientDisconnect: the client of an `alone` call has gone.
         """
-
-        async def call() -> bytes:
-            if not alone:
-                return await self._processes(function, *args)
-            if self._spooling.statistics().tasks_waiting >= MAX_WAITING:
-                raise Busy
-            async with self._spooling:
-                return await self._processes(function, *args)
-
-        response = self._cache.get_or_await((function, *map(_state_of, args)), call, ALWAYS)
+        pool = self._exclusive if alone else self._processes
+        key = (function, *map(_state_of, args))
+        response = self._cache.get_or_await(key, partial(pool, function, *args))
         return await (self._unless_gone(response) if alone else response)
 
     async def uncached(self, function: Callable[..., bytes], *args: object) -> bytes:
@@ -233,7 +224,7 @@ class Computation:
 async def computation_for(request: Request) -> Computation:
     """Return what computes for a request."""
     state = request.app.state
-    return Computation(state.cache, state.processes, state.spooling, request)
+    return Computation(state.cache, state.processes, state.exclusive, request)
 
 
 ComputationOf = Annotated[Computation, Depends(computation_for)]

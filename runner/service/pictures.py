@@ -206,11 +206,6 @@ class PictureStreams:
         finally:
             self._keep(stream)
 
-    def prepare(self, key: Hashable, make: Make, start: int) -> None:
-        """Begin a stream that will be requested soon, if that is possible."""
-        with contextlib.suppress(Busy):
-            self._keep(self.open(key, make, start))
-
     def _keep(self, stream: PictureStream) -> None:
         stream.idle_since = time.monotonic()
         asyncio.get_running_loop().call_later(IDLE_SECONDS, self._close_idle)

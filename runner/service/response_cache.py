@@ -1,23 +1,11 @@
-"""A short-lived cache of responses, which also merges equal requests that run at the same time."""
+"""A cache of responses, which also merges equal requests that run at the same time."""
 
 from __future__ import annotations
 
 import asyncio
-import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Hashable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
-
-MAX_SECONDS: Final = 5.0
-"""The default age limit: a response may depend on the time of day."""
-ALWAYS: Final = float("inf")
-"""The age limit of responses that depend on nothing but their key."""
-
-
-class _Response(NamedTuple):
-    body: bytes
-    created: float
 
 
 @dataclass
@@ -30,31 +18,29 @@ class _Pending:
 
 
 class ResponseCache:
-    """Response bodies by key; the least recently used ones are dropped beyond a number of bytes."""
+    """Response bodies by key, which has all that they depend on.
+
+    The least recently used ones are dropped beyond a number of bytes.
+    """
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
         self._bytes = 0
-        self._responses: OrderedDict[Hashable, _Response] = OrderedDict()
+        self._responses: OrderedDict[Hashable, bytes] = OrderedDict()
         self._pending: dict[Hashable, _Pending] = {}
 
-    def get(self, key: Hashable, max_seconds: float = ALWAYS) -> bytes | None:
-        """Return the cached response of a key; None if there is none, or an older one only."""
-        response = self._responses.get(key)
-        if response is None or time.monotonic() - response.created >= max_seconds:
-            return None
-        self._responses.move_to_end(key)
-        return response.body
+    def get(self, key: Hashable) -> bytes | None:
+        """Return the cached response of a key; None if there is none."""
+        if key in self._responses:
+            self._responses.move_to_end(key)
+        return self._responses.get(key)
 
-    async def get_or_await(
-        self, key: Hashable, make: Callable[[], Awaitable[bytes]], max_seconds: float = MAX_SECONDS
-    ) -> bytes:
-        """Return the response of a key: cached, not older than `max_seconds`, being made, or made now.
+    async def get_or_await(self, key: Hashable, make: Callable[[], Awaitable[bytes]]) -> bytes:
+        """Return the response of a key: cached, being made, or made now.
 
-        The key has everything that the response depends on, as far as that is known. Once all who wait for
-        it were cancelled, making it is, too.
+        Once all who wait for it were cancelled, making it is, too.
         """
-        if (body := self.get(key, max_seconds)) is not None:
+        if (body := self.get(key)) is not None:
             return body
         pending = self._pending.get(key)
         if pending is None:
@@ -77,12 +63,7 @@ class ResponseCache:
 
     def keep(self, key: Hashable, body: bytes) -> None:
         """Keep the response of a key."""
-        self._drop(key)
-        self._responses[key] = _Response(body, time.monotonic())
-        self._bytes += len(body)
-        while self._bytes > self._max_bytes and self._responses:
-            self._drop(next(iter(self._responses)))
-
-    def _drop(self, key: Hashable) -> None:
-        dropped = self._responses.pop(key, None)
-        self._bytes -= len(dropped.body) if dropped else 0
+        self._bytes += len(body) - len(self._responses.pop(key, b""))
+        self._responses[key] = body
+        while self._bytes > self._max_bytes:
+            self._bytes -= len(self._responses.popitem(last=False)[1])

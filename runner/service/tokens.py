@@ -87,31 +87,22 @@ class _RecordsFile(Generic[Record]):
     def __init__(self, path: Path, key: str, kind: type[Record]) -> None:
         self.path = path
         self._key, self._adapter = key, TypeAdapter(tuple[kind, ...])  # type: ignore[valid-type]
-        self._version: tuple[int, int, int] | None = None
-        self._records: tuple[Record, ...] = ()
 
     def all(self) -> tuple[Record, ...]:
-        """Return the records; the file is read again when it has changed.
+        """Return the records.
 
         Raises:
             StorageError: the file exists and cannot be read as one of them.
         """
         try:
-            stat = self.path.stat()
-            version = (stat.st_mtime_ns, stat.st_size, stat.st_ino)
-            if version != self._version:
-                entries = read_object(self.path, _MAX_FILE_BYTES)[self._key]
-                self._records = self._adapter.validate_python(entries)
-                self._version = version
+            return self._adapter.validate_python(read_object(self.path, _MAX_FILE_BYTES)[self._key])
         except FileNotFoundError:
-            self._records = ()
-            self._version = None
+            return ()
         except OSError as error:
             raise StorageError(f"{self.path}: cannot be read ({error.strerror}).") from error
         except (ValueError, KeyError):
             message = f"{self.path}: found no file of {self._key}; remove it, and create them again."
             raise StorageError(message) from None
-        return self._records
 
     def change(self, change: Callable[[tuple[Record, ...]], Iterable[Record]]) -> None:
         """Replace the records by the result of a function, while no other process changes them."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Any, Final, Literal
@@ -316,9 +316,8 @@ async def sql_page(request: Request, query: Sql = "", runs: Runs = "") -> Respon
     return Page("sql.html", values)
 
 
-async def _answer_query(request: Request, function: Callable[..., bytes], *asked: Hashable) -> bytes:
-    """Return the answer to a question about all runs: computed in a process with limits, or seconds old."""
+async def _answer_query(request: Request, function: Callable[..., bytes], *asked: object) -> bytes:
+    """Return the answer to a question about all runs: computed in a process with limits."""
     state = request.app.state
-    make = partial(state.processes, function, state.settings, *asked)
-    answer: bytes = await state.cache.get_or_await((function, *asked, state.catalogue.state()), make)
+    answer: bytes = await state.processes(function, state.settings, *asked)
     return answer

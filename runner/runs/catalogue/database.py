@@ -202,31 +202,12 @@ _SCHEMA: Final = (
 )
 _VERSION: Final = zlib.crc32("11".join(_SCHEMA).encode()) >> 1
 """Identifies the schema, and by the number the contents; an index of another version is replaced."""
-_HEAD_BYTES: Final = 100
-"""The header of an SQLite file; at 24 it has the number of changes."""
 _BUSY_SECONDS: Final = 60
 
 
 def index_path() -> Path:
     """Return the path of the index."""
     return cache_folder() / INDEX_FILE
-
-
-class Version(NamedTuple):
-    """Identifies a state of the index."""
-
-    file: int
-    changes: int
-
-
-def version() -> Version | None:
-    """Return the version of the index's contents; None if there is no index that can be read."""
-    try:
-        with index_path().open("rb", buffering=0) as stream:
-            head = stream.read(_HEAD_BYTES)
-            return Version(os.fstat(stream.fileno()).st_ino, int.from_bytes(head[24:28], "big"))
-    except OSError:
-        return None
 
 
 def open_index(report: Tell) -> sqlite3.Connection:

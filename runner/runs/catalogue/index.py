@@ -32,7 +32,6 @@ from runner.runs.catalogue.database import (
     row_of,
     text,
     transaction,
-    version,
     write_row,
 )
 from runner.runs.catalogue.filters import ANY_RUN, Filter, matches, setting_path
@@ -291,10 +290,10 @@ def look(
     for place in places:
         check_folder_name(place)
     for _ in range(2):
-        before, seen = version(), identity()
+        seen = identity()
         try:
             with contextlib.closing(open_index(report)) as database:
-                if not cached or before is None or before.file != (version() or before).file:
+                if not cached or seen is None or seen != identity():
                     update(database, places, rebuild)
                 with transaction(database, "DEFERRED"):
                     return work(CatalogueIndex(database, places))

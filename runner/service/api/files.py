@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import pathlib
 from dataclasses import replace
 from functools import partial
@@ -25,7 +23,6 @@ from runner.export.rerun.selection import Request as Selection
 from runner.runs.run import Run
 from runner.service import computed
 from runner.service.dependencies import (
-    CacheOf,
     ComputationOf,
     InTurn,
     OwnerOf,
@@ -125,7 +122,6 @@ def checkpoint(
 )
 async def replay(
     run: RecordedRun,
-    cache: CacheOf,
     processes: ProcessesOf,
     episodes: Annotated[
         str, Query(max_length=1000, description="Training episodes, such as `0..20,49980..`.")
@@ -153,7 +149,14 @@ async def replay(
     selection = Selection(
         _ranges(episodes), tuple(evaluations or ()), every, frames=frames, trials=tuple(trials or ())
     )
-    path = await replay_of([run], cache, processes, selection)
+    seconds = DRAW_SECONDS if frames else None
+    try:
+        path = await processes(computed.replay, [run], selection, seconds=seconds)
+    except CallFailed:
+        if not frames:
+            raise
+        # The environment hangs, crashes or needs too much memory.
+        path = await processes(computed.replay, [run], replace(selection, frames=False))
     return _file(path, f"{run.file_stem}.rrd", path.stem, if_none_match)
 
 
@@ -198,28 +201,6 @@ def attachment(body: bytes, name: str) -> Response:
     """Return a file to be saved under a name, which a browser never shows as a page of the service."""
     headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
     return Response(body, media_type=MEDIA, headers=headers)
-
-
-async def replay_of(
-    runs: list[Run],
-    cache: CacheOf,
-    processes: ProcessesOf,
-    selection: Selection,
-) -> pathlib.Path:
-    """Return the export of some runs, made in a child process, once for all concurrent requests.
-
-    Without pictures if their environment hangs, crashes or needs too much memory.
-    """
-
-    async def make() -> bytes:
-        if selection.frames:
-            with contextlib.suppress(CallFailed):
-                return await processes(computed.replay, runs, selection, seconds=DRAW_SECONDS)
-        return await processes(computed.replay, runs, replace(selection, frames=False))
-
-    key = ("replay", *map(recording_state, runs), selection)
-    path = await cache.get_or_await(key, make, max_seconds=0)
-    return pathlib.Path(os.fsdecode(path))
 
 
 def tag_of(run: Run) -> str:

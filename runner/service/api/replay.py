@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Awaitable, Callable, Hashable
+from collections.abc import Awaitable, Callable
 from dataclasses import fields
 from functools import partial
 from http import HTTPStatus
-from typing import Annotated, Any, Final, NamedTuple, get_type_hints
+from typing import Annotated, Any, Final, get_type_hints
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import BaseModel, create_model
@@ -17,7 +16,6 @@ from starlette.concurrency import run_in_threadpool
 from runner.analysis.episodes import EXPECTED, EpisodeRef
 from runner.debugging.what_if import WhatIf
 from runner.debugging.what_if import what_if as outcomes_of
-from runner.errors import RunnerError
 from runner.export.pictures import encoded_pictures
 from runner.export.reports.playback import Playback
 from runner.recording.reader import open_recording
@@ -32,7 +30,7 @@ from runner.service.dependencies import (
     RecordedRun,
     recording_state,
 )
-from runner.service.pictures import Block, Make, PictureStreams
+from runner.service.pictures import Block
 from runner.service.problems import media_docs
 from runner.util import __version__
 
@@ -103,14 +101,16 @@ def _add_routes(path: str, episode: Callable[..., Awaitable[EpisodeRef]], kind: 
         the reason why there are no further ones. A block may have fewer pictures than were asked for, if they
         take long to make. One that has them all has an ETag.
         """
-        pictured = await run_in_threadpool(_pictured_episode, run, at)
-        stop = min(start + steps, pictured.length + 1)
-        tag = f"{pictured.tag}-{start}-{stop}"
+        number, length = await run_in_threadpool(_number_and_length, run, at)
+        stop = min(start + steps, length + 1)
+        tag = f"{tag_of(run)}-{at.phase}-{number}-{__version__}-{start}-{stop}"
         if is_known(tag, if_none_match):
             return Response(status_code=HTTPStatus.NOT_MODIFIED, headers={"etag": f'"{tag}"'})
         if (body := cache.get(tag)) is None:
-            block = await streams.block(pictured.key, pictured.make, start, stop, request.is_disconnected)
-            body = _encoded(block, pictured.length)
+            key = recording_state(run), at.phase, number
+            make = partial(encoded_pictures, run.recording, at.phase, number)
+            block = await streams.block(key, make, start, stop, request.is_disconnected)
+            body = _encoded(block, length)
             if len(block.shown) < stop - start or block.note:
                 return Response(body, media_type=OCTETS)
             cache.keep(tag, body)
@@ -121,14 +121,6 @@ for (_path, _episode), _kind in zip(EPISODES.items(), ("training episode", "tria
     _add_routes(_path, _episode, _kind)
 
 
-async def prepare_pictures(run: Run, streams: PictureStreams, at: EpisodeRef) -> None:
-    """Begin to make the pictures of an episode, whose page will request them soon."""
-    with contextlib.suppress(RunnerError, OSError):  # its page shows the reason
-        episode = await run_in_threadpool(_pictured_episode, run, at)
-        if at.t <= episode.length:
-            streams.prepare(episode.key, episode.make, at.t)
-
-
 def _encoded(block: Block, last: int) -> bytes:
     """Return a block as a page takes it."""
     head = {"sizes": list(map(len, block.pictures)), "shown": block.shown, "last": last}
@@ -136,22 +128,11 @@ def _encoded(block: Block, last: int) -> bytes:
     return b"".join([len(encoded).to_bytes(4, "big"), encoded, *block.pictures])
 
 
-class _PicturedEpisode(NamedTuple):
-    key: Hashable
-    tag: str
-    """Changes with what its pictures depend on."""
-    make: Make
-    length: int
-    """Steps of the episode."""
-
-
-def _pictured_episode(run: Run, at: EpisodeRef) -> _PicturedEpisode:
+def _number_and_length(run: Run, at: EpisodeRef) -> tuple[int, int]:
+    """Return the number of an episode in its phase, and its length."""
     with open_recording(run.recording) as recording:
         number = at.number_in(recording)
-        length = len(recording.phase(at.phase).episode(number))
-    make = partial(encoded_pictures, run.recording, at.phase, number)
-    tag = f"{tag_of(run)}-{at.phase}-{number}-{__version__}"
-    return _PicturedEpisode((recording_state(run), at.phase, number), tag, make, length)
+        return number, len(recording.phase(at.phase).episode(number))
 
 
 MAX_ACTIONS = 1000

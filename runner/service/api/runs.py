@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-from functools import partial
 from http import HTTPStatus
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 from fastapi import Path as InPath
 from pydantic import BaseModel, Field
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.episodes import mark, unmark
 from runner.analysis.summary import describe_run
@@ -25,7 +23,6 @@ from runner.runs.run import Run, label
 from runner.service import computed
 from runner.service.computed import as_json
 from runner.service.dependencies import (
-    CacheOf,
     CatalogueOf,
     FoundRun,
     ProcessesOf,
@@ -55,10 +52,8 @@ class RunsPage(BaseModel):
     response_model=RunsPage,
     summary="List the runs that match a filter, the newest first.",
 )
-async def list_runs(
-    request: Request,
+def list_runs(
     catalogue: CatalogueOf,
-    cache: CacheOf,
     settings: SettingsOf,
     filter: Annotated[str, Query(max_length=3000, description="As for `dualtaxi ls`.")] = "",  # noqa: A002
     sort: Annotated[str, Query(max_length=500, description="Fields; `-FIELD` for descending order.")] = "",
@@ -72,21 +67,15 @@ async def list_runs(
             f"query.limit: found {limit}, expected at most {settings.limits.page_runs}; use offset.",
         )
 
-    def make() -> bytes:
-        condition, order = parse(filter), order_of(sort)
-        names = columns_of(columns) if columns else DEFAULT_JSON
+    condition, order = parse(filter), order_of(sort)
+    names = columns_of(columns) if columns else DEFAULT_JSON
 
-        def work(index: CatalogueIndex) -> Json:
-            rows, total = index.page(condition, *order, limit=limit, offset=offset)
-            runs = [row_as_json(row, names) for row in index.with_same_as(rows)]
-            return {"runs": runs, "total": total, "offset": offset, "limit": limit}
+    def work(index: CatalogueIndex) -> Json:
+        rows, total = index.page(condition, *order, limit=limit, offset=offset)
+        runs = [row_as_json(row, names) for row in index.with_same_as(rows)]
+        return {"runs": runs, "total": total, "offset": offset, "limit": limit}
 
-        return json.dumps(catalogue.read(work), ensure_ascii=False).encode()
-
-    key = ("runs", catalogue.state(), request.url.query)
-    return Response(
-        await cache.get_or_await(key, partial(run_in_threadpool, make)), media_type="application/json"
-    )
+    return json_response(json.dumps(catalogue.read(work), ensure_ascii=False).encode())
 
 
 class LabelChanges(BaseModel, extra="forbid"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import gzip
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -43,18 +42,9 @@ _TYPES: Final = {"css": "text/css", "js": "text/javascript", "svg": "image/svg+x
 _FOREVER: Final = "public, max-age=31536000, immutable"
 
 
-@dataclass(frozen=True)
-class Asset:
-    """A file of the pages."""
-
-    media_type: str
-    body: bytes
-    compressed: bytes
-
-
 @functools.cache
-def assets() -> Mapping[str, Asset]:
-    """Return the files by name."""
+def assets() -> Mapping[str, bytes]:
+    """Return the files of the pages by name."""
     bodies = {entry.name: entry.read_bytes() for entry in STATIC.iterdir() if entry.is_file()}
     bodies |= {
         name: (STATIC / name).read_bytes() for name in (f"{UPLOT}/uPlot.iife.min.js", f"{UPLOT}/LICENSE")
@@ -62,18 +52,15 @@ def assets() -> Mapping[str, Asset]:
     bodies["replay.js"] = (REPORT_TEMPLATES / "replay.js").read_bytes()
     layouts = (STATIC / UPLOT / "uPlot.min.css").read_text("utf-8"), bodies.pop("pages.css").decode()
     bodies["style.css"] = "\n".join([page_style(), *layouts]).encode()
-    return {
-        name: Asset(_TYPES[name.rpartition("/")[2].rpartition(".")[2]], body, gzip.compress(body, mtime=0))
-        for name, body in bodies.items()
-    }
+    return bodies
 
 
 @functools.cache
 def static_version() -> str:
     """Return a digest of all files."""
     digest = hashlib.sha256()
-    for name, asset in sorted(assets().items()):
-        digest.update(name.encode() + b"\0" + asset.body)
+    for name, body in sorted(assets().items()):
+        digest.update(name.encode() + b"\0" + body)
     return digest.hexdigest()[:12]
 
 
@@ -84,19 +71,13 @@ def static_address(name: str) -> str:
 
 
 @router.api_route("/static/{digest}/{name:path}", methods=["GET", "HEAD"])
-def static_file(digest: str, name: str, request: Request) -> Response:
+def static_file(digest: str, name: str) -> Response:
     """Return a file of the pages."""
-    asset = assets().get(name)
-    if asset is None:
+    if name not in assets():
         raise HTTPException(HTTPStatus.NOT_FOUND)
-    headers = {
-        "vary": "accept-encoding",
-        "cache-control": _FOREVER if digest == static_version() else "no-cache",
-    }
-    if "gzip" in request.headers.get("accept-encoding", ""):
-        headers["content-encoding"] = "gzip"
-        return Response(asset.compressed, media_type=asset.media_type, headers=headers)
-    return Response(asset.body, media_type=asset.media_type, headers=headers)
+    media_type = _TYPES[name.rpartition("/")[2].rpartition(".")[2]]
+    headers = {"cache-control": _FOREVER if digest == static_version() else "no-cache"}
+    return Response(assets()[name], media_type=media_type, headers=headers)
 
 
 TEMPLATES: Final = files("runner.service.pages") / "templates"
@@ -150,7 +131,8 @@ class Page(Response):
         self.status_code = self._status or (HTTPStatus.BAD_REQUEST if problem else HTTPStatus.OK)
         if isinstance(problem, RunnerError):
             values["problem"] = message_of(problem, request)
-        return render(request.url.path, viewer_of(request), self._template, values)
+        template, viewer = templates().get_template(self._template), viewer_of(request)
+        return template.render(values, path=request.url.path, viewer=viewer).encode()
 
 
 def made(values: Values) -> Mapping[str, object]:
@@ -161,11 +143,6 @@ def made(values: Values) -> Mapping[str, object]:
 def to_job(number: int) -> Response:
     """Return the redirection to the page of a job."""
     return RedirectResponse(f"/queue/{number}", HTTPStatus.SEE_OTHER)
-
-
-def render(path: str, viewer: Viewer, template: str, values: Mapping[str, object]) -> bytes:
-    """Return the HTML of a page at a path."""
-    return templates().get_template(template).render(values, path=path, viewer=viewer).encode()
 
 
 def viewer_of(request: Request) -> Viewer:

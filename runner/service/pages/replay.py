@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,7 +25,7 @@ from runner.recording.steps import EpisodeSteps
 from runner.runs.branches import BranchOrigin, Origin, origin_in
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.replay import STEPS, StepPath, prepare_pictures
+from runner.service.api.replay import STEPS, StepPath
 from runner.service.catalogue import Catalogue
 from runner.service.computed import link
 from runner.service.dependencies import (
@@ -35,12 +34,10 @@ from runner.service.dependencies import (
     CatalogueOf,
     Computation,
     ComputationOf,
-    PicturesOf,
     RecordedRun,
     WrittenRun,
 )
 from runner.service.pages.rendering import Form, Page, run_page
-from runner.service.pictures import PictureStreams
 from runner.service.problems import status_of
 from runner.util.humanize import counted
 from runner.util.values import JsonView
@@ -170,7 +167,6 @@ async def latest(
 async def _replay(
     run: Run,
     compute: Computation,
-    streams: PictureStreams,
     catalogue: Catalogue,
     at: EpisodeRef,
     refused: RunnerError | None = None,
@@ -178,14 +174,12 @@ async def _replay(
 ) -> Response:
     """Return the page of a step of an episode; see `_page`."""
     part: bytes | RunnerError
-    preparing = asyncio.create_task(prepare_pictures(run, streams, at))
     start = max(0, at.t - BEFORE)
     step = at if start else replace(at, t=0)  # one part, cached once, for all of the first steps
     try:
         part = await compute(computed.episode_part, run.recording, step, start, STEPS)
     except RunnerError as error:
         part = error
-    await preparing
     return _page(run, catalogue, at, part, refused, form)
 
 
@@ -223,13 +217,12 @@ def _add_route(path: str, episode: Callable[..., Awaitable[EpisodeRef]]) -> None
     async def replay(
         run: RecordedRun,
         compute: ComputationOf,
-        streams: PicturesOf,
         catalogue: CatalogueOf,
         at: EpisodeRef = Depends(episode),  # noqa: B008 - as FastAPI reads it
         t: T = 0,
     ) -> Response:
         """Show a step of an episode."""
-        return await _replay(run, compute, streams, catalogue, replace(at, t=t))
+        return await _replay(run, compute, catalogue, replace(at, t=t))
 
     @router.get(f"/replay{path}/environments")
     def environments(
@@ -246,9 +239,7 @@ for _path, _episode in EPISODES.items():
 
 
 @router.post("/replay/mark")
-async def mark_step(
-    run: WrittenRun, form: Form, compute: ComputationOf, streams: PicturesOf, catalogue: CatalogueOf
-) -> Response:
+async def mark_step(run: WrittenRun, form: Form, compute: ComputationOf, catalogue: CatalogueOf) -> Response:
     """Mark the step of a replay, or remove a mark, and show the replay again."""
     step = EpisodeRef.parse(form.get("at", ""))
     try:
@@ -258,7 +249,7 @@ async def mark_step(
             tags = form.get("tags", "").split()
             await run_in_threadpool(mark, run, step, form.get("text", ""), tags=tags)
     except RunnerError as error:
-        return await _replay(run, compute, streams, catalogue, step, error, form)
+        return await _replay(run, compute, catalogue, step, error, form)
     address = link(f"/runs/{run.run_id}/replay/{step.episode_path}", {"t": step.t or ""})
     return RedirectResponse(f"{address}#marks", HTTPStatus.SEE_OTHER)
 

@@ -6,14 +6,13 @@ over loopback, and kept in the user's cache.
 
 from __future__ import annotations
 
-import contextlib
-import http.client
 import json
 from http import HTTPStatus
 from importlib import metadata
 from pathlib import Path
 from typing import Final
 
+import httpx2
 from fastapi import APIRouter, HTTPException, Response
 from fastapi.responses import FileResponse
 from filelock import FileLock
@@ -121,19 +120,13 @@ def viewer_files() -> Path:
 def _fetch_files(folder: Path) -> None:
     """Fetch the files from the executable, which serves them."""
     port = native_viewer.free_port()
-    with native_viewer.web_viewer(port):
+    client = httpx2.Client(
+        base_url=f"http://{native_viewer.LOOPBACK}:{port}", timeout=_SECONDS, trust_env=False
+    )
+    with native_viewer.web_viewer(port), client:
         for name in FILES:
+            response = client.get(f"/{name}")
+            if response.status_code != HTTPStatus.OK or len(response.content) < 1000:
+                raise native_viewer.ViewerError(f"the Rerun viewer has no {name}; install rerun-sdk again.")
             with replacing(folder / name) as fresh:
-                fresh.write_bytes(_fetch(port, name))
-
-
-def _fetch(port: int, name: str) -> bytes:
-    with contextlib.closing(
-        http.client.HTTPConnection(native_viewer.LOOPBACK, port, timeout=_SECONDS)
-    ) as connection:
-        connection.request("GET", f"/{name}")
-        response = connection.getresponse()
-        body = response.read()
-    if response.status != HTTPStatus.OK or len(body) < 1000:
-        raise native_viewer.ViewerError(f"the Rerun viewer has no {name}; install rerun-sdk again.")
-    return body
+                fresh.write_bytes(response.content)

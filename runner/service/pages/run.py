@@ -280,11 +280,15 @@ def _status(run: Run, jobs: JobQueue, settings: ServiceSettings) -> Status:
         "Training episodes": humanize.number(episodes, 0),
         "Training steps": humanize.number(summary.get("train_steps"), 0),
     }
+    seconds = run.summary.seconds
+    time = humanize.UNKNOWN if seconds is None else humanize.duration(seconds)
+    if status == "running":
+        time = f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
     facts = {"Environment": environment} if environment else {}
     facts |= _results(run, results) | {
         **(taken if has_environment(run.file.config) else {}),
         **({"Evaluation steps": humanize.number(trial_steps, 0)} if trial_steps or live else {}),
-        "Time": _duration(run),
+        "Time": time,
         **({"Other processes": f"{others}, added at the end"} if (others := shards_in_words(run)) else {}),
         "Recording": humanize.size(summary["bytes"]) if summary.get("bytes") else humanize.UNKNOWN,
     }
@@ -342,10 +346,3 @@ def _job_of(run: Run, jobs: JobQueue) -> tuple[int | None, Json]:
             is_at_run = isinstance(progress, RunProgress) and progress.run_id == run.run_id
             return job.number, vars(progress) if is_at_run else {}
     return None, {}
-
-
-def _duration(run: Run) -> str:
-    if run.status == "running":
-        return f"{humanize.duration((datetime.now(UTC) - run.created).total_seconds())} so far"
-    seconds = run.summary.seconds
-    return humanize.UNKNOWN if seconds is None else humanize.duration(seconds)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from http import HTTPStatus
 from typing import Annotated, Final, Literal, NamedTuple
 
-from fastapi import APIRouter, Query, Request, Response
+from fastapi import APIRouter, Query, Response
 from fastapi.responses import RedirectResponse
-from starlette.concurrency import run_in_threadpool
 
 from runner.analysis.sections import Paging
 from runner.analysis.summary import usage_sections
@@ -31,8 +29,8 @@ from runner.runs.catalogue.index import CatalogueIndex, order_of
 from runner.runs.catalogue.usage import usage_of
 from runner.service.catalogue import Catalogue
 from runner.service.computed import link
-from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf
-from runner.service.pages.rendering import Page, message_of, render, viewer_of
+from runner.service.dependencies import CatalogueOf, JobsOf, SettingsOf
+from runner.service.pages.rendering import Page
 from runner.views.runs import LS
 
 router = APIRouter(include_in_schema=False)
@@ -100,10 +98,8 @@ def home() -> Response:
 
 
 @router.get("/runs")
-async def runs(
-    request: Request,
+def runs(
     catalogue: CatalogueOf,
-    cache: CacheOf,
     filter: Annotated[str, Query(max_length=3000)] = "",  # noqa: A002
     sort: Annotated[str, Query(max_length=1000)] = "",
     columns: Annotated[list[str] | None, Query(max_length=100)] = None,
@@ -111,22 +107,12 @@ async def runs(
     page: Annotated[int, Query(ge=1, lt=10**8)] = 1,
 ) -> Response:
     """Show the runs that match a filter; without one, those of a name in a row."""
-    viewer, status = viewer_of(request), HTTPStatus.OK
-
-    def make() -> bytes:
-        values = _values(
-            catalogue, filter, sort, ",".join(columns or ()), group == "name" and not filter, page
-        )
-        return render("/runs", viewer, "runs.html", values)
-
+    by_name = group == "name" and not filter
     try:
-        key = ("runs page", catalogue.state(), request.url.query, viewer)
-        body = await cache.get_or_await(key, partial(run_in_threadpool, make))
+        values = _values(catalogue, filter, sort, ",".join(columns or ()), by_name, page)
     except RunnerError as error:
-        status = HTTPStatus.BAD_REQUEST
-        values = _search(filter, "", USUAL, "", None, message_of(error, request))
-        body = render("/runs", viewer, "runs.html", values)
-    return Response(body, status, media_type="text/html")
+        values = _search(filter, "", USUAL, "", None, error)
+    return Page("runs.html", values)
 
 
 @router.get("/disk")
@@ -180,7 +166,7 @@ def _values(
 
 
 def _search(
-    text: str, sort: str, shown: Sequence[str], query: str, table: RunsTable | None, problem: str = ""
+    text: str, sort: str, shown: Sequence[str], query: str, table: RunsTable | None, problem: object = ""
 ) -> dict[str, object]:
     """Return the values of the page; `query` has the columns as the address contains them."""
     names = dict.fromkeys([*(column for column in shown if column in FIELDS), *FIELDS])

@@ -21,12 +21,10 @@ from runner.errors import RunnerError, RunNotFound
 from runner.runs.catalogue.filters import parse
 from runner.service import computed
 from runner.service.api.reading import Part, found_explanation
-from runner.service.catalogue import Catalogue
 from runner.service.computed import link
 from runner.service.dependencies import CacheOf, CatalogueOf, JobsOf, SettingsOf, SweepProcesses
 from runner.service.errors import Busy
 from runner.service.pages.rendering import Page, message_of
-from runner.service.response_cache import ALWAYS
 from runner.sweep import folder_of, sweeps_in, tag_of
 from runner.sweep.state import read_sweep
 
@@ -51,16 +49,16 @@ def sweeps(
 ) -> Response:
     """Show the sweeps, and prepare for the page of one."""
     rows: list[tuple[str, ...]] = []
-    for folder in settings.recordings:
-        for name in sweeps_in(folder):
-            try:
-                sweep = read_sweep(name, folder)
-            except RunnerError as error:
-                rows.append((name, message_of(error, request), "", "", ""))
-                continue
-            parameters = ", ".join(sweep.file.parameters)
-            runs = f"{_count_runs(catalogue, name):,}"
-            rows.append((name, sweep.file.strategy, parameters, sweep.objective.description, runs))
+    places = [(name, folder) for folder in settings.recordings for name in sweeps_in(folder)]
+    counts = catalogue.read(lambda index: {name: index.count(parse(_filter_of(name))) for name, _ in places})
+    for name, folder in places:
+        try:
+            sweep = read_sweep(name, folder)
+        except RunnerError as error:
+            rows.append((name, message_of(error, request), "", "", ""))
+            continue
+        parameters = ", ".join(sweep.file.parameters)
+        rows.append((name, sweep.file.strategy, parameters, sweep.objective.description, f"{counts[name]:,}"))
     if rows:
         with contextlib.suppress(Busy):
             processes.submit(settings.limits.work_seconds, computed.load_sweep_libraries)
@@ -152,14 +150,8 @@ async def sweep_part(state: SweepOf, part: SweepPart, cache: CacheOf, processes:
     body = await cache.get_or_await(
         _key(state, part),
         lambda: processes(computed.sweep_part, make, state.name, state.folder, state.digest),
-        ALWAYS,
     )
     return HTMLResponse(body)
-
-
-def _count_runs(catalogue: Catalogue, name: str) -> int:
-    is_of_sweep = parse(_filter_of(name))
-    return catalogue.read(lambda index: index.count(is_of_sweep))
 
 
 def _filter_of(name: str) -> str:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import psutil
 import pytest
-from anyio import CapacityLimiter
 from starlette.requests import ClientDisconnect
 
 from runner.errors import RecordingError
@@ -179,8 +178,8 @@ def test_a_film_of_clients_that_have_gone_ends_and_leaves_no_files(pool, tmp_pat
             return noted.exists()
 
     async def abandon():
-        cache, spooling = ResponseCache(1000), CapacityLimiter(1)
-        clients = [Computation(cache, pool, spooling, Client()) for _ in range(2)]
+        cache = ResponseCache(1000)
+        clients = [Computation(cache, pool, pool, Client()) for _ in range(2)]
         calls = [compute(fill_a_folder, str(noted), alone=True) for compute in clients]
         left = await asyncio.gather(*calls, return_exceptions=True)
         assert all(isinstance(error, ClientDisconnect) for error in left)
