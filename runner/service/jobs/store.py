@@ -50,8 +50,6 @@ STATE_FILE: Final = "state.json"
 VALUES_FILE: Final = "job.yaml"
 TEXT_FILE: Final = "submitted.yaml"
 LOG_FILE: Final = "log.jsonl"
-LOG_TAIL_BYTES: Final = 1 << 16
-"""The end of a log, which is read for its last whole line."""
 MAX_LOG_BYTES: Final = 8 << 20
 """Size of a job's log; beyond it only its states and the starts of its runs are stored."""
 EVENTS_PER_READ: Final = 2000
@@ -286,10 +284,8 @@ class JobStore:
             self._forget(number)
             return
         self._jobs[number] = read_job(path.parent)
-        with self.path(number, LOG_FILE).open("rb") as log:
-            log.seek(max(log.seek(0, os.SEEK_END) - LOG_TAIL_BYTES, 0))
-            begin, tail = log.tell(), log.read()
-        self._log_sizes[number] = begin + tail.rfind(b"\n") + 1  # without a line that was not written whole
+        log = self.path(number, LOG_FILE).read_bytes()
+        self._log_sizes[number] = log.rfind(b"\n") + 1  # without a line that was not written whole
 
     def _forget(self, number: int) -> None:
         self._jobs.pop(number, None)
