@@ -2,8 +2,7 @@
 
 The tables of the run, of states, actions and transitions are for readers only.
 
-Memory does not grow with the run: blocks of records become batches of columns, which a thread compresses and
-writes in row groups.
+Memory does not grow with the run: blocks of records become batches of columns, written in row groups.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Final, Self
 
@@ -61,7 +59,7 @@ def write_archive(recording: Recording, folder: Path, report: Report = lambda _:
 
 
 class TableWriter:
-    """A Parquet file that is being written; a thread compresses batches, a row group at a time."""
+    """A Parquet file that is being written; batches are compressed a row group at a time."""
 
     def __init__(self, path: Path, columns: pa.Schema) -> None:
         encodings = layout.encodings_of(columns)
@@ -77,8 +75,6 @@ class TableWriter:
         self._waiting: list[pa.RecordBatch] = []
         self._rows = 0
         self._bytes = 0
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="parquet")
-        self._under_way: Future[None] | None = None
 
     def add(self, batch: pa.RecordBatch) -> None:
         """Add rows."""
@@ -86,23 +82,15 @@ class TableWriter:
         self._rows += batch.num_rows
         self._bytes += batch.nbytes
         if self._rows >= ROWS_A_GROUP or self._bytes >= BYTES_A_GROUP:
-            self._send()
+            self.flush()
 
-    def _send(self) -> None:
-        if self._under_way is not None:
-            self._under_way.result()
-        table = pa.Table.from_batches(self._waiting)
-        self._under_way = self._thread.submit(self._writer.write_table, table, table.num_rows)
+    def flush(self) -> None:
+        """Write the rows that were added as a row group, if there are any."""
+        if self._waiting:
+            self._writer.write_table(pa.Table.from_batches(self._waiting), self._rows)
         self._waiting = []
         self._rows = 0
         self._bytes = 0
-
-    def close(self) -> None:
-        """Write what is left."""
-        if self._waiting:
-            self._send()
-        if self._under_way is not None:
-            self._under_way.result()
 
     def __enter__(self) -> Self:
         return self
@@ -110,9 +98,8 @@ class TableWriter:
     def __exit__(self, kind: object, *_: object) -> None:
         try:
             if kind is None:
-                self.close()
+                self.flush()
         finally:
-            self._thread.shutdown()
             self._writer.close()
 
 
@@ -180,7 +167,9 @@ class _ArchiveWriter:
         (self._folder / layout.METADATA).write_text(json.dumps(description, indent=1), encoding="utf-8")
         tables = {layout.RUN: run_table(recording)}
         if recording.tabular:
-            tables |= description_tables(recording.mdp, self._batches.shape)
+            mdp, shape = recording.mdp, self._batches.shape
+            tables[layout.TRANSITIONS] = _transitions(mdp, shape)
+            tables |= {layout.STATES: _states(mdp, shape), layout.ACTIONS: _actions(mdp, shape)}
         for name, table in tables.items():
             pq.write_table(table, self._folder / name, compression="zstd", compression_level=LEVEL)
 
@@ -284,15 +273,6 @@ def run_table(recording: Recording) -> pa.Table:
         )
     except (pa.ArrowException, OverflowError) as error:
         raise RecordingError(f"{recording.path}: its result is invalid ({error}).") from error
-
-
-def description_tables(mdp: Mdp, shape: Shape) -> dict[str, pa.Table]:
-    """Return transitions, states and actions as tables, by the name of their file."""
-    return {
-        layout.TRANSITIONS: _transitions(mdp, shape),
-        layout.STATES: _states(mdp, shape),
-        layout.ACTIONS: _actions(mdp, shape),
-    }
 
 
 def _transitions(mdp: Mdp, shape: Shape) -> pa.Table:

@@ -248,17 +248,11 @@ def lost_ranges(repair: Mapping[str, object], path: str) -> LostRanges:
 
 def environment_attachments(description: JsonView, arrays: Mapping[str, Array]) -> Attachments:
     """Return the attachments that describe an environment: its description, and its arrays if it has any."""
-    text = _indented(json.dumps({**description, "arrays": sorted(arrays)}, sort_keys=True))
+    text = json.dumps({**description, "arrays": sorted(arrays)}, indent=1, sort_keys=True)
     return {"environment.json": ("application/json", text.encode())} | {
         f"environment/{name}.npy.zst": ("application/zstd", pack_array(arrays[name]))
         for name in sorted(arrays)
     }
-
-
-@lru_cache(32)
-def _indented(text: str) -> str:
-    """Return JSON with one value a line; cached, because a process often records one environment again."""
-    return json.dumps(json.loads(text), indent=1, sort_keys=True)
 
 
 def environment_description(text: bytes, path: str) -> RecordedEnvironment:

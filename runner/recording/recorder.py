@@ -10,7 +10,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -372,18 +372,10 @@ class Recorder:
             lane.topic,
             filled.view(np.uint8).data.cast("B"),
             filled["log_time"],
-            _offsets(len(filled), filled.itemsize),
+            np.arange(len(filled), dtype=np.uint64) * np.uint64(filled.itemsize),
             write=write and lane.write,
             done=partial(lane.free.put, block) if is_whole else lambda: None,
         )
-
-
-@lru_cache(8)
-def _offsets(count: int, size: int) -> Unsigned:
-    """Return where each of the records of one size begins in a block; most blocks are whole."""
-    offsets = np.arange(count, dtype=np.uint64) * np.uint64(size)
-    offsets.flags.writeable = False
-    return offsets
 
 
 def _assign(column: Any, values: Any) -> None:

@@ -67,8 +67,6 @@ _PLAIN_BYTES: Final = 4 << 20
 """Chunks of up to this size are unpacked without checking their first message."""
 CHUNK_HEAD: Final = struct.Struct("<QQQII")
 """Start time, end time, size unpacked, its CRC, and the length of the name of the compression."""
-_MOSTLY_ZEROS: Final = 16
-"""Blocks of actions that become this many times smaller are discrete: nearly all of their columns are 0."""
 _DATA_LENGTH: Final = struct.Struct("<Q")
 _MAX_CODEC_BYTES: Final = max(map(len, MCAP_CODECS))
 
@@ -263,8 +261,6 @@ def encode_chunk(
     width = len(records) // len(log_times) if topic.message is schema.STEP and packing.values else 0
     size, crc = len(records), crc32(records)
     data = codec.pack(records, packing.level, width)
-    if topic.message is schema.ACTIONS and len(data) * _MOSTLY_ZEROS < len(records):  # quick at any level
-        data = codec.pack(records, max(codec.levels, default=0), width)
     start, end = int(log_times[0]), int(log_times[-1])
     head = CHUNK_HEAD.pack(start, end, size, crc, len(name)) + name
     head += _DATA_LENGTH.pack(len(data))
@@ -361,7 +357,10 @@ def unpack_chunk(body: bytes | memoryview, where: str) -> tuple[ChunkHead, bytes
             raise RecordingError(
                 f"{where}: declares {messages:,} messages, expected {MAX_CHUNK_STEPS:,} at most"
             )
-    records = decompress(view[head.data_at :], head.compression, head.uncompressed_size, where)
+    size = head.uncompressed_size
+    records, more = _unpack(view[head.data_at :], head.compression, size, where)
+    if len(records) != size or more:
+        raise RecordingError(f"{where}: found a chunk of another size than the {size} bytes it declares")
     if crc32(records) != head.crc:
         raise RecordingError(f"{where}: its content does not match its checksum")
     return head, records
@@ -376,20 +375,11 @@ def first_message(body: memoryview, head: ChunkHead, where: str) -> tuple[int, i
     return length, channel
 
 
-def decompress(data: bytes | memoryview, compression: str, size: int, where: str) -> bytes:
-    """Return the `size` bytes that a chunk's data hold; never allocates more than that.
-
-    Raises:
-        RecordingError: the data do not give exactly that many bytes; `where` is named.
-    """
-    records, more = _unpack(data, compression, size, where)
-    if len(records) != size or more:
-        raise RecordingError(f"{where}: found a chunk of another size than the {size} bytes it declares")
-    return records
-
-
 def _unpack(data: bytes | memoryview, compression: str, size: int, where: str) -> tuple[bytes, bool]:
-    """Return the first `size` bytes, or all if there are fewer, and whether there are more."""
+    """Return the first `size` bytes, or all if there are fewer, and whether there are more.
+
+    Never allocates more than that.
+    """
     try:
         return MCAP_CODECS[compression].unpack(data, size)
     except UNPACK_ERRORS as error:

@@ -264,7 +264,7 @@ def test_a_disk_that_fills_up_leaves_no_archive(run, recordings, command, monkey
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(writing.TableWriter, "close", full)
+    monkeypatch.setattr(writing.TableWriter, "flush", full)
     result = command("archive", run.run_id, "--remove")
     assert result.exit_code == 1
     assert "No space left on device" in result.output
