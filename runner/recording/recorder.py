@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -194,7 +194,7 @@ class Recorder:
         """Record messages of a fixed-width topic, given by field; `positions` are as for `take`."""
         for block, part in self.fill(topic, positions.astype(np.uint64)):
             for name, values in columns.items():
-                _assign(block[name], values[part])
+                block[name] = values[part]
 
     def capacity(self, topic: Topic) -> int:
         """Return how many records a whole block of a fixed-width topic has."""
@@ -376,14 +376,6 @@ class Recorder:
             write=write and lane.write,
             done=partial(lane.free.put, block) if is_whole else lambda: None,
         )
-
-
-def _assign(column: Any, values: Any) -> None:
-    """Assign values to a column: of structured ones part by part, which takes less time."""
-    for name in values.dtype.names or ():
-        _assign(column[name], values[name])
-    if values.dtype.names is None:
-        column[...] = values
 
 
 def capacity_of(topic: Topic, message: MessageType, chunk_steps: int) -> int:
