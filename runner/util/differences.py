@@ -58,7 +58,7 @@ def differing_rows(a: NDArray[Any], b: NDArray[Any], tolerance: float | None = N
         differs = ~np.isclose(b, a, rtol=tolerance, atol=tolerance, equal_nan=True)
     else:
         differs = a != b
-    rows: Flags = np.asarray(differs).reshape(len(a), -1)
+    rows: Flags = np.asarray(differs).reshape(len(a), np.size(differs) // max(len(a), 1))
     return np.asarray(rows.any(axis=1))
 
 

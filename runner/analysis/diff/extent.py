@@ -6,6 +6,7 @@ area, and where each first reaches a level.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from runner.errors import RecordingError, RunnerError, nearest
 from runner.recording.messages import QTable
 from runner.recording.metrics import METRICS, is_higher_better
 from runner.recording.reader import Recording
+from runner.replay.steps import step_of_episode
 from runner.util.arrays import Floats, Ints, Records
 
 T = TypeVar("T")
@@ -34,8 +36,6 @@ _MAX_STATES: Final = 5
 """States that are named."""
 _MAX_CELLS: Final = 5
 """Cells with the largest differences that are listed."""
-_BATCH_EPISODES: Final = 4096
-_BATCH_STEPS: Final = 1 << 15
 _ALIGNED: Final = FIELDS[2:]
 """The fields compared of steps of the same time in the same episode."""
 _COMPARED: Final = (
@@ -91,20 +91,33 @@ class VisitsDiff:
 
 def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Ints, Ints]]:
     """Return how far the training of two runs is the same, and the visits to each state, [S], of either."""
-    left, right = _Steps(a), _Steps(b)
-    episodes = equal_episodes = equal_steps = compared = 0
-    total = np.zeros(2, np.int64)
-    for ours, theirs in _common_lengths(a, b):
-        agree = _agreement(left, right, ours, theirs)
-        episodes += len(ours)
-        equal_steps += int(agree.sum())
-        compared += int(np.maximum(ours, theirs).sum())
-        equal_episodes += int(((ours == theirs) & (agree == ours)).sum())
-        total += ours.sum(), theirs.sum()
-    mean_a, mean_b = (total / max(episodes, 1)).tolist()
-    steps_a, steps_b = (recording.train.steps.count() for recording in (a, b))
-    overlap = Overlap(steps_a, steps_b, episodes, equal_episodes, equal_steps, compared, mean_a, mean_b)
-    return overlap, (left.count_all_visits(), right.count_all_visits())
+    episodes = min(_whole_episodes(recording) for recording in (a, b))
+    visits = np.zeros(a.mdp.states, np.int64), np.zeros(b.mdp.states, np.int64)
+    streams = [
+        _counted_steps(recording, episodes, counts) for recording, counts in zip((a, b), visits, strict=True)
+    ]
+    equal_steps = compared = 0
+    are_equal = np.ones(episodes, np.bool_)
+    for left, right, ours, theirs in _side_by_side(*streams):
+        pairs = (
+            _without_fields(steps)[at].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
+        )
+        agree = np.flatnonzero(~differing_steps(*pairs, _ALIGNED))
+        equal_steps += len(agree)
+        compared += len(left) + len(right) - len(ours)
+        for steps, at in ((left, ours[agree]), (right, theirs[agree])):
+            are_equal[np.delete(steps["episode"], at)] = False
+    overlap = Overlap(
+        steps_a=a.train.steps.count(),
+        steps_b=b.train.steps.count(),
+        episodes=episodes,
+        equal_episodes=int(are_equal.sum()),
+        equal_steps=equal_steps,
+        compared_steps=compared,
+        mean_length_a=step_of_episode(a, episodes) / max(episodes, 1),
+        mean_length_b=step_of_episode(b, episodes) / max(episodes, 1),
+    )
+    return overlap, visits
 
 
 def visits_diff(mdp: Mdp, a: Ints, b: Ints) -> VisitsDiff:
@@ -121,106 +134,51 @@ def visits_diff(mdp: Mdp, a: Ints, b: Ints) -> VisitsDiff:
     )
 
 
-def _common_lengths(a: Recording, b: Recording) -> Iterator[tuple[Ints, Ints]]:
-    """Yield the lengths of successive episodes of both runs, in batches of about `_BATCH_STEPS` steps.
-
-    An episode longer than that comes alone.
-    """
-    lengths = [unbroken(recording) for recording in (a, b)]
-    common = min(count for _, count in lengths)
-    for first in range(0, common, _BATCH_EPISODES):
-        last = min(first + _BATCH_EPISODES, common)
-        records = [recording.train.episodes.array(first, last) for recording in (a, b)]
-        whole = min(
-            int(np.searchsorted(episodes["last_step"], steps))
-            for episodes, (steps, _) in zip(records, lengths, strict=True)
-        )
-        ours, theirs = (episodes["length"][:whole].astype(np.int64) for episodes in records)
-        longer = np.maximum(ours, theirs)
-        apart = np.diff(np.cumsum(longer) // _BATCH_STEPS) > 0
-        apart |= (longer[:-1] > _BATCH_STEPS) | (longer[1:] > _BATCH_STEPS)
-        cuts = np.flatnonzero(apart) + 1
-        if whole:
-            yield from zip(np.split(ours, cuts), np.split(theirs, cuts), strict=True)
-        if whole < last - first:
-            return
+def _whole_episodes(recording: Recording) -> int:
+    """Return how many episodes of training precede the first that lost a step or its end."""
+    steps, episodes = unbroken(recording)
+    return min(episodes, recording.train.episodes.first_from("last_step", steps))
 
 
-class _Steps:
-    """A run's training steps, taken in order; the visits to each state are counted on the way."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._path = recording.path
-        self._blocks = recording.train.steps.blocks()
-        self._rest: Records = np.empty(0, recording.train.steps.row_dtype)
-        self._visits = np.zeros(recording.mdp.states, np.int64)
-
-    def take(self, count: int) -> Records:
-        """Return the next steps."""
-        parts = [self._rest[:0]]
-        while count > 0:
-            if not len(self._rest) and not self._read_block():
-                raise RecordingError(f"{self._path}: found fewer training steps than its episodes are long.")
-            parts.append(self._rest[:count])
-            self._rest = self._rest[count:]
-            count -= len(parts[-1])
-        if len(parts) == 2:
-            return parts[1]
-        return np.concatenate([_without_fields(part) for part in parts]).view(self._rest.dtype)
-
-    def skip(self, count: int) -> None:
-        """Pass over the next steps."""
-        for first in range(0, count, _BATCH_STEPS):
-            self.take(min(_BATCH_STEPS, count - first))
-
-    def count_all_visits(self) -> Ints:
-        """Read to the end, and return how often each state was acted in, [S]."""
-        while self._read_block():
-            pass
-        return self._visits
-
-    def _read_block(self) -> bool:
-        block = next(self._blocks, None)
-        if block is None:
-            return False
-        states = len(self._visits)
+def _counted_steps(recording: Recording, episodes: int, visits: Ints) -> Iterator[Records]:
+    """Yield the steps of the first episodes in blocks; add the visits of all steps to those of each state."""
+    states = len(visits)
+    for block in recording.train.steps.blocks():
         if (highest := int(block["state"].max(initial=0))) >= states:
             raise RecordingError(
-                f"{self._path}: found state {highest} in training step {block['step'][0]} or soon after, "
+                f"{recording.path}: found state {highest} in training step {block['step'][0]} or soon after, "
                 f"expected less than {states}; `dualtaxi verify` names the step."
             )
-        self._visits += np.bincount(block["state"], minlength=states)
-        self._rest = block
-        return True
+        visits += np.bincount(block["state"], minlength=states)
+        if count := np.searchsorted(block["episode"], episodes):
+            yield block[:count]
 
 
-def _agreement(left: _Steps, right: _Steps, ours: Ints, theirs: Ints) -> Ints:
-    """Return, for each of the next episodes, how many steps agree with the other's of the same time."""
-    common = np.minimum(ours, theirs)
-    if len(ours) == 1:  # it may be longer than a batch
-        agree = 0
-        for first in range(0, int(common[0]), _BATCH_STEPS):
-            n = min(_BATCH_STEPS, int(common[0]) - first)
-            agree += n - int(differing_steps(left.take(n), right.take(n), _ALIGNED).sum())
-        left.skip(int(ours[0] - common[0]))
-        right.skip(int(theirs[0] - common[0]))
-        return np.array([agree])
-    episode = np.repeat(np.arange(len(common)), common)
-    t = np.arange(len(episode)) - np.repeat(np.cumsum(common) - common, common)
-    at = [(np.cumsum(lengths) - lengths)[episode] + t for lengths in (ours, theirs)]
-    agree_at = _agreeing_pairs(left.take(int(ours.sum())), right.take(int(theirs.sum())), at[0], at[1])
-    return np.bincount(episode[agree_at], minlength=len(common))
+def _side_by_side(
+    a: Iterator[Records], b: Iterator[Records]
+) -> Iterator[tuple[Records, Records, Ints, Ints]]:
+    """Yield the steps of two runs in parts that end at the same time of the same episode.
+
+    Also the numbers, in either part, of the steps that both runs have.
+    """
+    left, right = next(a, None), next(b, None)
+    while left is not None and right is not None:
+        ours, theirs = _times(left), _times(right)
+        last = min(ours[-1], theirs[-1])
+        n, m = (np.searchsorted(times, last, side="right") for times in (ours, theirs))
+        at = np.searchsorted(theirs, ours).clip(max=len(theirs) - 1)
+        both = np.flatnonzero(theirs[at] == ours)
+        yield left[:n], right[:m], both, at[both]
+        left = left[n:] if n < len(left) else next(a, None)
+        right = right[m:] if m < len(right) else next(b, None)
+    for rest, others in ((left, a), (right, b)):
+        for steps in itertools.chain([] if rest is None else [rest], others):
+            yield steps, steps[:0], np.empty(0, np.int64), np.empty(0, np.int64)
 
 
-def _agreeing_pairs(left: Records, right: Records, ours: Ints, theirs: Ints) -> Ints:
-    """Return which of the pairs of steps (`ours` in `left`, `theirs` in `right`) agree in all but number."""
-    if len(left) == len(right) == len(ours):
-        return np.flatnonzero(~differing_steps(left, right, _ALIGNED))
-    agree = np.flatnonzero(left["state"][ours] == right["state"][theirs])  # most that differ do so there
-    pairs = [
-        _without_fields(steps)[at[agree]].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
-    ]
-    return agree[~differing_steps(pairs[0], pairs[1], _ALIGNED)]
+def _times(steps: Records) -> Ints:
+    """Return a number for each step that grows with its episode, and its time in it."""
+    return (steps["episode"].astype(np.int64) << 32) + steps["t"]
 
 
 def _without_fields(steps: Records) -> Records:
