@@ -67,10 +67,11 @@ def median(values: Floats) -> float:
 
 def interquartile_mean(values: Floats) -> Estimate:
     """Return the mean of the middle half of the values, and its interval; nan for fewer than four."""
-    if len(values) < FEWEST_FOR_IQM:
+    n = len(values)
+    if n < FEWEST_FOR_IQM:
         return Estimate()
-    low, high = _interval(values, iqm)
-    return Estimate(bounded(float(iqm(values, -1))), bounded(float(low)), bounded(float(high)))
+    ends = np.quantile(_weights(n, RESAMPLES, n // 4) @ np.sort(values), _TAILS)
+    return Estimate(*(bounded(float(value)) for value in (iqm(values, -1), *ends)))
 
 
 def iqm_band(values: Floats) -> tuple[Floats, Floats, Floats]:
@@ -214,16 +215,6 @@ def _standard_error(values: Floats) -> float:
     return float(winsorized.std(ddof=1) * np.sqrt((n - 1) / (left * (left - 1))))
 
 
-def share_at_least(values: Floats, thresholds: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the share of values that are at least each threshold, and its interval: (share, low, high)."""
-    above = (values >= thresholds[:, np.newaxis]).astype(np.float64)
-    share = above.mean(axis=1)
-    if len(values) < 2 or not len(thresholds):
-        nothing = np.full_like(share, np.nan)
-        return share, nothing, nothing
-    return share, *_interval(above, np.mean)
-
-
 def bounded(value: float) -> float:
     """Return a value, infinite if it was computed from `NEVER`."""
     return float(np.copysign(np.inf, value)) if abs(value) > NEVER / 1e6 else value
@@ -252,19 +243,3 @@ def _highest_probability(value: float, m: int, n: int) -> float:
         return 1.0
     start = value if value > 0 else 1e-12  # at 0 and 1 themselves the variance is 0
     return float(brentq(contradiction, start, 1.0)) if contradiction(start) < 0 else 1.0
-
-
-def _interval(values: Floats, statistic: Callable[..., Floats]) -> tuple[Floats, Floats]:
-    """Return the percentile bootstrap interval of a statistic over the last axis."""
-    result = require_scipy().bootstrap(
-        (values,),
-        statistic,
-        n_resamples=RESAMPLES,
-        batch=max(1, _BATCH // values.size),
-        vectorized=True,
-        axis=-1,
-        confidence_level=CONFIDENCE,
-        method="percentile",
-        rng=np.random.default_rng(_SEED),
-    )
-    return result.confidence_interval.low, result.confidence_interval.high

@@ -233,9 +233,8 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
 
 def _group(label: str, values: Measured, thresholds: Floats, sign: float) -> GroupResult:
     numbers = np.array(list(values.by_seed.values()))
-    share, low, high = (
-        column.tolist() for column in statistics.share_at_least(sign * numbers, sign * thresholds)
-    )
+    reached = sign * numbers >= sign * thresholds[:, np.newaxis]
+    shares = statistics.bootstrap_means(reached.astype(np.float64))
     return GroupResult(
         label=label,
         seeds=list(values.by_seed),
@@ -243,9 +242,9 @@ def _group(label: str, values: Measured, thresholds: Floats, sign: float) -> Gro
         values=[statistics.bounded(value) for value in numbers.tolist()],
         median=statistics.median(numbers),
         iqm=statistics.interquartile_mean(numbers),
-        profile=share,
-        profile_low=low,
-        profile_high=high,
+        profile=[share.value for share in shares],
+        profile_low=[share.low for share in shares],
+        profile_high=[share.high for share in shares],
     )
 
 

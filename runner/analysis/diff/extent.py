@@ -98,13 +98,15 @@ def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Ints, I
     ]
     equal_steps = compared = 0
     are_equal = np.ones(episodes, np.bool_)
-    for left, right, ours, theirs in _side_by_side(*streams):
+    for left, right, shared_a, shared_b in _side_by_side(*streams):
+        compared += len(left) + len(right) - len(shared_a)
+        alike = left["state"][shared_a] == right["state"][shared_b]  # most steps that differ do so there
+        ours, theirs = shared_a[alike], shared_b[alike]
         pairs = (
             _without_fields(steps)[at].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
         )
         agree = np.flatnonzero(~differing_steps(*pairs, _ALIGNED))
         equal_steps += len(agree)
-        compared += len(left) + len(right) - len(ours)
         for steps, at in ((left, ours[agree]), (right, theirs[agree])):
             are_equal[np.delete(steps["episode"], at)] = False
     overlap = Overlap(
