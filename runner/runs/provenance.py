@@ -15,7 +15,7 @@ import shlex
 import socket
 import sys
 from collections.abc import Iterator, Mapping
-from functools import cache, lru_cache
+from functools import cache
 from importlib.metadata import distributions
 from pathlib import Path
 from types import ModuleType
@@ -184,16 +184,20 @@ def _normalised(name: str) -> str:
 
 def _settings(with_command: bool) -> dict[str, str]:
     """Return what may change during a process: environment variables, flags, states of random generators."""
-    names = _used_names(tuple(os.environ))
-    present = frozenset((name, os.environ[name]) for name in names if name in os.environ)
-    has_command = with_command and is_code_wanted()
-    variables, command = _redacted(present, tuple(sys.argv) if has_command else ())
-    facts = {"host": socket.gethostname(), "directory": _directory(), "user": _user()}
-    if has_command:
-        facts["command"] = command
+    variables = dict(os.environ)
+    facts = {
+        f"env.{name}": redacted_text(value, variables)
+        for name, value in sorted(variables.items())
+        if _VARIABLE.fullmatch(name) and not is_secret_name(name)
+    }
+    facts |= {"host": socket.gethostname(), "directory": "", "user": _user()}
+    with contextlib.suppress(OSError):  # it was removed
+        facts["directory"] = str(Path.cwd())
+    if with_command and is_code_wanted():
+        facts["command"] = shlex.join(redacted_arguments(sys.argv, variables))
     if hasattr(os, "sched_getaffinity"):
         facts["processors.usable"] = str(len(os.sched_getaffinity(0)))
-    facts["random.state"] = _random_digest(random.getstate()[1])
+    facts["random.state"] = _digest(np.array(random.getstate()[1], np.int64).tobytes())
     if "numpy.random" in sys.modules:
         state = np.random.get_state(legacy=False)["state"]
         if "key" in state:  # otherwise the user chose another generator
@@ -202,32 +206,7 @@ def _settings(with_command: bool) -> dict[str, str]:
         if name in sys.modules:
             with contextlib.suppress(Exception):  # it may be of another version, or being imported
                 facts |= dict(read(sys.modules[name]))
-    return variables | {key: as_utf8(text) for key, text in facts.items()}
-
-
-@lru_cache(1)
-def _used_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return which environment variables are recorded, or hold a secret that is not."""
-    return tuple(name for name in names if _VARIABLE.fullmatch(name) or is_secret_name(name))
-
-
-@lru_cache(1)
-def _redacted(
-    variables: frozenset[tuple[str, str]], arguments: tuple[str, ...]
-) -> tuple[dict[str, str], str]:
-    """Return the recorded environment variables by key, and the command line, both without secrets."""
-    values = dict(variables)
-    facts = {
-        f"env.{name}": as_utf8(redacted_text(value, values))
-        for name, value in sorted(values.items())
-        if _VARIABLE.fullmatch(name) and not is_secret_name(name)
-    }
-    return facts, shlex.join(redacted_arguments(arguments, values))
-
-
-@lru_cache(1)
-def _random_digest(state: tuple[int, ...]) -> str:
-    return _digest(np.array(state, np.int64).tobytes())
+    return {key: as_utf8(text) for key, text in facts.items()}
 
 
 def _torch(torch: ModuleType) -> Iterator[tuple[str, str]]:
@@ -252,13 +231,6 @@ def _jax(jax: ModuleType) -> Iterator[tuple[str, str]]:
 
 def _digest(data: bytes) -> str:
     return blake3(data).hexdigest()[:16]
-
-
-def _directory() -> str:
-    try:
-        return str(Path.cwd())
-    except OSError:  # it was removed
-        return ""
 
 
 @cache
