@@ -35,7 +35,6 @@ def measure(quick: bool) -> list[Figure]:
         line = [*command("find"), "--recordings", str(place), "--sort", "ret"]
         run([*line, "length > 0"], environment)
         _write_many_episodes()
-        run([*line, "length > 0"], environment)  # packs them
         figures = []
         for expression in EXPRESSIONS:
             done = [run([*line, expression], environment) for _ in range(3 if quick else 10)]

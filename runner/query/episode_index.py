@@ -1,8 +1,7 @@
 """The index of episodes, a file for each run in the user's cache, and conditions on episodes as SQL over it.
 
-    episodes/RUN-HEX.parquet     a row for each episode: its columns, and of its steps the counts of flags,
-                                 events and actions, and least, greatest and last numbers
-    episodes/packs/HEX.parquet   the rows of some sixty of these files, to open one instead
+    episodes/RUN-HEX.parquet   a row for each episode: its columns, and of its steps the counts of flags,
+                               events and actions, and least, greatest and last numbers
 
 It is made from the run's own tables when it is first asked for. HEX has hashes of the recording's path and
 state, and of the facts in the file's metadata. An index of another state is not found.
@@ -22,10 +21,8 @@ import ast
 import glob
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
@@ -299,10 +296,6 @@ class EpisodeParser(Parser[Part]):
 
 MAX_FILES: Final = 20_000
 _VERSION: Final = 7
-_PACKED: Final = 64
-"""The average number of files in a pack."""
-_LEAST: Final = 8
-"""The fewest files for which a pack is made, or read."""
 _HEX: Final = 16
 """The digits of each hash in a name."""
 _MAX_COLUMNS: Final = 64
@@ -325,11 +318,10 @@ class EpisodeIndex:
         self.folder = cache_folder() / CACHED_EPISODES
         self._database = database
         with storage_errors(self.folder):
-            (self.folder / "packs").mkdir(parents=True, exist_ok=True)
-            written = self.folder.glob("[!.]*-*.parquet")  # a hidden one is being written by another search
-            self._files = {path.stem[:-_HEX]: path for path in written}
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._files = {path.stem[:-_HEX]: path for path in self.folder.glob("*.parquet")}
         self.read = set[Path]()
-        """The files of the index that were asked for, their packs, and the other files in these packs."""
+        """The files of the index that were asked for."""
 
     def file(self, row: IndexRow, runs: SelectedRuns) -> Path:
         """Return the file of a run; make it if it is missing.
@@ -353,44 +345,6 @@ class EpisodeIndex:
     def trim(self) -> None:
         """Remove the oldest files beyond the limit."""
         remove_oldest(self.folder, "*.parquet", keep=MAX_FILES)
-        remove_oldest(self.folder / "packs", "*.parquet", keep=MAX_FILES // _LEAST)
-
-    def packed(self, files: set[Path]) -> list[Path]:
-        """Return files with the same facts, or packs where these have many of them.
-
-        The files, by their age, are cut where a name says so. Thus a pack is made once, and a new file, which
-        comes last, changes none. It is named by its files and their times. Packs of other files are removed.
-        """
-        import os
-
-        if os.environ.get("NOPACKS"):
-            return list(files)
-        kind = kind_of(next(iter(files)))
-        folder = self.folder / "packs"
-        readable_packs = list[Path]()
-        loose = set(files)
-        alike = sorted((p.stat().st_mtime_ns, p) for p in self._files.values() if kind_of(p) == kind)
-        cuts = [k for k, (_, p) in enumerate(alike, 1) if not int(p.stem[-2 * _HEX : -_HEX], 16) % _PACKED]
-        groups = [alike[start:stop] for start, stop in pairwise([0, *cuts])]
-        packs = {folder / f"{kind}-{_hash(group)}.parquet": [path for _, path in group] for group in groups}
-        for pack, packed in packs.items():
-            if len(files.intersection(packed)) >= _LEAST:
-                self.read.update(packed)
-                if not pack.exists():
-                    self._write(pack, f"FROM {in_files(packed)}", "ROW_GROUP_SIZE 30720")
-                self.read.add(pack)
-                readable_packs.append(pack)
-                loose.difference_update(packed)
-        for other in set(folder.glob(f"{kind}-*")) - packs.keys():
-            other.unlink(missing_ok=True)
-        return [*readable_packs, *loose]
-
-    def _write(self, path: Path, rows: str, options: str, check: Callable[[], None] = lambda: None) -> None:
-        """Write rows into a file, unless `check` raises an error when all are there."""
-        with storage_errors(path), replacing(path) as fresh:
-            options = f"FORMAT parquet, COMPRESSION zstd, {options}"
-            self._database.rows(f"COPY ({rows}) TO {literal(fresh)} ({options})")
-            check()
 
     def _make(self, row: IndexRow, runs: SelectedRuns, stem: str) -> Path:
         """Make the file of a run."""
@@ -425,8 +379,10 @@ class EpisodeIndex:
         )
         if aggregates:
             rows = with_steps(rows, aggregates, {})
-        options = f"KV_METADATA {{facts: {literal(facts)}}}"
-        self._write(path, f"FROM ({rows}) ORDER BY row", options, partial(_check, row, runs))
+        options = f"FORMAT parquet, COMPRESSION zstd, KV_METADATA {{facts: {literal(facts)}}}"
+        with storage_errors(path), replacing(path) as fresh:
+            self._database.rows(f"COPY (FROM ({rows}) ORDER BY row) TO {literal(fresh)} ({options})")
+            _check(row, runs)
         return path
 
 

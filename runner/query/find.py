@@ -304,7 +304,7 @@ class _Search:
         """Add hits in runs with the same facts: by their indexes, and by the steps that these leave open."""
         where, key, aggregates, _ = of_index
         is_open = f"{where} IS NULL OR {key} IS NULL" if aggregates else "FALSE"
-        files = in_files(self.index.packed({self.files[k] for k in numbers}))
+        files = in_files({self.files[k] for k in numbers})
         self.database.rows(
             f"INSERT INTO hits SELECT run, row, {key}, {is_open} FROM {files} JOIN runs USING (file) "
             f"WHERE {where} {'IS NOT FALSE' if aggregates else ''}{in_phase}"

@@ -217,21 +217,18 @@ def _evaluation(difference: RunDiff, most: int) -> Section:
 
 def divergence_in_words(divergence: Divergence, cause: Cause | None) -> str:
     """Return where two runs diverge and why, as far as that is known, in a sentence."""
-    return f"They diverge {where_in_words(divergence)}: {_why_in_words(divergence, cause)}."
-
-
-def _why_in_words(divergence: Divergence, cause: Cause | None) -> str:
-    """Return the cause of a divergence; where how they learn is not known, the values that differ."""
     if cause is not None:
-        return cause.text
-    if divergence.field == "digest":
-        return "the actions are the same, but observations or rewards differ"
-    if divergence.field == "step":
+        why = cause.text
+    elif divergence.field == "digest":
+        why = "the actions are the same, but observations or rewards differ"
+    elif divergence.field == "step":
         has, lacks = ("B", "A") if _is_beyond_a(divergence) else ("A", "B")
-        return f"{has} has that step, {lacks} ended before it"
-    name = spoken(divergence.field.removeprefix("reset."))
-    a, b = _shortened_pair(_text(divergence.a), _text(divergence.b))
-    return f"{name} is {a} in A, {b} in B"
+        why = f"{has} has that step, {lacks} ended before it"
+    else:  # how they learn is not known: the values that differ
+        name = spoken(divergence.field.removeprefix("reset."))
+        a, b = _shortened_pair(_text(divergence.a), _text(divergence.b))
+        why = f"{name} is {a} in A, {b} in B"
+    return f"They diverge {where_in_words(divergence)}: {why}."
 
 
 def _evaluation_updates(difference: RunDiff, cause: Cause | None) -> list[str]:

@@ -21,7 +21,6 @@ from runner.archive.batches import Batches
 from runner.archive.runs import archive_run
 from runner.cli import cli
 from runner.errors import RunnerError
-from runner.query import episode_index
 from runner.query.episode_index import EpisodeParser
 from runner.query.sql_views import SelectedRuns
 from runner.recording.reader import open_recording
@@ -379,36 +378,8 @@ def test_the_cache_may_be_in_a_folder_with_signs_of_patterns(folder, tmp_path, m
     for cache in (tmp_path / "x1", tmp_path / name):  # a pattern would match the other
         cache.mkdir()
         monkeypatch.setenv(CACHE_VARIABLE, str(cache))
-        monkeypatch.setattr(episode_index, "_LEAST", 1)
-        monkeypatch.setattr(episode_index, "_PACKED", 1)
         for _ in range(2):
             assert [runner.find(expression, folder, runs="pole") for expression in expressions] == expected
-
-
-def place_damaged_file(folder, monkeypatch, name):
-    """Place a damaged file where a pack has it and a run's index; return the hits before, and the file."""
-    shutil.rmtree(cache_folder() / CACHED_EPISODES, ignore_errors=True)
-    before = runner.find("length > 20", folder, runs="pole")
-    (file,) = (cache_folder() / CACHED_EPISODES).glob(f"{before.hits[0].run_id}-*")
-    damaged = file.with_name(f"{name}-{'1' * 32}{file.stem[-16:]}.parquet")
-    damaged.write_bytes(b"?")
-    os.utime(damaged, (0, 0))
-    monkeypatch.setattr(episode_index, "_LEAST", 1)
-    monkeypatch.setattr(episode_index, "_PACKED", int(file.stem[-32:-16], 16))  # it ends a pack of both
-    return before, damaged
-
-
-def test_a_damaged_index_in_a_pack_is_made_again(folder, monkeypatch):
-    before, _ = place_damaged_file(folder, monkeypatch, "other")
-    with pytest.raises(RunnerError, match="the next search makes it again"):
-        runner.find("length > 20", folder, runs="pole")
-    assert runner.find("length > 20", folder, runs="pole") == before
-
-
-def test_a_file_that_another_search_is_writing_is_no_index(folder, monkeypatch):
-    before, unfinished = place_damaged_file(folder, monkeypatch, ".0a1b2c3d.other")
-    assert runner.find("length > 20", folder, runs="pole") == before
-    assert unfinished.exists()
 
 
 def test_a_return_that_is_no_number_matches_no_comparison(tmp_path):
@@ -465,26 +436,6 @@ def test_a_recording_that_lost_its_end_is_left_out_and_named(tmp_path):
 def test_a_wrong_limit_is_refused_before_anything_is_read(tmp_path, limit):
     with pytest.raises(RunnerError, match="limit: found"):
         runner.find("length > 0", tmp_path, limit=limit)
-
-
-def test_a_pack_that_another_search_removes_is_made_again(folder, monkeypatch):
-    before = runner.find("length > 20", folder)
-    monkeypatch.setattr(episode_index, "_LEAST", 1)
-    monkeypatch.setattr(episode_index, "_PACKED", 1)
-    packed, removed = episode_index.EpisodeIndex.packed, []
-
-    def packed_once(index, files):
-        chosen = packed(index, files)
-        if not removed:
-            removed.append(chosen[0])
-            chosen[0].unlink()
-        return chosen
-
-    monkeypatch.setattr(episode_index.EpisodeIndex, "packed", packed_once)
-    indexes = {path: path.stat().st_mtime_ns for path in (cache_folder() / CACHED_EPISODES).glob("*.parquet")}
-    assert runner.find("length > 20", folder) == before
-    assert {path: path.stat().st_mtime_ns for path in indexes} == indexes
-    assert removed
 
 
 def test_extras_are_searched(tmp_path):
@@ -624,32 +575,19 @@ def test_hits_are_marked(tmp_path, folder):
     assert "--tag needs --mark" in wrong.output
 
 
-def test_a_pack_of_many_indexes_has_the_same_hits(tmp_path, folder, monkeypatch):
+def test_runs_with_the_same_episodes_have_the_same_hits(tmp_path, folder):
     run = find_run("pole", folder)
-    for k in range(14):
+    for k in range(3):
         place = tmp_path / f"run{k:05d}"
         shutil.copytree(run.folder, place)
         facts = json.loads((place / "run.json").read_text()) | {"run_id": place.name, "name": f"pole{k % 2}"}
         (place / "run.json").write_text(json.dumps(facts))
-    shutil.rmtree(cache_folder() / CACHED_EPISODES, ignore_errors=True)  # no test may have searched before
-    monkeypatch.setattr(episode_index, "_LEAST", 2)
-    expressions = ("length > 20 and any(action == 1)", "then(action == 1, action == 0, within=1)")
-
-    def hits():
-        found = [runner.find(expression, tmp_path, sort="-ret", limit=None) for expression in expressions]
-        some = runner.find(expressions[0], tmp_path, runs='name == "pole1"')
-        return *found, some
-
-    monkeypatch.setattr(episode_index, "_PACKED", 1 << 70)
-    loose = hits()
-    assert all(found.count for found in loose)
-    for size in (1, 7, 2):  # where packs are cut depends on inodes; two of fourteen files stay together at 2
-        monkeypatch.setattr(episode_index, "_PACKED", size)
-        for _ in range(2):
-            assert hits() == loose
-    assert list((cache_folder() / CACHED_EPISODES / "packs").iterdir())
-    shutil.rmtree(tmp_path / "run00011")
-    assert [found.runs for found in hits()] == [13, 13, 6]
+    alone = runner.find("length > 20 and any(action == 1)", folder, runs='name == "pole"').count
+    assert alone
+    assert runner.find("length > 20 and any(action == 1)", tmp_path).count == 3 * alone
+    assert (
+        runner.find("length > 20 and any(action == 1)", tmp_path, runs='name == "pole0"').count == 2 * alone
+    )
 
 
 def test_a_number_to_sort_by_is_checked_as_a_condition_is(folder):
