@@ -102,10 +102,10 @@ def training_overlap(a: Recording, b: Recording) -> tuple[Overlap, tuple[Ints, I
         compared += len(left) + len(right) - len(shared_a)
         alike = left["state"][shared_a] == right["state"][shared_b]  # most steps that differ do so there
         ours, theirs = shared_a[alike], shared_b[alike]
-        pairs = (
+        pairs = [
             _without_fields(steps)[at].view(steps.dtype) for steps, at in ((left, ours), (right, theirs))
-        )
-        agree = np.flatnonzero(~differing_steps(*pairs, _ALIGNED))
+        ]
+        agree = np.flatnonzero(~differing_steps(pairs[0], pairs[1], _ALIGNED))
         equal_steps += len(agree)
         for steps, at in ((left, ours[agree]), (right, theirs[agree])):
             are_equal[np.delete(steps["episode"], at)] = False
@@ -180,7 +180,8 @@ def _side_by_side(
 
 def _times(steps: Records) -> Ints:
     """Return a number for each step that grows with its episode, and its time in it."""
-    return (steps["episode"].astype(np.int64) << 32) + steps["t"]
+    times: Ints = (steps["episode"].astype(np.int64) << 32) + steps["t"]
+    return times
 
 
 def _without_fields(steps: Records) -> Records:
