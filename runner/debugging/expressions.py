@@ -237,7 +237,15 @@ class JobParser(Parser[Series]):
             raise self.error(node, f"found {self.text_of(node)}, expected {_FORMS[name]}.")
         state = self.numbered(index[0], self._state_names, "state") if index else -1
         action = self.numbered(index[1], self._actions(learner), "action") if index[1:] else -1
-        return self._quantity(Quantity(name, learner, state, action))
+        quantity = Quantity(name, learner, state, action)
+        self.quantities[quantity] = None
+        kind = {"greedy_success": CONDITION, "greedy": _ACTION}.get(name, NUMBER)
+        return Series(
+            _ROW if name == "q" and action < 0 else kind,
+            lambda columns: columns[quantity],
+            self._actions(learner) if kind == _ACTION else (),
+            name in ("visits", "step", "episode"),
+        )
 
     def _check_algorithm(self, node: ast.expr, name: str) -> None:
         if name in TABLE_NAMES and not self._learns:
@@ -271,18 +279,6 @@ class JobParser(Parser[Series]):
 
     def _actions(self, learner: int) -> list[str]:
         return self._joint if learner == JOINT else self._own[learner]
-
-    def _quantity(self, quantity: Quantity) -> Series:
-        self.quantities[quantity] = None
-        kind = {"greedy_success": CONDITION, "greedy": _ACTION}.get(quantity.name, NUMBER)
-        if quantity.name == "q" and quantity.action < 0:
-            kind = _ROW
-        return Series(
-            kind,
-            lambda columns: columns[quantity],
-            self._actions(quantity.learner) if kind == _ACTION else (),
-            quantity.name in ("visits", "step", "episode"),
-        )
 
 
 # --- values after each training step ------------------------------------------------------------------
@@ -388,8 +384,10 @@ class JobColumns:
         columns: dict[Quantity, Array] = {}
         if len(places):
             columns = self._of_steps(block[places])
-            if changes is not None:
-                columns |= self._of_tables(changes, places)
+            if changes is not None:  # the values of the last change before or at each place
+                at = np.searchsorted(changes.row, places, side="right")
+                for quantity, values in self._table_values(changes).items():
+                    columns[quantity] = np.concatenate([self.last[quantity], values])[at]
         for quantity, mask in visits.items():
             if len(places):
                 columns[quantity] = (self._visits[quantity] + np.cumsum(mask)[places]).astype(np.float64)
@@ -412,12 +410,6 @@ class JobColumns:
                     )
                     columns[quantity][len(steps) - len(wanted_steps) :] = explorations(rules, *numbers)
         return columns
-
-    def _of_tables(self, changes: WatchedValues, places: Ints) -> dict[Quantity, Array]:
-        """Return the values at places in a block, each that of the last change before or at it."""
-        at = np.searchsorted(changes.row, places, side="right")
-        values = self._table_values(changes)
-        return {key: np.concatenate([self.last[key], value])[at] for key, value in values.items()}
 
     def _table_values(self, changes: WatchedValues) -> dict[Quantity, Array]:
         columns: dict[Quantity, Array] = {}

@@ -358,7 +358,21 @@ class _Branches:
         self._at = at
         self._mdp = recording.mdp
         self._number = at.number_in(recording)
-        self._read_episode()
+        length = len(at.steps_in(recording))
+        returns = self._returns = np.zeros(len(recording.agents))
+        self._succeeded = False
+        done = 0
+        for block in episode_blocks(recording, at.phase, self._number):
+            self._mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
+            before = block[: max(0, at.t - done)]
+            self._returns = _summed(self._returns, before)
+            self._succeeded |= self._has_success(before)
+            if done <= at.t < done + len(block):
+                self._step = block[at.t - done].copy()
+            returns = _summed(returns, block)
+            done += len(block)
+        end = ending_of(recording, at.phase, self._number)
+        self._recorded = Outcome(tuple(returns.tolist()), length, end)
         trained_episode = at.episode
         trained_step = int(self._step["step"])
         if at.after is not None:
@@ -368,28 +382,6 @@ class _Branches:
         self._playing = _Continuation(
             self._tables.learner, self._step, trained_episode, trained_step, at.after is not None
         )
-
-    def _read_episode(self) -> None:
-        """Read the step, what came before it, and where the episode led."""
-        recording = self._recording
-        phase = self._at.phase
-        episode = self._number
-        t = self._at.t
-        length = len(self._at.steps_in(recording))
-        self._returns = np.zeros(len(recording.agents))
-        self._succeeded = False
-        done = 0
-        returns = self._returns
-        for block in episode_blocks(recording, phase, episode):
-            self._mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[phase])
-            before = block[: max(0, t - done)]
-            self._returns = _summed(self._returns, before)
-            self._succeeded |= self._has_success(before)
-            if done <= t < done + len(block):
-                self._step = block[t - done].copy()
-            returns = _summed(returns, block)
-            done += len(block)
-        self._recorded = Outcome(tuple(returns.tolist()), length, ending_of(recording, phase, episode))
 
     @property
     def _learns(self) -> bool:

@@ -308,11 +308,19 @@ def _cell(
     learner: int,
     at: EpisodeRef | None,
 ) -> _Cell:
-    """Return the place of the value of a state and an action, by default those of a step."""
+    """Return the place of the value of a state and an action, by default those of a step.
+
+    Raises:
+        ConfigError: one of them is missing, and no step is given.
+    """
     mdp = recording.mdp
     is_joint = len(recording.agents) < len(recording.mdp.agents)
     if state is None or action is None:
-        taken = _step_at(recording, at)
+        if at is None:
+            raise ConfigError("found no state or no action, expected both, or a step to take them from.")
+        (block,) = at.steps_in(recording).rows(at.t, at.t + 1)
+        mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
+        taken = block[0]
         taken_action = taken["action"] if is_joint else mdp.own_actions[taken["action"], learner]
         state = str(taken["state"]) if state is None else state
         action = str(taken_action) if action is None else action
@@ -333,20 +341,6 @@ def _learner(recording: Recording, agent: str | None) -> int:
             f"{nearest(agent or '', learners)}"
         )
     return learners.index(names[0])
-
-
-def _step_at(recording: Recording, at: EpisodeRef | None) -> Records:
-    """Return the record of a step.
-
-    Raises:
-        ConfigError: none is given.
-    """
-    if at is None:
-        raise ConfigError("found no state or no action, expected both, or a step to take them from.")
-    (block,) = at.steps_in(recording).rows(at.t, at.t + 1)
-    recording.mdp.check_steps(block, str(recording.path), schema.PHASE_NAMES[at.phase])
-    step: Records = block[0]
-    return step
 
 
 def _steps_before(recording: Recording, at: EpisodeRef) -> int:

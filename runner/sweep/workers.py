@@ -19,7 +19,7 @@ from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from types import ModuleType
-from typing import Any, Concatenate, Final, Generic, ParamSpec, Protocol, Self, TypeVar
+from typing import Any, Final, Generic, Protocol, Self, TypeVar
 
 from runner.errors import RunnerError
 from runner.util.extras import require
@@ -179,7 +179,6 @@ def serve(pipe: Connection, stopping: Event) -> None:
 
 
 _CONNECT_SECONDS: Final = 5.0
-P = ParamSpec("P")
 
 
 def connect(address: str | None, processors: int | None = None) -> ModuleType:
@@ -210,26 +209,18 @@ def connect(address: str | None, processors: int | None = None) -> ModuleType:
 
 
 class RayActor:
-    """Runs one function at a time in a process of Ray."""
+    """Runs one task at a time in a process of Ray."""
 
     def __init__(self) -> None:
         self._stopping = threading.Event()
 
-    def run(self, function: Callable[Concatenate[RayActor, P], R], *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call a function with this actor and these arguments."""
-        return function(self, *args, **kwargs)
+    def run(self, task: Work) -> object:
+        """Return the result of a task."""
+        return task.run(self._stopping.is_set)
 
     def request_stop(self) -> None:
-        """Ask the running function, and every later one, to stop."""
+        """Ask the running task, and every later one, to stop."""
         self._stopping.set()
-
-    def stop(self) -> bool:
-        """Return whether the function must stop."""
-        return self._stopping.is_set()
-
-
-def _run(actor: RayActor, task: Work) -> object:
-    return task.run(actor.stop)
 
 
 class RayWorkers(Workers[T, R]):
@@ -252,7 +243,7 @@ class RayWorkers(Workers[T, R]):
             self._idle.append(self._ray.remote(RayActor).options(**options).remote())
         actor = self._idle.pop()
         remote = task.placed(threads=False, on_own_disk=self._on_own_disk)
-        self._busy[actor.run.remote(_run, remote)] = actor, task
+        self._busy[actor.run.remote(remote)] = actor, task
 
     def _ready(self, seconds: float) -> Iterable[Any]:
         done: list[Any] = self._ray.wait(list(self._busy), timeout=seconds)[0]
