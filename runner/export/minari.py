@@ -1,14 +1,11 @@
-"""A run's episodes as a Minari dataset, which libraries for offline reinforcement learning read.
-
-Steps are read a block at a time; an episode is yielded when it has ended.
-"""
+"""A run's episodes as a Minari dataset, which libraries for offline reinforcement learning read."""
 
 from __future__ import annotations
 
+import contextlib
 import re
 import warnings
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, islice
 from pathlib import Path
@@ -19,15 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runner.analysis.contents import whole_ranges
-from runner.errors import RecordingError
+from runner.errors import NotInRecording, RecordingError
 from runner.export.values import acted, observed
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
 from runner.recording.spaces import Description, Value, least_number
-from runner.recording.steps import turns_of
+from runner.recording.steps import is_of_environment
+from runner.replay.recorded import reset_of
 from runner.replay.trust import require_listed, trusting
 from runner.runs.trust_marks import environment_of_job
-from runner.util.arrays import Array, Flags, Floats, Records
+from runner.util.arrays import Array, Flags, Floats
 from runner.util.extras import require
 from runner.util.values import Ranges
 
@@ -239,99 +237,33 @@ class MinariEpisode:
 def episodes_in(recording: Recording, phase: str, ranges: Ranges) -> Iterator[MinariEpisode]:
     """Yield the episodes of a phase that ended, in these ranges.
 
-    An episode of a loop is left out if a repair lost steps of it or the observation of its reset.
+    An episode is left out if a repair lost steps of it or the observation of its reset.
     """
-    starts: list[int] = []
-    lengths: dict[int, int] = {}
-    """The lengths of the episodes, by the number of their last step."""
-    for start, stop in ranges:
-        for block in recording.phase(phase).episodes.blocks(start, stop):
-            lengths |= zip(block["last_step"].tolist(), block["length"].tolist(), strict=True)
-            starts += block["first_step"].tolist()
-    if not lengths:
-        return
-    numbers = range(max(min(starts), 0), max(lengths) + 1)
-    resets = _EpisodeResets(recording, phase)
-    for environment, steps in _steps(recording, phase, numbers, lengths):
-        seed, first = resets.before(environment, steps)
-        resets.keep_last(environment, steps[-1])
-        if first is not None and lengths.get(int(steps[-1]["step"])) == len(steps):
-            yield _episode(recording, steps, first, seed)
+    records = recording.phase(phase).episodes
+    blocks = (block for start, stop in ranges for block in records.blocks(start, stop))
+    for number in sorted({number for block in blocks for number in block["episode"].tolist()}):
+        episode = None
+        with contextlib.suppress(NotInRecording):  # its last steps were lost
+            episode = _episode(recording, phase, number)
+        if episode is not None:
+            yield episode
 
 
-class _EpisodeResets:
-    """The seed and the observation that each episode begins with."""
-
-    def __init__(self, recording: Recording, phase: str) -> None:
-        self._recording = recording
-        self._remaining = recording.phase(phase).reset_values()
-        self._next = next(self._remaining, None)
-        self._read: dict[tuple[int, int], tuple[int | None, Value]] = {}
-        """By environment and episode."""
-        self._last: dict[int, Value] = {}
-
-    def before(self, environment: int, steps: Records) -> tuple[int | None, Value]:
-        """Return seed and observation of the reset before steps, or None and the last observation."""
-        while self._next is not None and int(self._next["step"]) <= int(steps[0]["step"]):
-            reset = self._next
-            seed = int(reset["seed"]) if reset["seeded"] else None
-            key = int(reset["environment"]), int(reset["episode"])
-            self._read[key] = seed, _copy(reset["observation"])
-            self._next = next(self._remaining, None)
-        key = environment, int(steps[0]["episode"])
-        seed, first = self._read.pop(key, (None, self._last.get(environment)))
-        if self._recording.has_states:
-            first = steps[0]["state"].astype(np.int64) + least_number(self._recording.spaces["observation"])
-        return seed, first
-
-    def keep_last(self, environment: int, step: np.void) -> None:
-        """Keep the last observation of an environment, since an episode may continue after its end."""
-        self._last[environment] = _copy(observed(self._recording, step))
-
-
-def _copy(value: Value) -> Value:
-    """Return a value that does not keep its block in memory."""
-    return value.copy() if isinstance(value, np.ndarray | np.void) else value
-
-
-def _steps(
-    recording: Recording, phase: str, numbers: range, lengths: Mapping[int, int]
-) -> Iterator[tuple[int, Records]]:
-    """Yield environment and steps of each episode; the last one of an environment may not have ended."""
-    open_parts: defaultdict[int, list[Records]] = defaultdict(list)
-    for block in recording.phase(phase).steps.numbered(numbers):
-        ended: list[tuple[int, Records]] = []
-        for environment, places in turns_of(block):
-            rows, parts = block[places], open_parts[environment]
-            for part in np.split(rows, np.flatnonzero(np.diff(rows["episode"])) + 1):
-                is_last = int(part["step"][-1]) in lengths
-                ended += ((environment, steps) for steps in _extend(recording, parts, part, is_last))
-        yield from sorted(ended, key=lambda episode: int(episode[1]["step"][-1]))
-    yield from ((environment, np.concatenate(parts)) for environment, parts in open_parts.items() if parts)
-
-
-def _extend(recording: Recording, parts: list[Records], part: Records, is_last: bool) -> Iterator[Records]:
-    """Add steps to the parts of the current episode; yield it if they belong to another one, or end it.
-
-    Args:
-        is_last: whether an episode is known to end with these steps.
-    """
-    if parts and parts[-1]["episode"][-1] != part["episode"][0]:
-        yield np.concatenate(parts)
-        parts.clear()
-    parts.append(part.copy())
-    if sum(part.nbytes for part in parts) > MAX_EPISODE_BYTES:
+def _episode(recording: Recording, phase: str, number: int) -> MinariEpisode | None:
+    """Return an episode; None if steps of it, or the observation of its reset, were lost."""
+    episode = recording.phase(phase).episode(number)
+    if len(episode) * episode.table.row_dtype.itemsize > MAX_EPISODE_BYTES:
         raise RecordingError(
-            f"{recording.path}: episode {part['episode'][0]} has more than {MAX_EPISODE_BYTES:,} bytes, "
+            f"{recording.path}: episode {number} has more than {MAX_EPISODE_BYTES:,} bytes, "
             "which Minari would hold at once; choose others by --episodes, or export parquet."
         )
-    if is_last or part["terminated"][-1] or part["truncated"][-1]:
-        yield np.concatenate(parts)
-        parts.clear()
-
-
-def _episode(recording: Recording, steps: Records, first: Value, seed: int | None) -> MinariEpisode:
-    """Return an episode of its steps and the observation of its reset."""
+    blocks = list(episode.rows())
+    if sum(map(len, blocks)) != len(episode):
+        return None
+    steps = np.concatenate(blocks)
+    seed, first = _beginning(recording, phase, number, steps[0])
+    if first is None:
+        return None
     after, actions = observed(recording, steps), acted(recording, steps)
     seen, done = (recording.spaces[name] for name in ("observation", "action"))
     if isinstance(after, list):
@@ -341,6 +273,26 @@ def _episode(recording: Recording, steps: Records, first: Value, seed: int | Non
     fields = {"rewards", "terminated", "truncated", "acted"} & {*(steps.dtype.names or ())}
     outcomes: dict[str, Any] = {name: steps[name].copy() for name in fields}
     return MinariEpisode(_nested(seen, after), _nested(done, actions), seed=seed, **outcomes)
+
+
+def _beginning(
+    recording: Recording, phase: str, number: int, step: np.void
+) -> tuple[int | None, Value | None]:
+    """Return the seed of the reset before an episode, and the observation before its first step."""
+    reset = reset_of(recording, phase, number)
+    if reset is not None and reset.episode != step["episode"]:  # it continues after the end of the one before
+        reset = None
+    seed = None if reset is None or reset.given.large_seed is not None else reset.seed
+    if recording.has_states:
+        return seed, step["state"].astype(np.int64) + least_number(recording.spaces["observation"])
+    if reset is not None:
+        return seed, reset.value(recording)
+    episode = recording.phase(phase).episode(number)
+    first = None
+    for block in episode.table.numbered(range(max(0, episode.first - recording.environments), episode.first)):
+        rows = block[is_of_environment(block, episode.environment)]
+        first = observed(recording, rows[-1]) if len(rows) else first
+    return seed, first
 
 
 def _nested(description: Description, values: NDArray[Any] | list[Value]) -> Value:
