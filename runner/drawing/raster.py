@@ -31,7 +31,7 @@ Pixels = NDArray[np.uint8]
 """A picture: [height, width, 3], red, green and blue."""
 _SPRITE: Final = 130
 """Side of the square in which a thing is drawn, in hundredths of a cell."""
-_FINE: Final = 4
+_FINE: Final = 3
 """Trails are drawn at this multiple of the resolution, for smooth edges."""
 _JPEG_QUALITY: Final = 90
 _PURPOSE: Final = "a picture"
@@ -54,7 +54,6 @@ class SceneRaster:
         self._scale = min(width / drawing.width, height / drawing.height)
         self._size = round(drawing.width * self._scale), round(drawing.height * self._scale)
         self._sprites: dict[tuple[int, int], Image.Image] = {}
-        self._segments: dict[tuple[int, ...], tuple[int, int, Pixels]] = {}
 
     @functools.cached_property
     def _ground(self) -> Image.Image:
@@ -96,34 +95,18 @@ class SceneRaster:
         return _rendered(shape, f"{-half} {-half} {2 * half} {2 * half}", pixels, pixels)
 
     def _trail(self, points: NDArray[np.int16]) -> Image.Image:
-        """Return the coverage of each pixel by a trail through points [states, 2]."""
-        from PIL import Image
-
-        mask = np.zeros((self._size[1], self._size[0]), np.uint8)
-        for ends in {tuple(pair) for pair in np.column_stack([points[:-1], points[1:]]).tolist()}:
-            if ends not in self._segments:
-                self._segments[ends] = self._segment(ends)
-            x, y, cover = self._segments[ends]
-            part = mask[y : y + cover.shape[0], x : x + cover.shape[1]]
-            np.maximum(part, cover[: part.shape[0], : part.shape[1]], out=part)
-        return Image.fromarray(mask)
-
-    def _segment(self, ends: tuple[int, ...]) -> tuple[int, int, Pixels]:
-        """Return the corner of a line with round ends, and the coverage of the pixels from there."""
+        """Return the coverage of each pixel by a trail with round ends through points [states, 2]."""
         from PIL import Image, ImageDraw
 
-        scaled = np.array(ends, np.float64).reshape(2, 2) * self._scale
-        radius = svg.TRAIL_WIDTH * self._scale / 2
-        corner = np.maximum(np.floor(scaled.min(axis=0) - radius), 0)
-        width, height = np.ceil(scaled.max(axis=0) + radius - corner).astype(int).tolist()
-        large = Image.new("L", (width * _FINE, height * _FINE))
-        points = [tuple(point) for point in ((scaled - corner) * _FINE).tolist()]
-        pen = ImageDraw.Draw(large)
+        fine = Image.new("L", (self._size[0] * _FINE, self._size[1] * _FINE))
+        pen = ImageDraw.Draw(fine)
         ink = round(255 * svg.TRAIL_OPACITY)
-        pen.line(points, fill=ink, width=round(2 * radius * _FINE))
-        for point in points:
-            pen.circle(point, radius * _FINE, fill=ink)
-        return int(corner[0]), int(corner[1]), np.asarray(large.reduce(_FINE))
+        scale = self._scale * _FINE
+        ends = [(x * scale, y * scale) for x, y in points.tolist()]
+        pen.line(ends, fill=ink, width=round(svg.TRAIL_WIDTH * scale))
+        for end in {*ends}:
+            pen.circle(end, svg.TRAIL_WIDTH * scale / 2, fill=ink)
+        return fine.reduce(_FINE)
 
 
 def draw_bars(names: Sequence[str], low: Floats, high: Floats, rows: Iterable[Floats]) -> Iterator[Pixels]:
