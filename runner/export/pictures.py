@@ -9,7 +9,7 @@ recorded frames; the environment, made again, which draws the episode while it i
 observations that are images; or else the numbers of the observations as bars.
 
 Each source is painted by a generator of T + 1 pictures, uint8 [height, width, 3] of one size; close it to
-free what it uses. Its argument `seen` has the steps of the episode as `observations_of` yields them.
+free what it uses.
 
 The service sends the pictures as files (`encoded_pictures`), and a report contains small ones (`thumbnails`).
 Lists of episodes show a sketch, for which no environment is made (`episode_sketch`).
@@ -24,7 +24,6 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from enum import StrEnum
-from itertools import tee
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -144,11 +143,9 @@ class Pictures:
         require_steps(recording, "show", may_redo=True)
         self.learners = recording.agents
         self.steps = len(recording.phase(phase).episode(episode))
-        # Read once: what draws the pictures takes the steps at the same time as their descriptions do.
-        seen, to_paint = tee(observations_of(recording, phase, episode))
-        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust, seen=to_paint)
+        self.source, self.reason, _, self._painted = paint(recording, phase, episode, trust)
         self.note = ""
-        self._pictures = self._generate(moments_of(recording, phase, episode, seen))
+        self._pictures = self._generate(moments_of(recording, phase, episode))
 
     def __iter__(self) -> Iterator[EpisodePicture]:
         return self
@@ -173,18 +170,13 @@ class Pictures:
                 return
 
 
-def moments_of(
-    recording: Recording, phase: str, episode: int, seen: Iterator[Seen] | None = None
-) -> Iterator[PictureMoment]:
-    """Yield T + 1 moments of an episode of T steps: after the reset, and after each step.
-
-    `seen` are the steps of the episode as `observations_of` yields them, if they are read already.
-    """
+def moments_of(recording: Recording, phase: str, episode: int) -> Iterator[PictureMoment]:
+    """Yield T + 1 moments of an episode of T steps: after the reset, and after each step."""
     describe = describer(recording, phase)
     steps = len(recording.phase(phase).episode(episode))
     returns = np.zeros(len(recording.agents))
     unpaid = tuple(returns.tolist())
-    for t, (observation, step) in enumerate(seen or observations_of(recording, phase, episode)):
+    for t, (observation, step) in enumerate(observations_of(recording, phase, episode)):
         if step is None:
             yield PictureMoment(t, observation, "", unpaid, unpaid, "", "")
             continue
@@ -263,18 +255,8 @@ class Painting(NamedTuple):
     pictures: Painted
 
 
-def paint(
-    recording: Recording,
-    phase: str,
-    episode: int,
-    trust: bool = False,
-    first: int = 0,
-    seen: Iterator[Seen] | None = None,
-) -> Painting:
-    """Return the painted states of an episode from number `first` on, of the best source that works.
-
-    `seen` are the steps from there on as `observations_of` yields them, if they are read already.
-    """
+def paint(recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0) -> Painting:
+    """Return the painted states of an episode from number `first` on, of the best source that works."""
     source, reason = source_of(recording, phase, trust, episode)
     has_failed = False
     if source is PictureSource.REDRAWN:
@@ -286,12 +268,12 @@ def paint(
             source = source_of_recorded(recording, phase, episode)
             reason = str(error)
             has_failed = True
-    seen = seen or observations_of(recording, phase, episode, first)
+    seen = observations_of(recording, phase, episode, first)
     match source:
         case PictureSource.SCENE:
             painted = paint_scene(recording, seen)
         case PictureSource.RECORDED:
-            painted = paint_recorded(recording, phase, episode, seen)
+            painted = paint_recorded(recording, phase, episode, first)
         case PictureSource.OBSERVATION:
             painted = paint_observation(recording, seen)
         case _:
@@ -322,12 +304,11 @@ def paint_scene(recording: Recording, seen: Iterator[Seen]) -> Painted:
         yield raster.draw(np.stack(places))
 
 
-def paint_recorded(recording: Recording, phase: str, episode: int, seen: Iterator[Seen]) -> Painted:
-    """Show the last frame that was recorded up to each step."""
+def paint_recorded(recording: Recording, phase: str, episode: int, first: int) -> Painted:
+    """Show the last frame that was recorded up to each step, from the one after `first` steps on."""
     last: Message = {}
     pixels: Pixels | None = None
-    steps = (step for _, step in seen if step is not None)
-    for frame in recorded_frames(recording, phase, episode, steps=steps):
+    for frame in recorded_frames(recording, phase, episode, first):
         if pixels is None or frame is not last:
             where = f"{recording.path}: the frame at {frame['log_time']} ns"
             last = frame

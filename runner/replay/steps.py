@@ -179,9 +179,7 @@ def first_of(recording: Recording, reset: RecordedReset) -> Value:
 # --- next to the steps -----------------------------------------------------------------------------------
 
 
-def recorded_frames(
-    recording: Recording, phase: str, episode: int, start: int = 0, steps: Iterable[Any] | None = None
-) -> Iterator[Message]:
+def recorded_frames(recording: Recording, phase: str, episode: int, start: int = 0) -> Iterator[Message]:
     """Yield the last frame that was recorded up to each step of an episode, as a decoded message.
 
     Args:
@@ -189,14 +187,13 @@ def recorded_frames(
         phase: `train` or `eval`.
         episode: its number in the phase.
         start: steps before the first frame; 0 for the frame after the reset.
-        steps: the steps of the episode, if they are read already; then `start` is 0.
 
     Raises:
         RecordingError: the recording has no such episode, steps of it were lost, or its first frame.
     """
     recorded = recording.phase(phase).episode(episode)
     first = max(0, start - frames_every(recording))
-    steps = transitions_of(recording, phase, episode, max(0, first - 1)) if steps is None else steps
+    steps = transitions_of(recording, phase, episode, max(0, first - 1))
     times = (int(step["log_time"]) for step in steps)
     # The frames of a vector come at the end of a round.
     turns = recorded.table.round_of(recorded.first)

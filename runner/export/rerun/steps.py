@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from runner.drawing import palette
@@ -203,13 +202,9 @@ class StepTracks:
         before = np.repeat(state[:1], TRAIL_STEPS) if self._before is None else self._before
         states = np.concatenate((before, state))
         self._before = states[-TRAIL_STEPS:]
-        # A point as one number of eight bytes: fewer and larger values to copy.
-        points = scene.mover_points.take(states, axis=0).view(np.int64)[..., 0]
-        lines = np.ascontiguousarray(sliding_window_view(points, TRAIL_STEPS + 1, axis=0))
-        early = np.flatnonzero(t < TRAIL_STEPS)
-        back = np.minimum(np.arange(TRAIL_STEPS, -1, -1), t[early, None])
-        lines[early] = points[early[:, None] + TRAIL_STEPS - back].swapaxes(1, 2)
-        return lines[..., None].view(np.float32)
+        back = np.minimum(np.arange(TRAIL_STEPS, -1, -1), t[:, None])
+        shown = states[np.arange(len(t))[:, None] + TRAIL_STEPS - back]
+        return scene.mover_points.take(shown, axis=0).swapaxes(1, 2)
 
     def _events(self, batch: Batch, events: NDArray[np.uint32]) -> Iterator[Track]:
         """Yield the text log: beginnings and ends of episodes, pickups, collisions; not illegal actions."""

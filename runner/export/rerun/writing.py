@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -38,7 +37,6 @@ from runner.runs.run import Run
 from runner.util.arrays import Records, in_blocks
 from runner.util.files import new_file
 
-T = TypeVar("T")
 _BATCH_BYTES: Final = 64 << 20
 
 
@@ -98,8 +96,7 @@ class RunReader:
         for phase, makers in self._makers.items():
             style = [series_lines(names, phase_colours(phase, len(names)))]
             edges: set[int] = set()
-            batches = self._batches(phase, values)
-            for batch in _prefetched(batches) if is_job else batches:
+            for batch in self._batches(phase, values):
                 if is_job:
                     yield Track(f"{phase}/reward", batch.times, scalars(batch.records["rewards"]), style)
                 are_unknown = is_job and not len(batch.values)  # some steps before them were lost
@@ -159,16 +156,6 @@ class RunReader:
             words = ["no steps of this time were exported"] * len(gaps)
             yield text_track(entity, {"step": gaps[:, 0]}, (x, y), words)
             yield from cleared(entity, gaps[gaps[:, 1] <= last, 1])
-
-
-def _prefetched(items: Iterable[T]) -> Iterator[T]:
-    """Yield the items; while one is in use, a thread makes the next."""
-    iterator = iter(items)
-    with ThreadPoolExecutor(1, "prefetch") as executor:
-        following = executor.submit(next, iterator, None)
-        while (item := following.result()) is not None:
-            following = executor.submit(next, iterator, None)
-            yield item
 
 
 def export(
