@@ -42,6 +42,7 @@ from runner.recording.messages import Message
 from runner.recording.metrics import METRICS
 from runner.recording.reader import Recording
 from runner.recording.schema import PHASES, SCALAR_TOPIC, STEP_NANOSECONDS
+from runner.util.arrays import Ints
 from runner.util.extras import require
 from runner.util.values import Ranges
 
@@ -91,18 +92,20 @@ def write_tables(
     out other steps and episodes; all metrics are written anyway. `report` is called with the number of steps
     so far.
     """
+    numbers, keys = None, None
     if episodes:
         phase = phase or "train"
-        whole_ranges(episodes, _episode_count(recording, phase), phase, str(recording.path))
+        ranges = whole_ranges(episodes, _episode_count(recording, phase), phase, str(recording.path))
+        numbers = np.concatenate([np.arange(*bounds) for bounds in ranges])
+        keys = _keys_of(recording, phase, numbers)
     source = Batches(recording)
     archive_tables = source.shape.tables
-    keys = _keys_of(recording, phase, episodes) if phase is not None and episodes else None
     sources = {
         name: source.of(archive_tables[table]) for name, table in _TABLES.items() if table in archive_tables
     }
     if "extras" in sources:
         sources["extras"] = _with_episodes(sources["extras"], recording, archive_tables[layout.STEPS].columns)
-    tables = {name: _selected(rows, phase, episodes, keys) for name, rows in sources.items()}
+    tables = {name: _selected(rows, phase, numbers, keys) for name, rows in sources.items()}
     tables["metrics"] = _metrics(recording)
     rows = {}
     for name, batches in tables.items():
@@ -162,11 +165,8 @@ def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
     clock = wall_clock(recording)
     rows = (
         {
+            **vars(moment),
             "run_id": recording.run_id,
-            "phase": moment.phase,
-            "position": moment.position,
-            "step": moment.step,
-            "episode": moment.episode,
             "seconds": None if clock is None else clock(moment.position),
             "metric": name,
             "value": value,
@@ -178,8 +178,8 @@ def _metrics(recording: Recording) -> Iterator[pa.RecordBatch]:
         yield pa.RecordBatch.from_pylist(batch, _METRICS)
 
 
-def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | None:
-    """Return a key of the steps and resets of each episode; None where one environment is alone.
+def _keys_of(recording: Recording, phase: str, numbers: Ints) -> list[int] | None:
+    """Return a key of the steps and resets of each ended episode; None where one environment is alone.
 
     It is made of the environment and the episode as the rows count it, in their own environment; the phase
     counts the episodes of all as they ended.
@@ -187,34 +187,25 @@ def _keys_of(recording: Recording, phase: str, episodes: Ranges) -> pa.Array | N
     records = recording.phase(phase)
     if not records.steps.have_turns:
         return None
-    count = records.episodes.count()
-    numbers = [n for start, stop in episodes for n in range(start, count if stop is None else stop)]
-    selected = map(records.episode, numbers)
-    keys = [steps.environment << _ENVIRONMENT_BITS | int(steps.one(0)["episode"]) for steps in selected]
-    return pa.array(keys, pa.int64())
+    selected = map(records.episode, numbers[numbers < records.episodes.count()].tolist())
+    return [steps.environment << _ENVIRONMENT_BITS | int(steps.one(0)["episode"]) for steps in selected]
 
 
 def _selected(
-    batches: Iterator[pa.RecordBatch], phase: str | None, episodes: Ranges, keys: pa.Array | None
+    batches: Iterator[pa.RecordBatch], phase: str | None, numbers: Ints | None, keys: list[int] | None
 ) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of a phase and of ranges of episodes, whose `keys` are as `_keys_of` returns them."""
+    """Yield the rows of a phase and of the episodes of these numbers and `keys`, see `_keys_of`."""
     for batch in batches:
         rows = batch if phase is None else batch.filter(pc.equal(batch["phase"], phase))
-        is_ended = "length" in rows.schema.names  # an episode, which has its number in the phase
-        if keys is not None and not is_ended and {"episode", "environment"} <= set(rows.schema.names):
-            environment = pc.shift_left(rows["environment"].cast(pa.int64()), _ENVIRONMENT_BITS)
-            is_selected = pc.is_in(pc.bit_wise_or(environment, rows["episode"].cast(pa.int64())), keys)
-            if "taken" in rows.schema.names:
-                is_selected = pc.and_(is_selected, rows["taken"])
-            rows = rows.filter(is_selected)
-        elif episodes and "episode" in rows.schema.names:
-            is_selected = pa.scalar(False)
-            for start, stop in episodes:
-                inside = pc.greater_equal(rows["episode"], start)
-                if stop is not None:
-                    inside = pc.and_(inside, pc.less(rows["episode"], stop))
-                is_selected = pc.or_(is_selected, inside)
-            rows = rows.filter(is_selected)
+        names = set(rows.schema.names)
+        if numbers is not None and "episode" in names:
+            selected, episode = numbers.tolist(), rows["episode"].cast(pa.int64())
+            # The row of an ended episode, with its length, has its number in the phase.
+            if keys is not None and "environment" in names and "length" not in names:
+                environment = pc.shift_left(rows["environment"].cast(pa.int64()), _ENVIRONMENT_BITS)
+                selected, episode = keys, pc.bit_wise_or(environment, episode)
+            is_selected = pc.is_in(episode, pa.array(selected, pa.int64()))
+            rows = rows.filter(pc.and_(is_selected, rows["taken"]) if "taken" in names else is_selected)
         if rows.num_rows:
             yield rows
 
