@@ -1,15 +1,16 @@
 """The scene of an environment for the viewer: where everything is in each state, and its labels.
 
 Coordinates are cells: x to the right, y down, the first cell from (0, 0) to (1, 1). Rerun looks up the text
-and colour of a class id in an annotation context, which is logged once. So everything written at a step is
-numbered here (marks of movers, the step, rewards, values): two bytes at each step instead of a string.
+and colour of a class id in an annotation context, which is logged once, after the steps. So everything
+written at a step is numbered here (marks of movers, the step, rewards, values): two bytes at each step
+instead of a string.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -31,16 +32,15 @@ from runner.export.rerun.tracks import (
     pairs,
     repeated,
 )
-from runner.util.arrays import Floats, Ints, Records
+from runner.util.arrays import Array, Floats, Ints, Records
 
 _SPACING: Final = 0.34
 """Between movers in one cell, so that both are visible."""
 _BLOCKED_ARROW: Final = 0.34
 """Length of the arrow of a move that led nowhere."""
 
-MAX_REWARDS: Final = 2_000
-MAX_T: Final = 10_000
-MAX_LEVELS: Final = 4_000
+MAX_LABELS: Final = 60_000
+"""Different texts in a run; further ones are left out."""
 BAD_SIGN: Final = "✗"
 GOOD_SIGN: Final = "✓"
 STATUS_Y: Final = 0.35
@@ -208,56 +208,36 @@ def scene_of(mdp: Mdp) -> Scene | None:
 
 
 class GridLabels:
-    """Texts and colours, numbered, and the numbers and points of what is written at each step.
+    """Texts and colours, numbered as they occur, and the numbers and points of what is written at each step.
 
-    `value_range` is the lowest and the highest value of the tables, and includes 0.
+    `largest` is the largest absolute value of the tables; values are rounded to three digits of it.
     """
 
-    def __init__(
-        self,
-        mdp: Mdp,
-        scene: Scene | None,
-        learners: Sequence[str],
-        value_range: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
+    def __init__(self, mdp: Mdp, scene: Scene | None, learners: Sequence[str], largest: float = 0.0) -> None:
         self.mdp = mdp
         self.scene = scene
         self.learners = tuple(learners)
-        self.texts: list[str] = []
-        self._colours: list[str] = []
-        self._masks = np.unique(np.append(mdp.events, np.uint32(0)))
-        """The sets of events that a step can have."""
-        if scene:
-            self._add_movers(scene)
-            self._waiting = self._add([scene.labels[i] for i in scene.passengers], palette.PASSENGER)
-        self._riding = self._add([""], palette.PASSENGER)
-        """A passenger that is carried: the label of its carrier shows it."""
-        self._longest = min(mdp.step_limit or MAX_T, MAX_T)
-        self._t = self._add([f"t = {k}" for k in range(self._longest)] + [f"t ≥ {self._longest}"])
-        self._rewards: list[tuple[int, int, Floats]] = []
-        """Learner, first label, and the rewards it can get, ascending."""
-        rewards = mdp.rewards_of(len(learners))
-        is_alone = len(learners) == 1
-        for i, learner in enumerate(learners):
-            distinct = np.unique(rewards[..., i])
-            if len(distinct) <= MAX_REWARDS:
-                prefix = "reward" if is_alone else f"reward of {spoken(learner)}"
-                colour = palette.MIDTONE if is_alone else palette.agent(i)
-                first = self._add([f"{prefix} {reward:g}" for reward in distinct], colour)
-                self._rewards.append((i, first, distinct))
-        self.unmarked = self._add([""])
-        self.greedy = self._add(["●"])
-        """The mark of the greedy action."""
-        self.exploited = self._add(["greedy"], palette.GOOD)
-        """The mark of the chosen action if it was not explored."""
-        self.explored = self._add(["explored"], palette.BAD)
+        self.numbers = {("", palette.MIDTONE): 0}
+        """By text and colour."""
+        self._unit = 10.0 ** (math.floor(math.log10(max(largest, 1e-9))) - 2)
         self.stops = np.full((len(mdp.agents), max(mdp.action_counts) + 1), -1)
         """[agents, own actions + 1]: the letter of an action such as a pickup; -1 for a move or none."""
         for agent, names in enumerate(numbered_actions(mdp)):
-            if scene:
-                for action in scene.stops:
-                    self.stops[agent, action] = self._add([names[action][0].upper()], palette.agent(agent))
-        self._add_levels(*value_range)
+            for action in scene.stops if scene else ():
+                self.stops[agent, action] = self.number(names[action][0].upper(), palette.agent(agent))
+
+    def number(self, text: str, colour: str = palette.MIDTONE) -> int:
+        """Return the number of a text in a colour; 0, which is no text, if there are too many."""
+        following = len(self.numbers)
+        if following == MAX_LABELS:
+            return self.numbers.get((text, colour), 0)
+        return self.numbers.setdefault((text, colour), following)
+
+    def of(self, values: Array, label: Callable[[Any], tuple[str, str]]) -> NDArray[np.uint16]:
+        """Return the number of each value's label, which is a text and its colour."""
+        distinct, places = np.unique(values, return_inverse=True)
+        numbers = [self.number(*label(value)) for value in distinct.tolist()]
+        return np.array(numbers, np.uint16)[places].reshape(values.shape)
 
     def track(self) -> Track:
         """Return the texts and colours of everything below an entity path."""
@@ -270,7 +250,7 @@ class GridLabels:
                     "keypoint_connections": [],
                 },
             }
-            for number, (text, colour) in enumerate(zip(self.texts, self._colours, strict=True))
+            for (text, colour), number in self.numbers.items()
         ]
         # As Arrow, because Rerun is slow to convert thousands of labels.
         context: Any = pa.array([classes], rr.components.AnnotationContext.arrow_type())
@@ -285,69 +265,49 @@ class GridLabels:
         y = scene.rows + STATUS_Y
         left = 0.25 * scene.columns
         right = 0.65 * scene.columns
-        rewards = ((right, y + STATUS_LINE * k) for k in range(len(self._rewards)))
+        rewards = ((right, y + STATUS_LINE * k) for k in range(len(self.learners)))
         status = repeated(pairs([(left, y), *rewards]), len(scene.points))
         return np.concatenate((scene.points + pairs((0, rise) for rise in rises), status), axis=1)
-
-    @cached_property
-    def _of_states(self) -> Ints:
-        """[S, movers + passengers]: the labels in each state, of movers in a step without events."""
-        scene = self.scene
-        assert scene is not None
-        is_carrying = (scene.carriers[..., None] == np.array(scene.movers, np.int64)).any(axis=1)
-        movers = 2 * np.arange(len(scene.movers)) + is_carrying
-        waiting = self._waiting + np.arange(len(scene.passengers))
-        passengers = np.where(scene.carriers[:, scene.passengers] >= 0, self._riding, waiting)
-        return np.concatenate((movers * len(self._masks), passengers), axis=1)
 
     def of_steps(self, records: Records, events: NDArray[np.uint32]) -> NDArray[np.uint16]:
         """Return the label of each text in each step, [n, texts].
 
-        Movers have their name and what happened to them.
+        Movers have their name, whether they carry a passenger, and what happened to them.
         """
-        assert self.scene is not None
-        things = self._of_states.take(records["state"], axis=0)
-        things[:, : len(self.scene.movers)] += np.searchsorted(self._masks, events)[:, None]
-        labels = [things, self._t + np.minimum(records["t"], self._longest)[:, None]]
-        for i, first, distinct in self._rewards:
-            number = np.searchsorted(distinct, records["rewards"][:, [i]])
-            labels.append(first + number.clip(max=len(distinct) - 1))
-        return np.concatenate(labels, axis=1, dtype=np.uint16, casting="unsafe")
+        scene = self.scene
+        assert scene is not None
+        carriers = scene.carriers.take(records["state"], axis=0)
+        labels = []
+        for i, mover in enumerate(scene.movers):
+            is_carrying = (carriers == mover).any(axis=1)
+            labels.append(self.of(events.astype(np.int64) << 1 | is_carrying, partial(self._of_mover, i)))
+        for passenger in scene.passengers:  # the label of its carrier shows one that is carried
+            waiting = self.number(scene.labels[passenger], palette.PASSENGER)
+            labels.append(np.where(carriers[:, passenger] < 0, waiting, 0).astype(np.uint16))
+        labels.append(self.of(records["t"], lambda t: (f"t = {t}", palette.MIDTONE)))
+        rewards = enumerate(records["rewards"].T)
+        labels += [self.of(paid, partial(self._of_reward, learner)) for learner, paid in rewards]
+        return np.stack(labels, axis=1)
 
     def of_values(self, values: Floats) -> NDArray[np.uint16]:
         """Return the label of each value."""
-        levels = np.rint(np.nan_to_num(values, posinf=np.inf, neginf=-np.inf) / self._unit) - self._lowest
-        return (self._levels + levels.clip(0)).clip(max=len(self.texts) - 1).astype(np.uint16)
-
-    def _add(self, texts: Sequence[str], colour: str = palette.MIDTONE) -> int:
-        """Add texts; return the number of the first."""
-        first = len(self.texts)
-        self.texts += texts
-        self._colours += [colour] * len(texts)
-        return first
-
-    def _add_movers(self, scene: Scene) -> None:
-        """Number each mover's label by whether it carries someone, and by the events of a step."""
-        for i, (mover, agent) in enumerate(zip(scene.movers, scene.agents, strict=True)):
-            for carried in ("", " + passenger"):
-                for mask in self._masks.tolist():
-                    events = ", ".join(_event_labels(scene.mdp, mask, agent))
-                    text = ": ".join(filter(None, (scene.labels[mover] + carried, events)))
-                    self._add([text], palette.BAD if BAD_SIGN in events else palette.agent(i))
-
-    def _add_levels(self, low: float, high: float) -> None:
-        """Number values to three digits of the greatest one, with a margin on both sides."""
-        self._unit = 10.0 ** (math.floor(math.log10(max(-low, high, 1e-9))) - 2)
-        while (high - low) / self._unit > MAX_LEVELS:
-            self._unit *= 10
-        margin = (high - low) / 2 + self._unit
-        self._lowest = math.floor((low - margin) / self._unit)
-        highest = math.ceil((high + margin) / self._unit)
         digits = max(0, -round(math.log10(self._unit)))
-        texts = [f"{k * self._unit:.{digits}f}" for k in range(self._lowest, highest + 1)]
-        texts[0], texts[-1] = f"≤ {texts[0]}", f"≥ {texts[-1]}"
-        self._levels = self._add(texts)
-        """The first level; the others are the last labels."""
+        levels = np.rint(values / self._unit) + 0.0  # no -0
+        return self.of(levels, lambda level: (f"{level * self._unit:.{digits}f}", palette.MIDTONE))
+
+    def _of_mover(self, number: int, happened: int) -> tuple[str, str]:
+        """Return the label of a mover; `happened` is a mask of events, and bit 0 whether it carries one."""
+        scene = self.scene
+        assert scene is not None
+        events = ", ".join(_event_labels(self.mdp, happened >> 1, scene.agents[number]))
+        name = scene.labels[scene.movers[number]] + " + passenger" * (happened & 1)
+        text = ": ".join(filter(None, (name, events)))
+        return text, palette.BAD if BAD_SIGN in events else palette.agent(number)
+
+    def _of_reward(self, learner: int, reward: float) -> tuple[str, str]:
+        if len(self.learners) == 1:
+            return f"reward {reward:g}", palette.MIDTONE
+        return f"reward of {spoken(self.learners[learner])} {reward:g}", palette.agent(learner)
 
 
 def _event_labels(mdp: Mdp, mask: int, agent: str | None) -> list[str]:

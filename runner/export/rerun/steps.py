@@ -358,11 +358,12 @@ class ValueTracks:
         n, count = q.shape
         actions = self._own_actions[batch.records["action"]]
         is_explored = batch.records["explored"][:, None] >> self._explored_bit & 1
-        classes = np.full((n, 3 * count), labels.unmarked, np.uint16)
+        classes = np.zeros((n, 3 * count), np.uint16)
         classes[:, :count] = labels.of_values(q)
+        explored, exploited = labels.number("explored", palette.BAD), labels.number("greedy", palette.GOOD)
         steps = np.arange(n)[:, None]
-        classes[steps, count + first + batch.greedy] = labels.greedy
-        classes[steps, 2 * count + first + actions] = np.where(is_explored, labels.explored, labels.exploited)
+        classes[steps, count + first + batch.greedy] = labels.number("●")
+        classes[steps, 2 * count + first + actions] = np.where(is_explored, explored, exploited)
         low, high = (bound.reduceat(q, first, axis=1) for bound in (np.minimum, np.maximum))
         span = high - low
         scale = np.divide(BAR_LENGTH * _BAR_FRACTION, span, out=np.zeros_like(span), where=span > 0)

@@ -61,8 +61,8 @@ class RunReader:
             writer.last = sum(phase.steps.count() for phase in recording.phases)
         if not (writer.selection.steps and (scene or self._is_job)):
             return
-        bounds = [0.0, *(b for q in recording.snapshots() for b in (q.values.min(), q.values.max()))]
-        labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, (min(bounds), max(bounds)))
+        largest = max((float(np.abs(q.values).max()) for q in recording.snapshots()), default=0.0)
+        labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, largest)
         for phase in filter(spans.get, spans):
             makers = self._makers[phase]
             makers.append(StepTracks(phase, writer.title, labels))
@@ -77,22 +77,20 @@ class RunReader:
         writer = self.writer
         yield from metric_tracks(writer) if self._is_job else logged_tracks(self._recording)
         yield from mark_tracks(writer)
-        if self._labels:
-            yield self._labels.track()
-            if self._scene:
-                view = grid_view(writer.title, self._scene)
-                yield from background(self._scene, view)
-                if self._is_job:
-                    text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
-                    yield Track("notice/text", static=[text], view=view)
+        if self._labels and self._scene:
+            view = grid_view(writer.title, self._scene)
+            yield from background(self._scene, view)
+            if self._is_job:
+                text = rr.Points2D.from_fields(radii=0.0, colors=[GREY])
+                yield Track("notice/text", static=[text], view=view)
         for maker in chain.from_iterable(self._makers.values()):
             yield from maker.still
 
     def steps(self) -> Iterator[Track]:
         """Yield the selected steps, then pictures that are drawn of them."""
-        recording, is_job, scene = self._recording, self._is_job, self._scene
+        recording, is_job, scene, labels = self._recording, self._is_job, self._scene, self._labels
         names = [f"reward {spoken(name)}" for name in recording.agents]
-        values = ValueReader(recording, scene) if is_job and self._labels else None
+        values = ValueReader(recording, scene) if is_job and labels else None
         for phase, makers in self._makers.items():
             style = [series_lines(names, phase_colours(phase, len(names)))]
             edges: set[int] = set()
@@ -102,7 +100,7 @@ class RunReader:
                 are_unknown = is_job and not len(batch.values)  # some steps before them were lost
                 for maker in makers[:1] if are_unknown else makers:
                     yield from maker.of(batch)
-                if self._labels:
+                if labels:
                     edges ^= batch.edges()  # no edge where a stretch continues the one before
             self._edges ^= edges
             # A job's last step stays in view.
@@ -110,10 +108,12 @@ class RunReader:
             stops = [stop for stop in sorted(edges)[1::2] if stop <= last]
             for part in ("grid", "q", "map") if is_job else ("grid",):
                 yield from cleared(f"{phase}/{part}", stops)
+        if labels:  # all texts are known now
+            yield labels.track()
         if not is_job:
             for maker, *_ in self._makers.values():
                 yield from maker.drawn()
-        elif scene and self._labels:
+        elif scene and labels:
             yield from self._notice(scene.columns / 2, scene.rows / 2)
 
     def _batches(self, phase: str, values: ValueReader | None) -> Iterator[Batch]:

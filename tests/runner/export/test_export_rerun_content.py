@@ -190,7 +190,8 @@ def test_the_labels_of_movers_show_illegal_actions(exported):
     if scene is None or "collision" not in mdp.event_names:
         return
     labels, events = GridLabels(mdp, scene, exported.recording.agents), events_of(mdp, steps)
-    shown = np.array(labels.texts)[labels.of_steps(steps, events)]
+    numbers = labels.of_steps(steps, events)
+    shown = np.array([text for text, _ in labels.numbers])[numbers]
     illegal = events >> mdp.event_names.index("taxi_2.illegal_pickup") & 1
     assert [("illegal pickup" in label) for label in shown[:, 1]] == illegal.astype(bool).tolist()
     assert not any("illegal pickup" in label for label in shown[illegal == 0, 1])
