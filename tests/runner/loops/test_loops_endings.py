@@ -24,7 +24,7 @@ child = os.fork()
 if not child:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        for _ in range(100_000 // {n}):
+        for _ in range(40_000 // {n}):
             _, _, terminated, truncated, _ = rec.step({action})
             if np.any(terminated | truncated):
                 rec.reset()

@@ -48,7 +48,7 @@ ENVIRONMENTS = {
     "Acrobot": (partial(gymnasium.make, "Acrobot-v1", max_episode_steps=100), 700),
     "LunarLander": (partial(gymnasium.make, "LunarLander-v3", enable_wind=True), 700),
     "HalfCheetah": (partial(gymnasium.make, "HalfCheetah-v5", max_episode_steps=100), 700),
-    "Pong": (atari, 1100),
+    "Pong": (partial(atari, max_num_frames_per_episode=600), 250),
     "BipedalWalker": (partial(gymnasium.make, "BipedalWalker-v3", max_episode_steps=60), 700),
     "sticky actions": (lambda: wrappers.StickyAction(gymnasium.make("FrozenLake-v1"), 0.3), 700),
     "running means": (lambda: wrappers.NormalizeObservation(gymnasium.make("CartPole-v1")), 700),
