@@ -21,7 +21,9 @@ hypothesis.settings.register_profile(
 hypothesis.settings.load_profile("untimed")
 if sys.platform == "linux":
     os.environ.setdefault("MUJOCO_GL", "egl")  # MuJoCo reads it when it is imported
-process_context(PRELOADED)  # as the service does it; else each of its children would import them itself
+process_context(
+    (*PRELOADED, "runner.service.app")
+)  # as the service does it; else each of its children would import them itself
 os.environ["DUALTAXI_CODE"] = "off"  # thousands of runs need not ask git; tests of the user's code turn it on
 
 

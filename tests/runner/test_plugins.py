@@ -2,6 +2,7 @@
 
 import functools
 import json
+import multiprocessing
 import os
 import re
 import subprocess
@@ -33,6 +34,7 @@ def environment(tmp_path, monkeypatch):
     (metadata / "entry_points.txt").write_text(
         "".join(f"[{group}]\n{name} = {value}\n" for group, name, value in points)
     )
+    monkeypatch.syspath_prepend(site)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), *sys.path[1:]]))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return site
@@ -67,7 +69,7 @@ def test_an_installed_view_and_export_are_commands(environment, run, tmp_path):
 
 
 def test_an_installed_view_and_export_are_served(environment, run):
-    with Served(run.folder.parent) as served:
+    with Served(run.folder.parent, context=multiprocessing.get_context("spawn")) as served:
         address = f"/runs/{run.run_id}"
         page = get(f"{served.url}{address}/longest?count=2").raise_for_status().text
         assert page.count(f'href="{address}/replay/train/') == 2
@@ -114,5 +116,5 @@ def test_names_that_are_shipped_stay(environment, run):
     points.write_text("[dualtaxi.views]\nwhen = long_episodes:LONGEST\n")
     assert "From the package" not in dualtaxi("--help")
     assert "EXPRESSION" in dualtaxi("when", "--help")
-    with Served(run.folder.parent) as served:
+    with Served(run.folder.parent, context=multiprocessing.get_context("spawn")) as served:
         get(f"{served.url}/runs/{run.run_id}/when").raise_for_status()

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
+import os
 import random
+import signal
 import socket
-import subprocess
 import sys
 from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,6 +25,8 @@ from selenium.common.exceptions import (
 from selenium.webdriver.remote.webdriver import WebDriver
 from selenium.webdriver.support.ui import WebDriverWait
 
+from runner.__main__ import main
+from runner.util.processes import process_context, start_process
 from tests.waiting import until
 
 
@@ -47,21 +53,43 @@ def wait(browser: WebDriver, is_so: Callable[[], Any], seconds: float = 60) -> A
     return WebDriverWait(browser, seconds, 0.05, ignored).until(ask)
 
 
+def serve(words: list[str], log: Path, output: Connection, max_files: int | None) -> None:
+    """Be the command of these words in this process."""
+    with log.open("ab") as errors:
+        os.dup2(errors.fileno(), 2)
+    os.dup2(output.fileno(), 1)
+    output.close()
+    sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w", buffering=1)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked while processes are started
+    if max_files is not None:
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_NOFILE, (max_files, max_files))
+    sys.argv = ["dualtaxi", *words]
+    main()
+
+
 class Served:
     """`dualtaxi serve` over a folder, always at the same port and with one log; a `with` starts and stops it.
 
     Before it is started, nothing listens at its address.
+
+    Args:
+        options: words after the command.
+        context: of `multiprocessing`. By default the process is forked with all that the tests import, which
+            takes half the time; that of "spawn" makes it a fresh interpreter.
     """
 
-    def __init__(self, recordings: Path, *options: str) -> None:
+    def __init__(self, recordings: Path, *options: str, context: Any = None) -> None:
         self.recordings, self.options = recordings, options
         self.log = recordings.with_name(f"{recordings.name}.log")
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.origin = {"Origin": self.url}
-        self.prefix: list[str] = []
-        """Words before its command, such as those that limit what it may use."""
-        self.process: subprocess.Popen[str] | None = None
+        self.max_files: int | None = None
+        """How many files it may have open at once; None for as many as the tests."""
+        self.process: BaseProcess | None = None
+        self._context = context or process_context()
 
     def __enter__(self) -> Self:
         self.start()
@@ -73,16 +101,15 @@ class Served:
     def start(self) -> None:
         """Start it, and wait until it responds."""
         words = ["serve", "--port", str(self.port), "--recordings", str(self.recordings), *self.options]
-        with self.log.open("ab") as log:
-            self.process = subprocess.Popen(
-                [*self.prefix, sys.executable, "-m", "runner", *words],
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-            )
-        self.client = httpx2.Client(base_url=f"{self.url}/api/v1", headers=self.origin, timeout=60)
-        if self.process.stdout.readline() != f"{self.url}/\n":
-            self.kill()
+        output, theirs = multiprocessing.Pipe(duplex=False)
+        with output:
+            with theirs:
+                self.process = start_process(self._context, serve, words, self.log, theirs, self.max_files)
+            self.client = httpx2.Client(base_url=f"{self.url}/api/v1", headers=self.origin, timeout=60)
+            with open(output.fileno(), closefd=False) as lines:
+                first = lines.readline()
+        if first != f"{self.url}/\n":
+            self.stop()
             raise AssertionError(self.log.read_text())
         httpx2.get(f"{self.url}/healthz", timeout=60)  # answered when it has the folder
 
@@ -103,14 +130,12 @@ class Served:
         self._ended()
         return workers
 
-    def _ended(self) -> int:
+    def _ended(self) -> int | None:
         process, self.process = self.process, None
         self.client.close()
-        with process.stdout:
-            try:
-                return process.wait(60)
-            finally:
-                process.kill()  # which does nothing to one that has ended
+        process.join(60)
+        process.kill()  # which does nothing to one that has ended
+        return process.exitcode
 
     def workers(self) -> list[psutil.Process]:
         """Return its child processes, and theirs."""
