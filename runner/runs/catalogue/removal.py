@@ -21,8 +21,9 @@ from typing import Final
 
 from runner.errors import RunnerError, StorageError
 from runner.recording.labels import KEEP, LABELS_FILE, are_labels_readable
+from runner.recording.run_file import EvaluationMetrics
 from runner.runs.catalogue.columns import IndexRow, moment
-from runner.runs.catalogue.database import Sql, row_of
+from runner.runs.catalogue.database import Sql
 from runner.runs.catalogue.filters import Filter
 from runner.runs.catalogue.index import CatalogueIndex
 from runner.runs.catalogue.usage import REMOVED, Contents, belongs, contents_of, strays
@@ -91,30 +92,27 @@ def plan(run: Run, root: Path, foreign: bool = False) -> Removal:
     Args:
         foreign: also remove foreign files in its folder.
     """
-    row = row_of(run, None) | {"root": os.fspath(run.folder.parent), "entry": run.folder.name}
-    return plan_row(row, foreign, _why_not_in(run, root) or _protected(run))
+    refusal, contents = _judged(run.folder, _why_not_in(run, root) or _protected(run), foreign)
+    evaluation = run.summary.last_evaluation or EvaluationMetrics()
+    return Removal(
+        run_id=run.run_id,
+        name=run.name,
+        seed=run.file.seed if run.has_seed else None,
+        status=run.status,
+        success_percent=evaluation.values.get("success_percent"),
+        created=run.created,
+        folder=run.folder,
+        is_archived=bool(run.archive),
+        root=root,
+        contents=contents,
+        refusal=refusal,
+    )
 
 
-def plan_row(row: IndexRow, foreign: bool, refusal: str = "") -> Removal:
-    """Return the removal of a run by its row in the index, which is quicker for very many runs.
-
-    Args:
-        foreign: also remove foreign files in its folder.
-        refusal: why it must not be removed, if that is known; else its folder is checked.
-    """
+def plan_row(row: IndexRow, foreign: bool) -> Removal:
+    """Return the removal of a run by its row in the index, which is quicker for very many runs."""
     folder = Path(row["root"], row["entry"])
-    refusal = refusal or _linked(folder) or _unreadable(folder)
-    contents = Contents()
-    if not refusal:
-        try:
-            contents = contents_of(folder)
-        except OSError as error:
-            refusal = f"its folder cannot be read ({error.strerror})"
-    if contents.foreign and not foreign:
-        refusal = (
-            f"its folder also has {listed(contents.foreign)}, which no run writes; "
-            "move that away, or remove it as well with --foreign-files"
-        )
+    refusal, contents = _judged(folder, _linked(folder) or _unreadable(folder), foreign)
     return Removal(
         run_id=row["id"],
         name=row["name"],
@@ -128,6 +126,22 @@ def plan_row(row: IndexRow, foreign: bool, refusal: str = "") -> Removal:
         contents=contents,
         refusal=refusal,
     )
+
+
+def _judged(folder: Path, refusal: str, foreign: bool) -> tuple[str, Contents]:
+    """Return why a run stays, `refusal` or what its folder holds, and the contents of the folder."""
+    contents = Contents()
+    if not refusal:
+        try:
+            contents = contents_of(folder)
+        except OSError as error:
+            refusal = f"its folder cannot be read ({error.strerror})"
+    if contents.foreign and not foreign:
+        refusal = (
+            f"its folder also has {listed(contents.foreign)}, which no run writes; "
+            "move that away, or remove it as well with --foreign-files"
+        )
+    return refusal, contents
 
 
 def remove(removal: Removal, foreign: bool = False) -> None:

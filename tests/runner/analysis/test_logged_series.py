@@ -15,7 +15,6 @@ from runner.analysis.series import LOGGED, points_of, read_series, values_left_o
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
 from runner.integrations import wandb
-from runner.recording import messages
 
 
 @pytest.fixture(autouse=True)
@@ -57,20 +56,6 @@ def test_many_calls_are_means_and_the_output_says_so():
     series = series_over(logged({"loss": float(i)} for i in range(2_000)))
     assert curve(series, "loss") == {at: at - 4.5 for at in range(9, 2_000, 10)}
     assert series.averaged == "Means over stretches of 10 steps."
-
-
-def test_the_values_of_a_curve_are_decoded_together(monkeypatch):
-    path = logged({"loss": float(i)} for i in range(2_000))
-    decoded = []
-
-    def counting(message, payload, decode=messages.decode):
-        decoded.append(payload)
-        return decode(message, payload)
-
-    monkeypatch.setattr(messages, "decode", counting)
-    series_over(path)
-    series_over(path, "loss")
-    assert 0 < len(decoded) < 50
 
 
 def test_any_logged_name_that_does_not_decrease_is_an_axis():

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from runner.execution import session
 from runner.sweep import task as tasks
+from runner.sweep.workers import RayActor
 
 MOMENTS = ("before the task", "before the recording", "empty recording", "training", "before the result")
 MOVING = (*MOMENTS, "before moving", "moved in part")
@@ -75,6 +76,8 @@ def serve(pipe, stopping):
             pipe.send(attempt(pipe.recv(), stopping.is_set))
 
 
-def run_on_ray(actor, task):
-    """Run a task as `runner.sweep.workers._run` does, and die."""
-    return attempt(task, actor.stop)
+class DyingActor(RayActor):
+    """Dies while it runs a task."""
+
+    def run(self, task):
+        return attempt(task, self._stopping.is_set)

@@ -40,7 +40,7 @@ def ray_workers(monkeypatch, own):
     ray = pytest.importorskip("ray")
 
     ray.cloudpickle.register_pickle_by_value(dying)
-    monkeypatch.setattr("runner.sweep.workers._run", dying.run_on_ray)
+    monkeypatch.setattr("runner.sweep.workers.RayActor", dying.DyingActor)
     return RayWorkers(2, None, 6)
 
 
