@@ -14,8 +14,8 @@ from runner.util.files import CACHE_VARIABLE
 from runner.util.humanize import counted
 
 CLIENTS: Final = 4
-MEDIAN: Final = (500, 100)
-NINETY_NINTH: Final = (1500, 500)
+MEDIAN: Final = (300, 100)
+NINETY_NINTH: Final = (1000, 300)
 """Targets in milliseconds: at least, and aim."""
 SEARCHES: Final = [
     f"/api/v1/runs?filter=name=='experiment{k}'%20and%20config.discount%3E0.{k}&sort=-success_percent"
