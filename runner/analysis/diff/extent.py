@@ -144,8 +144,15 @@ def _whole_episodes(recording: Recording) -> int:
 
 def _counted_steps(recording: Recording, episodes: int, visits: Ints) -> Iterator[Records]:
     """Yield the steps of the first episodes in blocks; add the visits of all steps to those of each state."""
-    states = len(visits)
+    states, last = len(visits), -1
     for block in recording.train.steps.blocks():
+        times = _times(block)
+        if (np.diff(times, prepend=last) <= 0).any():  # else the two runs could not be aligned
+            raise RecordingError(
+                f"{recording.path}: found training steps out of order, from step {block['step'][0]} on; "
+                "`dualtaxi verify` names the step."
+            )
+        last = times[-1]
         if (highest := int(block["state"].max(initial=0))) >= states:
             raise RecordingError(
                 f"{recording.path}: found state {highest} in training step {block['step'][0]} or soon after, "

@@ -20,6 +20,7 @@ from runner.cli import cli
 from runner.config import from_mapping
 from runner.config.model import Job
 from runner.environments.naming import states_in_words
+from runner.errors import RecordingError
 from runner.execution.session import run_job
 from runner.recording import schema
 from runner.recording.reader import open_recording
@@ -233,6 +234,17 @@ def test_the_diff_of_an_altered_copy_names_step_and_field(small, tmp_path, data)
     assert difference.cause is not None
     assert difference.overlap.equal_steps >= difference.overlap.compared_steps - 1
     copy.unlink()
+
+
+@pytest.mark.parametrize("episode", [0, 10**6, -5])
+def test_steps_out_of_order_are_an_error(small, tmp_path, episode):
+    def alter(steps):
+        steps["episode"][len(steps) // 2] = episode
+        return steps
+
+    copy = altered(small, tmp_path / "copy.mcap", schema.TRAIN_STEP, alter, result=without_digest)
+    with open_recording(small) as a, open_recording(copy) as b, pytest.raises(RecordingError, match="order"):
+        diff(a, b)
 
 
 def test_equal_streams_have_no_difference_however_they_are_cut(record):
