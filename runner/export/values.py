@@ -16,7 +16,6 @@ from runner.recording import schema
 from runner.recording.environment import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
-from runner.recording.steps import is_of_environment
 from runner.replay.recorded import reset_of
 from runner.replay.steps import transitions_of
 from runner.util.arrays import Floats, Records
@@ -114,30 +113,12 @@ def observations_of(recording: Recording, phase: str, episode: int, start: int =
             where = str(recording.path)
             name = schema.PHASE_NAMES[phase]
             recording.mdp.check_steps(np.asarray(step).reshape(1), where, name)
-        if start == 0 and t == 0:
-            yield first_observed(recording, phase, episode), None
+        if start == 0 and t == 0 and recording.has_states:
+            yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None
+        elif start == 0 and t == 0:
+            reset = reset_of(recording, phase, episode)
+            yield None if reset is None else reset.value(recording), None
         yield observed(recording, step), step
-
-
-def first_observed(recording: Recording, phase: str, number: int) -> Value | None:
-    """Return the observation before the first step of an episode; None if it was lost.
-
-    Of an episode that began without a reset it is the last observation of its environment.
-
-    Raises:
-        RecordingError: there is no such episode, or its first step was lost.
-    """
-    episode = recording.phase(phase).episode(number)
-    if recording.has_states:
-        state = episode.table.one(episode.first)["state"]
-        return state.astype(np.int64) + least_number(recording.spaces["observation"])
-    if (reset := reset_of(recording, phase, number)) is not None:
-        return reset.value(recording)
-    first = None
-    for block in episode.table.numbered(range(max(0, episode.first - recording.environments), episode.first)):
-        rows = block[is_of_environment(block, episode.environment)]
-        first = observed(recording, rows[-1]) if len(rows) else first
-    return first
 
 
 def value_in_words(value: object, limit: int = FEW) -> str:

@@ -34,7 +34,6 @@ from runner.environments.naming import (
 )
 from runner.errors import RecordingError, shortened
 from runner.export.values import (
-    first_observed,
     is_image,
     names_in,
     number_names,
@@ -346,7 +345,8 @@ def _loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int)
     actions: list[dict[str, str]] = []
     observations: list[list[Column]] = []
     reset = reset_of(recording, at.phase, number)
-    if not first and (value := first_observed(recording, at.phase, number)) is not None:
+    if reset is not None and not first:
+        value = reset.value(recording)
         values: Values = [value] if phase.steps.dtype is None else np.array([value])
         observations.append([part.column(values) for part in parts])
     for steps in _steps(recording, at.phase, number, first + limit):
