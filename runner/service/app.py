@@ -233,7 +233,6 @@ def readyz(request: Request, settings: SettingsOf, catalogue: CatalogueOf) -> Re
     has_space = can_list = False
     with contextlib.suppress(OSError):
         has_space = shutil.disk_usage(folder).free > MIN_FREE_BYTES
-    catalogue.changed()
     with contextlib.suppress(RunnerError):
         can_list = catalogue.read(lambda index: index.count()) >= 0
     checks = {
