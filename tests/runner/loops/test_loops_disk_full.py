@@ -42,7 +42,7 @@ except runner.RunnerError as error:
 @pytest.mark.skipif(sys.platform == "win32", reason="limits the size of files")
 @pytest.mark.parametrize("kind", ["arrays", "texts", "vectors"])
 def test_all_steps_in_the_file_have_their_resets_and_episodes(tmp_path, kind):
-    command = [sys.executable, "-c", LOOP, str(tmp_path), kind, "200000"]
+    command = [sys.executable, "-c", LOOP, str(tmp_path), kind, "1000000"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert "writing failed (File too large)" in done.stdout, done.stderr
     (run,) = list_runs(tmp_path)
