@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 
 from runner.analysis.contents import whole_ranges
 from runner.errors import NotInRecording, RecordingError
-from runner.export.values import acted, observed
+from runner.export.values import acted, first_observed, observed
 from runner.recording.gym_spaces import restore_space
 from runner.recording.reader import Recording
-from runner.recording.spaces import Description, Value, least_number
-from runner.recording.steps import is_of_environment
+from runner.recording.spaces import Description, Value
 from runner.replay.recorded import reset_of
 from runner.replay.trust import require_listed, trusting
 from runner.runs.trust_marks import environment_of_job
@@ -261,9 +260,11 @@ def _episode(recording: Recording, phase: str, number: int) -> MinariEpisode | N
     if sum(map(len, blocks)) != len(episode):
         return None
     steps = np.concatenate(blocks)
-    seed, first = _beginning(recording, phase, number, steps[0])
+    first = first_observed(recording, phase, number, steps[0])
     if first is None:
         return None
+    reset = reset_of(recording, phase, number)
+    seed = None if reset is None or reset.given.large_seed is not None else reset.seed
     after, actions = observed(recording, steps), acted(recording, steps)
     seen, done = (recording.spaces[name] for name in ("observation", "action"))
     if isinstance(after, list):
@@ -273,26 +274,6 @@ def _episode(recording: Recording, phase: str, number: int) -> MinariEpisode | N
     fields = {"rewards", "terminated", "truncated", "acted"} & {*(steps.dtype.names or ())}
     outcomes: dict[str, Any] = {name: steps[name].copy() for name in fields}
     return MinariEpisode(_nested(seen, after), _nested(done, actions), seed=seed, **outcomes)
-
-
-def _beginning(
-    recording: Recording, phase: str, number: int, step: np.void
-) -> tuple[int | None, Value | None]:
-    """Return the seed of the reset before an episode, and the observation before its first step."""
-    reset = reset_of(recording, phase, number)
-    if reset is not None and reset.episode != step["episode"]:  # it continues after the end of the one before
-        reset = None
-    seed = None if reset is None or reset.given.large_seed is not None else reset.seed
-    if recording.has_states:
-        return seed, step["state"].astype(np.int64) + least_number(recording.spaces["observation"])
-    if reset is not None:
-        return seed, reset.value(recording)
-    episode = recording.phase(phase).episode(number)
-    first = None
-    for block in episode.table.numbered(range(max(0, episode.first - recording.environments), episode.first)):
-        rows = block[is_of_environment(block, episode.environment)]
-        first = observed(recording, rows[-1]) if len(rows) else first
-    return seed, first
 
 
 def _nested(description: Description, values: NDArray[Any] | list[Value]) -> Value:

@@ -16,6 +16,7 @@ from runner.recording import schema
 from runner.recording.environment import observation_names
 from runner.recording.reader import Recording
 from runner.recording.spaces import Leaf, Value, decode, least_number, leaves_of
+from runner.recording.steps import is_of_environment
 from runner.replay.recorded import reset_of
 from runner.replay.steps import transitions_of
 from runner.util.arrays import Floats, Records
@@ -113,12 +114,37 @@ def observations_of(recording: Recording, phase: str, episode: int, start: int =
             where = str(recording.path)
             name = schema.PHASE_NAMES[phase]
             recording.mdp.check_steps(np.asarray(step).reshape(1), where, name)
-        if start == 0 and t == 0 and recording.has_states:
-            yield step["state"].astype(np.int64) + least_number(recording.spaces["observation"]), None
-        elif start == 0 and t == 0:
-            reset = reset_of(recording, phase, episode)
-            yield None if reset is None else reset.value(recording), None
+        if start == 0 and t == 0:
+            yield first_observed(recording, phase, episode, step), None
         yield observed(recording, step), step
+
+
+def first_observed(recording: Recording, phase: str, number: int, step: Step) -> Value | None:
+    """Return the observation before the first step of an episode; None if it was lost.
+
+    Where a loop stepped on without a reset, it is the last observation of the environment before.
+
+    Args:
+        recording: the run.
+        phase: `train` or `eval`.
+        number: the episode's number in the phase.
+        step: its first step.
+
+    Raises:
+        RecordingError: there is no such episode, or its first step was lost.
+    """
+    if recording.has_states:
+        return step["state"].astype(np.int64) + least_number(recording.spaces["observation"])
+    if (reset := reset_of(recording, phase, number)) is not None:
+        return reset.value(recording)
+    episode = recording.phase(phase).episode(number)
+    first = None
+    if not episode.table.are_actions:
+        earlier = range(max(0, episode.first - recording.environments), episode.first)
+        for block in episode.table.numbered(earlier):
+            rows = block[is_of_environment(block, episode.environment)]
+            first = observed(recording, rows[-1]) if len(rows) else first
+    return first
 
 
 def value_in_words(value: object, limit: int = FEW) -> str:

@@ -29,7 +29,7 @@ from runner.recording.schema import STEP_NANOSECONDS
 from runner.recording.steps import Steps
 from runner.replay.engine import Rerun, RerunSteps
 from runner.replay.makers import ALL, environments_of, silence, stream_from_child, why_not_rerun
-from runner.replay.recorded import Piece, RecordedReset, pieces, reset_of, resets_back
+from runner.replay.recorded import Piece, RecordedReset, pieces, reset_before, resets_back
 from runner.replay.steppers import Stepper
 from runner.util.processes import Report, report_progress
 
@@ -231,7 +231,7 @@ def _target(recording: Recording, phase: str, number: int) -> _Target:
     """
     steps = recording.phase(phase).episode(number)
     ended = recording.phase(phase).episodes.array(number, number + 1)
-    if (reset := reset_of(recording, phase, number)) is None:
+    if (reset := reset_before(recording, phase, number)) is None:
         raise RecordingError(f"{recording.path}: {phase} episode {number} has no reset before it.")
     stop_time = int(ended["log_time"][0]) if len(ended) else _step_time(steps.table, steps.last)
     others = steps.table.round_of(steps.last)[-1] - steps.last  # their steps follow at once

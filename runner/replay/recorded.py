@@ -191,7 +191,7 @@ def resets_back(recording: Recording, phase: str, time: int) -> Iterator[Recorde
         width = 4 * width
 
 
-def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
+def reset_before(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
     """Return the last reset of an episode's environment at or before its first step; None if it was lost.
 
     Raises:
@@ -203,6 +203,16 @@ def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | 
         if reset.environment == steps.environment and reset.step <= steps.first:
             return reset
     return None
+
+
+def reset_of(recording: Recording, phase: str, episode: int) -> RecordedReset | None:
+    """Return the reset that begins an episode, as `reset_before` does.
+
+    None, too, if the environment was stepped on after the end of the episode before, without a reset.
+    """
+    steps = recording.phase(phase).episode(episode)
+    reset = reset_before(recording, phase, episode)
+    return None if reset is None or reset.episode != steps.table.one(steps.first)["episode"] else reset
 
 
 def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:

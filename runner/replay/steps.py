@@ -16,7 +16,7 @@ from runner.recording.messages import Message, frame_place
 from runner.recording.reader import MAX_EPISODE_BYTES, Recording, open_recording
 from runner.recording.spaces import Value, least_number
 from runner.recording.topic_chunks import FOREVER
-from runner.replay.recorded import RecordedReset, reset_of
+from runner.replay.recorded import RecordedReset, reset_before
 from runner.util.arrays import Ints, Records
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def recorded_frames(recording: Recording, phase: str, episode: int, start: int =
     # The frames of a vector come at the end of a round.
     turns = recorded.table.round_of(recorded.first)
     later = (turns[-1] - recorded.first) * schema.STEP_NANOSECONDS
-    reset = reset_of(recording, phase, episode) if first == 0 else None
+    reset = reset_before(recording, phase, episode) if first == 0 else None
     if (earliest := next(times, None)) is None:
         return
     begin = earliest - len(turns) * schema.STEP_NANOSECONDS if reset is None else reset.time

@@ -34,6 +34,7 @@ from runner.environments.naming import (
 )
 from runner.errors import RecordingError, shortened
 from runner.export.values import (
+    first_observed,
     is_image,
     names_in,
     number_names,
@@ -345,11 +346,11 @@ def _loop_playback(recording: Recording, at: EpisodeRef, limit: int, first: int)
     actions: list[dict[str, str]] = []
     observations: list[list[Column]] = []
     reset = reset_of(recording, at.phase, number)
-    if reset is not None and not first:
-        value = reset.value(recording)
-        values: Values = [value] if phase.steps.dtype is None else np.array([value])
-        observations.append([part.column(values) for part in parts])
     for steps in _steps(recording, at.phase, number, first + limit):
+        is_start = not first and not log_times[1:]
+        if is_start and (value := first_observed(recording, at.phase, number, steps[0])) is not None:
+            values: Values = [value] if phase.steps.dtype is None else np.array([value])
+            observations.append([part.column(values) for part in parts])
         paid = steps["rewards"].astype(np.float64)
         earlier, seen = np.searchsorted(steps["t"], [first, first - 1]).tolist()
         before += paid[:earlier].sum(axis=0)

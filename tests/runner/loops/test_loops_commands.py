@@ -17,6 +17,7 @@ from runner.analysis.episodes import EpisodeRef
 from runner.analysis.evaluations import loop_summary
 from runner.analysis.series import read_series
 from runner.export.reports.playback import playback_of
+from runner.export.values import observations_of
 from runner.recording.reader import open_recording
 from runner.recording.run_file import Summary
 from runner.service.app import create_app
@@ -49,6 +50,38 @@ def test_the_seed_and_the_options_of_resets_are_shown(tmp_path):
         descriptions = [playback_of(recording, EpisodeRef(episode)).description for episode in (0, 1)]
     assert descriptions[0].endswith(f" Reset with {words}.")
     assert "eset" not in descriptions[1]
+
+
+class Counting(gymnasium.Env):
+    """Counts its steps, ends every third time, and counts on if it is not reset."""
+
+    observation_space = gymnasium.spaces.Box(0, 100, (1,), np.float64)
+    action_space = gymnasium.spaces.Discrete(2)
+    count = 0.0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0.0
+        return np.array([self.count]), {}
+
+    def step(self, action):
+        self.count += 1
+        return np.array([self.count]), 1.0, self.count % 3 == 0, False, {}
+
+
+def test_an_episode_without_a_reset_begins_where_the_one_before_ended(tmp_path):
+    with runner.record(Counting(), tmp_path, name="on") as rec:
+        rec.reset(seed=7)
+        for _ in range(6):
+            rec.step(0)
+    with open_recording(rec.run.recording) as recording:
+        for episode, values in enumerate(([0, 1, 2, 3], [3, 4, 5, 6])):
+            assert [seen[0] for seen, _ in observations_of(recording, "train", episode)] == values
+        playback = playback_of(recording, EpisodeRef(1))
+    assert "eset" not in playback.description
+    assert playback.series[0].values == [3, 4, 5, 6]
+    first, *_ = dualtaxi(tmp_path, "play", "on", "--episode", "1", "--json").output.splitlines()
+    assert "reset" not in json.loads(first)
 
 
 def test_ls_and_show_describe_loops(folder):

@@ -145,8 +145,11 @@ def test_a_run_is_filmed_and_archived_from_its_page(page, folder, tmp_path):
     def press(section, tag):
         browser.execute_script("arguments[0].click()", section.find_element(By.TAG_NAME, tag))
 
-    sections = {each.text: each for each in browser.find_elements(By.TAG_NAME, "details")}
-    film, archive = sections["Make a film"], sections["Archive this run"]
+    film, archive = (
+        browser.find_element(By.XPATH, f"//details[summary='{summary}']")
+        for summary in ("Make a film", "Archive this run")
+    )
+    wait(browser, film.is_displayed)  # the charts above it are drawn
     press(film, "summary")
     film.find_element(By.NAME, "at").send_keys("best")
     Select(film.find_element(By.NAME, "ending")).select_by_visible_text("GIF")
