@@ -68,7 +68,7 @@ def leaves_of(description: object, where: str) -> list[Leaf]:
         size = sum(leaf.dtype.itemsize for leaf in leaves if leaf.dtype is not None)
         if size > MAX_VALUE_BYTES:
             raise ValueError(f"{size:,} bytes a value, expected {MAX_VALUE_BYTES:,} at most")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise RecordingError(f"{where}: describes no space that can be recorded ({error}).") from error
     return leaves
 

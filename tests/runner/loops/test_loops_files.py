@@ -123,6 +123,7 @@ def altered(path: Path, tmp_path: Path, **metadata: str) -> Path:
         ({"environments": "many"}, "environments"),
         ({"spaces": "[]"}, "space"),
         ({"spaces": "{}"}, "space"),
+        ({"spaces": '{"observation": {"type": "Dict", "spaces": []}}'}, "describes no space"),
         ({"spaces": json.dumps({"observation": {"type": "Box"}, "action": {"type": "Text"}})}, "space"),
         (
             {
