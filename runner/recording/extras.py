@@ -184,7 +184,7 @@ class ExtraNames:
         layout = ExtraLayout(fields["layout"], time, _columns_of(json_object(fields["json"], what), what))
         if not is_whole(layout.number, 0, schema.MAX_LAYOUTS - 1):
             raise RecordingError(
-                f"{what}: found layout {layout.number}, expected {schema.MAX_LAYOUTS} at most."
+                f"{what}: found layout {layout.number}, expected {schema.MAX_LAYOUTS - 1} at most."
             )
         if self.layouts:
             last = next(reversed(self.layouts.values()))
