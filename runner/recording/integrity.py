@@ -240,7 +240,7 @@ def _ends_torn(stream: BinaryIO, contents: Index) -> bool:
         if raw.end > contents.size and raw.is_known:
             return raw.length <= MAX_CHUNK_BYTES
         try:
-            if not raw.is_chunk:
+            if not raw.is_chunk or raw.length > MAX_CHUNK_BYTES:
                 raise RecordingError("no chunk")
             read_record(raw._replace(body=stream.read(raw.length)))
         except RecordingError:

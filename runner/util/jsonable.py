@@ -73,7 +73,7 @@ def _array_of(value: Any) -> Array:
         if dtype.kind not in "biuf":
             raise ValueError(f"found {dtype}, expected numbers")
         return np.frombuffer(binascii.a2b_base64(value["base64"]), dtype).reshape(value["shape"]).copy()
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, SyntaxError) as error:  # the last of a dtype such as ","
         raise ValueError(f"found {error}, expected dtype, shape and base64 of an array") from error
 
 
@@ -149,7 +149,7 @@ def restored(value: Any) -> Any:
         return {key: restored(part) for key, part in value.items()}
     try:
         return _RESTORED[tag](restored(content))
-    except TypeError as error:
+    except (TypeError, OverflowError) as error:
         raise ValueError(f"found {error}, expected the content of {tag}") from error
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
 import struct
+import tracemalloc
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +20,8 @@ from runner.errors import RecordingError, RunnerError
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.description import recorded_facts
-from runner.recording.integrity import check_integrity
+from runner.recording.integrity import check_integrity, may_be_cut, survey
+from runner.recording.messages import decode_array, decode_reset_options, encode
 from runner.recording.reader import open_recording
 from runner.recording.repair import repair
 from runner.recording.rewriting import rewrite
@@ -371,3 +375,36 @@ def test_a_file_that_declares_far_more_than_it_can_hold_is_refused_before_it_is_
     with pytest.raises(RecordingError, match="made to exhaust memory"):
         check_integrity(path)
     assert "made to exhaust memory" in verify(path).finding
+
+
+def test_a_record_longer_than_any_chunk_is_not_read_to_find_out_whether_a_file_was_cut(lake, tmp_path):
+    path = tmp_path / "long.mcap"
+    data = lake.recording.read_bytes()
+    end = next(start for opcode, start, _ in records_of(data) if opcode == CHUNK)
+    length = 256 << 20
+    path.write_bytes(data[:end] + struct.pack("<BQ", CHUNK, length))
+    os.truncate(path, end + 9 + length)  # zeros that take no room on the disk
+    tracemalloc.start()
+    try:
+        assert not may_be_cut(path, survey(path))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < length / 2
+
+
+@pytest.mark.parametrize("shape", [[1] * 70, [0] + [2**32 - 1] * 5], ids=["70 axes", "too large"])
+def test_an_array_of_an_impossible_shape_is_refused(shape):
+    data = b"" if 0 in shape else bytes(8)
+    with pytest.raises(RecordingError, match="found an array of shape"):
+        decode_array(encode(schema.ARRAY, {"name": "w", "shape": shape, "dtype": "<f8", "data": data}))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"$float": 10**400}, {"$array": {"dtype": ",", "shape": [], "base64": ""}}],
+    ids=["a large number", "no dtype"],
+)
+def test_options_that_cannot_be_restored_are_refused(options):
+    with pytest.raises(RecordingError, match="options of a reset"):
+        decode_reset_options(encode(schema.RESET_OPTIONS, {"json": json.dumps(options), "resets": 1}))
