@@ -302,9 +302,11 @@ _MAX_COLUMNS: Final = 64
 """The most numbers of steps, and the most actions, that are in an index."""
 _NOT_INDEXED: Final = ("run", "phase", "position", "step", "episode", "environment")
 _PLAIN: Final = ("phase", "episode", "first_step", "last_step", "length", "penalties", "return", *ENDS[1:])
+CUT_OFF: Final = "eval:-1:"
+"""Begins the text of a trial of an evaluation that was cut off, before its number in the phase."""
 _AT: Final = (
     "CASE WHEN phase = 'train' THEN '' || episode WHEN episode < stop "
-    "THEN 'eval:' || after || ':' || (episode - start) ELSE 'eval:-1:' || episode END"
+    f"THEN 'eval:' || after || ':' || (episode - start) ELSE '{CUT_OFF}' || episode END"
 )
 """The text of a reference to an episode."""
 _COUNTED: Final = "row_number() OVER (PARTITION BY phase, environment ORDER BY episode) - 1"

@@ -25,6 +25,7 @@ from runner.analysis.sections import Grid
 from runner.environments.naming import event_in_words
 from runner.errors import RecordingError, RunnerError, RunNotFound, StorageError
 from runner.query.episode_index import (
+    CUT_OFF,
     ENDS,
     EpisodeIndex,
     EpisodeParser,
@@ -70,7 +71,10 @@ class Hit:
     run_id: str
     name: str
     at: str
-    """The episode as other commands take it: `812`, or `eval:3000:17`."""
+    """The episode as other commands take it: `812`, or `eval:3000:17`.
+
+    None takes `eval:-1:17`, trial 17 of all evaluations, of an evaluation that was cut off.
+    """
     phase: str
     episode: int
     """Its number in the phase."""
@@ -84,7 +88,7 @@ class Hit:
     marks: list[str]
     """The texts of its marks."""
     replay: str
-    """The address of its replay."""
+    """The address of its replay; empty where no command takes `at`."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,12 @@ class Found:
     def mark(self, text: str = "", *, tags: Iterable[str] = ()) -> int:
         """Mark the first step of each hit, and return how many were marked.
 
-        A hit with a mark of this text is left as it is. Arguments and errors as for `runner.mark`.
+        A hit with a mark of this text is left as it is, and one without a replay. Arguments and errors as for
+        `runner.mark`.
         """
         steps = defaultdict[str, list[str]](list)
         for hit in self.hits:
-            if text.strip() not in hit.marks:
+            if hit.replay and text.strip() not in hit.marks:
                 steps[hit.run_id].append(f"{hit.at}:0")
         tags = list(tags)
         return sum(
@@ -361,6 +366,7 @@ class _Search:
 
 def _hit(run: IndexRow, row: Json, marks: Sequence[Mark]) -> Hit:
     """Return the episode of a row in the index of a run, which has these marks."""
+    is_cut_off = row["at"].startswith(CUT_OFF)
     return Hit(
         run["id"],
         run["name"],
@@ -372,7 +378,7 @@ def _hit(run: IndexRow, row: Json, marks: Sequence[Mark]) -> Hit:
         next((name for name in ENDS if row.get(name)), "reset"),
         {name[2:]: n for name, n in row.items() if name.startswith("n_") and n},
         [mark.text for mark in marks if (mark.phase, mark.episode) == (row["phase"], row["episode"])],
-        f"/runs/{run['id']}/replay/{EpisodeRef.parse(row['at']).episode_path}",
+        "" if is_cut_off else f"/runs/{run['id']}/replay/{EpisodeRef.parse(row['at']).episode_path}",
     )
 
 

@@ -279,6 +279,7 @@ async def find_page(request: Request, search: SearchOf) -> Response:
         "given": asked,
         "problem": "",
         "found": None,
+        "kept": {},
         "left_out": (),
         "max_thumbnails": MAX_THUMBNAILS,
     }
@@ -288,9 +289,9 @@ async def find_page(request: Request, search: SearchOf) -> Response:
 
             answer = await _answer_query(request, computed.find, *asked.values())
             result = TypeAdapter(Found).validate_json(answer)
-            kept = link("", asked).removeprefix("?")
-            links = [link(hit.replay, {"found": kept}) for hit in result.hits]
-            values |= {"found": result, "left_out": result.left_out, "links": links}
+            kept = {"found": link("", asked).removeprefix("?")}
+            links = [hit.replay and link(hit.replay, kept) for hit in result.hits]
+            values |= {"found": result, "left_out": result.left_out, "links": links, "kept": kept}
     except RunnerError as error:
         values["problem"] = error
     return Page("find.html", values)

@@ -117,7 +117,7 @@ def find(
         if len(result.hits) < result.count:
             progress.say(f"Shown are the first {len(result.hits):,}; --limit 0 shows all.")
         if marked is not None:
-            had = len(result.hits) - marked
+            had = sum(bool(hit.replay) for hit in result.hits) - marked
             progress.say(f"Marked {counted(marked, 'episode')}; {had:,} had this mark.")
 
     def sections() -> Iterator[Section]:

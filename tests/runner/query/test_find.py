@@ -17,6 +17,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 import runner
 from dualtaxi.parallel import DualTaxiParallelEnv
+from runner.analysis.evaluations import evaluations_of
 from runner.archive.batches import Batches
 from runner.archive.runs import archive_run
 from runner.cli import cli
@@ -251,6 +252,18 @@ def test_a_finished_run_whose_recording_is_cut_off_is_left_out(tmp_path):
         result = runner.sql(f"SELECT count(*) AS n FROM {view}", recordings=tmp_path)
         assert result.arrow().to_pylist() == [{"n": 0}]
         assert "is cut off, though its run is finished" in result.left_out[0]
+
+
+def test_trials_of_an_evaluation_that_was_cut_off_are_found(tmp_path):
+    run = make_run(tmp_path, LAKE, evaluation={"every": 6, "trials": 60_000}).update(status="interrupted")
+    os.truncate(run.recording, run.recording.stat().st_size // 10)
+    with open_recording(run.recording) as recording:
+        ended = recording.eval.episodes.count()
+        assert ended > 2 * len(evaluations_of(recording))
+    found = runner.find("length > 0", tmp_path, phase="eval", limit=2)
+    assert found.count == ended
+    assert [(hit.at, hit.replay) for hit in found.hits] == [("eval:-1:0", ""), ("eval:-1:1", "")]
+    assert not found.mark("nowhere")
 
 
 def test_a_recording_that_changed_is_read_again(tmp_path):
