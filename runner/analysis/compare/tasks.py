@@ -316,20 +316,11 @@ def parse_table(text: str, name: str) -> dict[str, Bounds]:
     ending = Path(name).suffix.lower()
     if ending not in (".csv", ".yaml", ".yml", ".json"):
         raise RunnerError(f"{name}: found the ending {ending!r}, expected .csv, .yaml or .json.")
-    rows: list[tuple[str, Any]]
-    if ending == ".csv":
-        reader = csv.DictReader(text.splitlines())
-        if sorted(reader.fieldnames or ()) != sorted(("task", *_SCORES)):
-            columns = ", ".join(reader.fieldnames or ()) or "none"
-            raise RunnerError(f"{name}: found the columns {columns}, expected task, {', '.join(_SCORES)}.")
-        rows = [(str(row.pop("task")), row) for row in reader]
-    else:
-        rows = [(str(task), scores) for task, scores in _mapping(text, name).items()]
     table: dict[str, Bounds] = {}
-    for task, scores in rows:
+    for task, scores in _rows(text, ending, name):
         try:
             bounds = Bounds(*(float(scores[score]) for score in _SCORES))
-        except (KeyError, TypeError, ValueError):
+        except (KeyError, TypeError, ValueError, OverflowError):
             bounds = Bounds(math.nan, math.nan)
         if not math.isfinite(bounds.one - bounds.zero) or len(scores) != len(_SCORES):
             raise RunnerError(f"{name}: {task}: found {scores}, expected finite numbers, random and expert.")
@@ -343,16 +334,23 @@ def parse_table(text: str, name: str) -> dict[str, Bounds]:
     return table
 
 
-def _mapping(text: str, name: str) -> Mapping[object, object]:
+def _rows(text: str, ending: str, name: str) -> list[tuple[str, Any]]:
+    """Return the environments of a table, each with its scores by name."""
     import yaml
 
     try:
-        table = json.loads(text) if name.endswith(".json") else yaml.safe_load(text)
-    except (ValueError, RecursionError, yaml.YAMLError) as error:
+        if ending != ".csv":
+            table = json.loads(text) if ending == ".json" else yaml.safe_load(text)
+            if not isinstance(table, Mapping):
+                raise RunnerError(f"{name}: expected a mapping of environments to `random` and `expert`.")
+            return [(str(task), scores) for task, scores in table.items()]
+        reader = csv.DictReader(text.splitlines())
+        if sorted(reader.fieldnames or ()) != sorted(("task", *_SCORES)):
+            columns = ", ".join(reader.fieldnames or ()) or "none"
+            raise RunnerError(f"{name}: found the columns {columns}, expected task, {', '.join(_SCORES)}.")
+        return [(str(row.pop("task")), row) for row in reader]
+    except (ValueError, RecursionError, csv.Error, yaml.YAMLError) as error:
         raise RunnerError(f"{name}: cannot be parsed ({' '.join(str(error).split())}).") from error
-    if not isinstance(table, Mapping):
-        raise RunnerError(f"{name}: expected a mapping of environments to `random` and `expert`.")
-    return table
 
 
 # --- statistics ---------------------------------------------------------------------------------------

@@ -214,6 +214,8 @@ def test_tables_are_read_from_csv_yaml_and_json(tmp_path):
         ("a.yaml", "[1, 2]", "expected a mapping"),
         ("a.yaml", "{", "cannot be parsed"),
         ("a.json", "{", "cannot be parsed"),
+        ("a.csv", f"task,random,expert\n{'x' * 140_000},1,2\n", "cannot be parsed"),
+        ("a.json", f'{{"Cart": {{"random": 1, "expert": {10**400}}}}}', "expected finite numbers"),
     ],
 )
 def test_what_is_no_table_is_refused(name, text, expected):
