@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -173,10 +175,10 @@ def parse_target(text: str) -> tuple[str, float]:
         RunnerError: the text is no target.
     """
     metric, _, level = text.partition("=")
-    try:
-        return metric, float(level)
-    except ValueError:
-        raise RunnerError(f"found {text!r}, expected METRIC=LEVEL such as success_percent=80.") from None
+    with contextlib.suppress(ValueError):
+        if not math.isnan(number := float(level)):
+            return metric, number
+    raise RunnerError(f"found {text!r}, expected METRIC=LEVEL such as success_percent=80.")
 
 
 # --- reading ------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -178,7 +179,7 @@ def moment_of(
     for kind in _OF_WHOLE_RUNS:
         if moment == kind:
             return Moment(kind, axis=axis), metrics
-    if moment.isascii() and moment.isdecimal():
+    if re.fullmatch("[0-9]{1,15}", moment):
         return Moment("position", number=int(moment), axis=axis), metrics
     with contextlib.suppress(ValueError):
         if not axis.whole and 0 <= (number := float(moment)) < math.inf:

@@ -342,6 +342,8 @@ def test_the_command_prints_text_json_and_markdown(command):
         (["near"], "found 3 runs of one configuration"),
         (["near@latest"], "found one run"),
         (["near", "far", "--moment", "middle"], "expected last, best, area"),
+        (["near", "far", "--moment", "9" * 400], "expected last, best, area"),
+        (["near", "far", "--target", "success_percent=nan"], "expected METRIC=LEVEL"),
         (["near", "far", "--target", "success_percent"], "expected METRIC=LEVEL"),
         (["near", "far", "--target", "finish=80"], "expected one of"),
         (["near", "far", "--moment", "14"], "the nearest are those after 10 and 20"),
