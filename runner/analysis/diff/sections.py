@@ -117,7 +117,8 @@ def _shortened_pair(a: str, b: str) -> tuple[str, str]:
     """Return two texts, of long ones a part from shortly before where they differ."""
     if max(len(a), len(b)) <= _MAX_TEXT:
         return a, b
-    same = next((i for i, pair in enumerate(zip(a, b, strict=False)) if pair[0] != pair[1]), 0)
+    differ = (i for i, pair in enumerate(zip(a, b, strict=False)) if pair[0] != pair[1])
+    same = next(differ, min(len(a), len(b)))
     start = max(same - _MAX_TEXT // 4, 0)
     first, second = (shortened(f"…{text[start:]}" if start else text, _MAX_TEXT) for text in (a, b))
     return first, second

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -261,6 +262,13 @@ def test_markdown_tables_have_as_many_cells_as_headings(compare):
     for above, line in pairwise(lines):
         if above.startswith("|") and line.startswith("|"):
             assert above.count(" | ") == line.count(" | ")
+
+
+def test_of_a_long_text_that_continues_in_one_run_the_end_is_shown(compare):
+    text = "a" * 200
+    difference = replace(compare(), config=[Change("note", text, f"{text} and b")])
+    (row,) = sections(difference)[1].grids[0].rows
+    assert row == ("note", f"…{'a' * 20}", f"…{'a' * 20} and b")
 
 
 def test_the_command_prints_what_differs_and_exits_with_1(record, folder):
