@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Final, NamedTuple
 
 from runner.errors import RecordingError, RunnerError
@@ -70,7 +71,7 @@ def _without_names(name: str, entries: dict[str, str], recording: Path) -> dict[
         return {
             key: text
             for key, text in entries.items()
-            if key not in PRIVATE and not (key.startswith("env.") and "/" in text)
+            if key not in PRIVATE and not (key.startswith("env.") and re.search(r"[/\\]", text))
         }
     if name == "result" and "json" in entries:
         try:
@@ -91,7 +92,7 @@ def _warnings(run: Run) -> Iterator[str]:
     """Yield a sentence for each part of an anonymous file that may identify a person or a place."""
     with open_recording(run.recording) as recording:
         for key, text in _texts(recording.config, ""):
-            if Path(text).is_absolute():
+            if PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute():
                 yield f"The configuration contains a path, which is part of the job and stays: {key}: {text}"
     if run.labels != Labels() or run.marks:
         yield "The labels of the run (name, tags and note) and its marks stay as they are."

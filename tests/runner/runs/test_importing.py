@@ -12,12 +12,14 @@ import socket
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import pytest
 from click.testing import CliRunner
 from mcap.reader import make_reader
 from mcap.records import Attachment, Message, Metadata
 from mcap.stream_reader import StreamReader
 
+import runner
 from runner.cli import cli
 from runner.errors import RecordingError, RunnerError
 from runner.execution.resume import resume
@@ -277,6 +279,20 @@ def test_an_anonymous_file_names_no_person_host_or_folder(taxis, tmp_path, monke
     with open_recording(imported.run.recording) as recording:
         assert recording.provenance.keys().isdisjoint({"host", "user", "command", "directory"})
         assert recording.provenance["dualtaxi"]
+
+
+def test_an_anonymous_file_has_no_path_of_windows(tmp_path, monkeypatch):
+    monkeypatch.setenv("VIRTUAL_ENV", r"C:\Users\annabella\venv")
+    config = {"data": r"C:\Users\annabella\lake"}
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path / "mine", config=config) as env:
+        env.reset(seed=0)
+    run = env.run
+    exported = export_mcap(run, tmp_path / "a.mcap", anonymous=True)
+    with open_recording(run.recording) as recording, open_recording(exported.path) as anonymous:
+        assert recording.provenance["env.VIRTUAL_ENV"]
+        assert "env.VIRTUAL_ENV" not in anonymous.provenance
+    (warning,) = exported.warnings
+    assert r"config.data: C:\Users\annabella\lake" in warning
 
 
 @pytest.mark.parametrize("text", ["no JSON", '["error"]', "[" * 100_000])
