@@ -200,8 +200,8 @@ def cached_export(
     """
     folder = files.cache_folder() / CACHED_EXPORTS
     path = folder / f"{RUN_SEPARATOR.join(run.run_id for run in runs)}-{_cache_key(runs, request)}.rrd"
-    if path.exists():
-        path.touch()
+    with contextlib.suppress(FileNotFoundError):
+        os.utime(path)  # creates no file, where another process removes this one meanwhile
         selections = []
         for run in runs:
             with open_recording(run.recording) as recording:

@@ -171,6 +171,7 @@ def export(
         stream = rr.RecordingStream(APPLICATION, recording_id="-".join(r.run_id for r in recordings))
         temporary = stack.enter_context(new_file(path, force=True))
         temporary.touch()  # where no file can be created, Rerun would not raise an OSError
+        stack.callback(stream.disconnect)  # before the file is renamed, or removed after an error
         stream.save(temporary)
         stream.set_log_time_enabled(False)
         writers = [
@@ -192,5 +193,4 @@ def export(
         if not are_jobs:  # their views follow from steps
             stream.send_blueprint(blueprint(writers))
         stream.flush()
-        stream.disconnect()
     return selections

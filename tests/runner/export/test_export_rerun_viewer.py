@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from runner.analysis.episodes import EpisodeRef
 from runner.cli import cli
 from runner.cli.commands import play
-from runner.errors import RunnerError, StorageError
+from runner.errors import RecordingError, RunnerError, StorageError
 from runner.export.rerun import viewer, writing
 from runner.export.rerun.selection import Request, locate
 from runner.export.rerun.viewer import cached_export
@@ -72,6 +72,28 @@ def test_a_second_export_comes_from_the_cache(pictured):
     again, _ = cached_export([run], Request())
     assert again == path
     assert again.stat().st_ino == made
+
+
+def test_an_export_that_another_process_removes_from_the_cache_is_made_again(pictured, monkeypatch):
+    run = pictured("lake")
+    path, _ = cached_export([run], Request())
+    monkeypatch.setattr(Path, "exists", lambda _: True)
+    path.unlink()
+    again, _ = cached_export([run], Request())
+    assert again.stat().st_size
+
+
+def test_an_export_that_fails_leaves_no_file_open(pictured, monkeypatch, tmp_path):
+    def fail(reader):
+        raise RecordingError("it is damaged")
+
+    monkeypatch.setattr(writing.RunReader, "steps", fail)
+    with pytest.raises(RecordingError) as failed:
+        writing.export([pictured("lake")], Request(), tmp_path / "a.rrd")
+    assert failed.value
+    for descriptor in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # what listed them
+            assert str(tmp_path) not in str(descriptor.readlink())
 
 
 def test_the_error_of_a_viewer_that_cannot_start(monkeypatch):
