@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +69,8 @@ def at_hand(run: Run, log: Tell = lambda _: None, report: Report = lambda _: Non
                     with archive_store(run).reading(run.run_id) as folder:
                         restore_to(folder, fresh, digest, report)
                     fresh.replace(cached)
-                cached.touch()
+                # It was used now, but has not changed: its ETag and what is computed from it stay valid.
+                os.utime(cached, ns=(time.time_ns(), cached.stat().st_mtime_ns))
                 copy_mark(run.folder, cached)
         except Timeout as error:
             raise StorageError(

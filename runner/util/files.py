@@ -68,12 +68,13 @@ def cache_folder() -> Path:
 
 
 def remove_oldest(folder: Path, pattern: str, keep: int) -> None:
-    """Remove the files of a pattern in a folder, but for those that were changed last."""
-    changed = []
+    """Remove the files of a pattern in a folder, but for those that were used last."""
+    used = []
     for path in folder.glob(pattern):
         with contextlib.suppress(FileNotFoundError):  # another process removed it meanwhile
-            changed.append((path.stat().st_mtime, path))
-    for _, old in sorted(changed, reverse=True)[keep:]:
+            facts = path.stat()
+            used.append((max(facts.st_atime, facts.st_mtime), path))
+    for _, old in sorted(used, reverse=True)[keep:]:
         old.unlink(missing_ok=True)
 
 

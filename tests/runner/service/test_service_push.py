@@ -299,6 +299,16 @@ def test_a_pull_is_resumed(server, recordings, tmp_path, monkeypatch):
     assert pulled.run.recording.read_bytes() == run.recording.read_bytes()
 
 
+def test_an_archived_run_is_pulled(server, recordings, tmp_path):
+    run = find_run("second", recordings)
+    with Client(server.url) as client:
+        client.push(run)
+        answer = client.request("POST", f"/runs/{run.run_id}/archive?remove=true")
+        assert answer.json()["removed"]
+        pulled = client.pull(run.run_id, tmp_path / "back")
+    assert pulled.run.summary.content_digest == run.summary.content_digest
+
+
 def test_a_recording_made_to_exhaust_memory_is_refused(server, tmp_path, run):
     import zstandard
 
