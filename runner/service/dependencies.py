@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from functools import partial
 from http import HTTPStatus
@@ -17,6 +18,8 @@ from starlette.requests import ClientDisconnect
 from runner.analysis.episodes import EpisodeRef
 from runner.archive.places import at_hand
 from runner.errors import RecordingError
+from runner.recording.labels import LABELS_FILE
+from runner.recording.marks import MARKS_FILE
 from runner.recording.reader import Recording, open_recording
 from runner.runs.run import Run
 from runner.service.catalogue import Catalogue
@@ -166,10 +169,14 @@ def recording_state(run: Run) -> tuple[str, int, int]:
 def _state_of(argument: object) -> object:
     """Return what changes with an argument of a computation: with the contents of recordings and runs."""
     if isinstance(argument, Run):  # `run.json` may get the duration after the recording is closed
-        return *recording_state(argument), argument.summary.seconds
-    if isinstance(argument, Path):
+        return _state_of(argument.recording), argument.summary.seconds
+    if isinstance(argument, Path):  # a recording, whose name and marks are in files next to it
         stat = argument.stat()
-        return str(argument), stat.st_size, stat.st_mtime_ns
+        changed = [stat.st_mtime_ns]
+        for name in (LABELS_FILE, MARKS_FILE):
+            with contextlib.suppress(FileNotFoundError):
+                changed.append(argument.with_name(name).stat().st_mtime_ns)
+        return str(argument), stat.st_size, *changed
     return tuple(map(_state_of, argument)) if isinstance(argument, list | tuple) else argument
 
 

@@ -234,3 +234,16 @@ def test_a_report_is_downloaded_and_not_shown_as_a_page(client):
     assert "text/html" not in answer.headers["content-type"]
     assert answer.text.startswith("<!doctype html>")
     assert "http" not in "".join(re.findall(r'(?:src|href)="([^"]*)"', answer.text))
+
+
+def test_a_report_that_was_made_before_shows_a_new_name_and_marks(client):
+    run_id = client.get("/api/v1/runs/first").json()["run_id"]
+
+    def report() -> str:
+        return client.get(f"/api/v1/runs/{run_id}/report.html").text
+
+    assert "patient" not in report()
+    client.patch(f"/api/v1/runs/{run_id}", json={"name": "patient"})
+    assert "patient" in report()
+    client.post(f"/api/v1/runs/{run_id}/marks", json={"at": "0:1", "text": "both stuck"})
+    assert "both stuck" in report()
