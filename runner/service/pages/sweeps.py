@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -91,11 +90,11 @@ def _state_of(name: Name, settings: SettingsOf, catalogue: CatalogueOf) -> _Swee
         raise RunNotFound(f"no sweep {name!r}: the page of sweeps lists those there are.")
     is_of_sweep = parse(_filter_of(name))
     rows = catalogue.read(lambda index: index.select(is_of_sweep))
-    files = sorted(
-        (entry.name, facts.st_size, facts.st_mtime_ns)
-        for entry in os.scandir(folder_of(name, folder))
-        if (facts := entry.stat())
-    )
+    files = []
+    for path in sorted(folder_of(name, folder).iterdir()):
+        with contextlib.suppress(FileNotFoundError):  # a temporary file, which has replaced another meanwhile
+            facts = path.stat()
+            files.append((path.name, facts.st_size, facts.st_mtime_ns))
     digest = hashlib.sha256(json.dumps([files, rows], default=str, sort_keys=True).encode()).hexdigest()
     return _SweepState(name, folder, len(rows), digest)
 

@@ -229,6 +229,8 @@ def test_a_sweep_uses_the_free_workers(client, submit, recordings, tmp_path):
     assert all(f'href="/runs/{run.run_id}"' in table for run in runs)
     assert 'aria-label="Length of evaluation trials over training episodes"' in pictures
     assert "data-later" not in page
+    (recordings / ".sweeps" / "small" / ".replacing").symlink_to("gone")  # as a file that vanishes
+    assert client.get("/sweeps/small").status_code == 200
 
 
 def test_jobs_hold_the_workers_that_they_ask_for_and_start_in_order(client, submit):
