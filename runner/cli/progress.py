@@ -25,6 +25,8 @@ LINE_SECONDS: Final = 60.0
 
 _BAR: Final = "bar"
 _SPINNER: Final = "spinner"
+_LABEL: Final = "{task.description}"
+"""The label, which is no part of a format string: it may name a file with braces."""
 _DRAWN: Final = (_BAR, _SPINNER, "speed", "left", "elapsed")
 """Columns that need a terminal."""
 
@@ -43,30 +45,29 @@ def progress_line(label: str, episodes: int) -> Iterator[Callable[[Progress], No
         speed = (steps - first[0][1]) / seconds if seconds else None
         update(completed=progress.episode, facts=progress_facts(progress, speed))
 
-    columns = [_BAR, "{task.completed:,}/{task.total:,}", "{task.fields[facts]}", "left"]
-    with _line(label, columns, total=episodes, facts="") as update:
+    columns = [_LABEL, _BAR, "{task.completed:,}/{task.total:,}", "{task.fields[facts]}", "left"]
+    with _line(label, columns if label else columns[1:], total=episodes, facts="") as update:
         yield report
 
 
 @contextlib.contextmanager
 def steps_line(label: str) -> Iterator[Callable[[int], None]]:
     """Yield a function that is called with the number of steps done."""
-    with _line("", [_SPINNER, label, "{task.completed:,} steps"]) as update:
+    with _line(label, [_SPINNER, _LABEL, "{task.completed:,} steps"]) as update:
         yield lambda steps: update(completed=steps)
 
 
 @contextlib.contextmanager
 def stage_line(stage: str) -> Iterator[Callable[[str], None]]:
     """Show what is being done and for how long; yield a function that is called with the next stage."""
-    with _line("", [_SPINNER, "{task.description}", "elapsed"]) as update:
-        update(description=stage, refresh=True)
+    with _line(stage, [_SPINNER, _LABEL, "elapsed"]) as update:
         yield lambda text: update(description=text, refresh=True)
 
 
 @contextlib.contextmanager
 def bytes_line(label: str) -> Iterator[Callable[[int, int], None]]:
     """Yield a function that is called with the bytes done and their total."""
-    with _line(label, [_BAR, "bytes", "speed", "left"]) as update:
+    with _line(label, [_LABEL, _BAR, "bytes", "speed", "left"]) as update:
         yield lambda done, total: update(completed=done, total=total)
 
 
@@ -92,11 +93,11 @@ def _line(
 ) -> Iterator[Callable[..., None]]:
     """Yield the function that updates a line of columns; without a terminal, prints it now and then.
 
-    The columns are names of the table below, or texts, which use the fields; `total` is None if it is
-    unknown.
+    The columns are names of the table below, or format strings, which use the label and the fields; `total`
+    is None if it is unknown.
     """
     if not sys.stderr.isatty():
-        yield _plain_line([label, *names], total=total, **fields)
+        yield _plain_line(names, description=label, total=total, **fields)
         return
     from rich import progress
 
@@ -109,17 +110,17 @@ def _line(
         "elapsed": progress.TimeElapsedColumn(),
     }
     with progress.Progress(
-        *(columns.get(name) or progress.TextColumn(name, markup=False) for name in [label, *names] if name),
+        *(columns.get(name) or progress.TextColumn(name, markup=False) for name in names),
         console=console(stderr=True),
         transient=True,
         refresh_per_second=REDRAWS_PER_SECOND,
     ) as line:
-        yield partial(line.update, line.add_task("", total=total, **fields))
+        yield partial(line.update, line.add_task(label, total=total, **fields))
 
 
 def _plain_line(names: list[str], **values: Any) -> Callable[..., None]:
     """Return the function that updates a line which is printed now and then, as text."""
-    task = SimpleNamespace(**{"completed": 0, "description": ""} | values, fields=values)
+    task = SimpleNamespace(completed=0, **values, fields=values)
     texts = {"bytes": "{task.completed:,} of {task.total:,} bytes", **dict.fromkeys(_DRAWN, "")}
     template = "  ".join(filter(None, (texts.get(name, name) for name in names)))
     print_seldom = seldom(lambda: say(template.format(task=task)))

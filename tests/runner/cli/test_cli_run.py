@@ -211,6 +211,13 @@ def test_without_a_terminal_a_line_now_and_then_shows_that_work_goes_on(
     assert re.search(line, done.stderr), done.stderr
 
 
+def test_the_label_of_a_line_may_have_braces(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "LINE_SECONDS", 0)
+    with progress.bytes_line("pulling {run}") as report:
+        report(1, 2000)
+    assert capsys.readouterr().err == "pulling {run}  1 of 2,000 bytes\n"
+
+
 def test_the_steps_of_a_run_are_in_the_range_of_the_estimate(command):
     done = command("run", "cliff_walking")
     low, high = re.search(
