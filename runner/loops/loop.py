@@ -284,6 +284,7 @@ class Loop:
             finally:
                 self.closed, self.active = True, None
                 self._rows.clear()
+                self._loop_run.end_joining()
                 self._loop_run.file.close()
             try:
                 self._loop_run.write_status(status, summary)

@@ -94,6 +94,8 @@ class LoopRun:
                 raise
         self._follower = Follower(client, self.run, lambda: self.file.size) if client else None
         self._absolute = os.path.abspath(self.run.folder)  # noqa: PTH100 - links stay what they are
+        self._joined_before = os.environ.get(RUN_VARIABLE)
+        """The folder of the run that child processes joined before this one began."""
         if not is_shard:
             os.environ[RUN_VARIABLE] = self._absolute
 
@@ -202,10 +204,15 @@ class LoopRun:
         self.run = self.run.update(status=status, summary=summary, provenance=self._code.made_by(self.run))
         SYNCER.add(self.file.path, partial(_mark_unsynced, self.run.folder))
 
-    def fold(self) -> Run:
-        """Put together what several processes recorded, if this was the last one; return the whole run."""
+    def end_joining(self) -> None:
+        """Let child processes join the run that was open before this one, if any."""
         if os.environ.get(RUN_VARIABLE) == self._absolute:
             del os.environ[RUN_VARIABLE]
+            if self._joined_before is not None:
+                os.environ[RUN_VARIABLE] = self._joined_before
+
+    def fold(self) -> Run:
+        """Put together what several processes recorded, if this was the last one; return the whole run."""
         joined = self._options.join
         whole = fold_if_over(joined or self.run, 0 if joined else OWNER_WAITS)
         self.run = self.run if joined else whole

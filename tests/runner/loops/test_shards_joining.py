@@ -45,6 +45,17 @@ def test_a_run_is_joined_by_id_prefix_name_folder_or_variable(tmp_path, monkeypa
         assert len(recording.shards) == 1 + len(ways)
 
 
+def test_a_run_can_be_joined_again_after_a_later_one_has_ended(tmp_path, monkeypatch):
+    monkeypatch.delenv(RUN_VARIABLE, raising=False)
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="training") as training:
+        with runner.record(gymnasium.make("CartPole-v1"), tmp_path, name="other"):
+            pass
+        with runner.record(gymnasium.make("CartPole-v1"), join=True) as worker:
+            pass
+    assert worker.run.folder.is_relative_to(training.run.folder)
+    assert RUN_VARIABLE not in os.environ
+
+
 def recorded_here(run):
     return lambda: runner.record(gymnasium.make("CartPole-v1"), join=run)
 
