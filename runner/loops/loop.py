@@ -12,6 +12,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Final
 
 from gymnasium.vector import AutoresetMode
@@ -119,9 +120,10 @@ class Loop:
         """Note how the environment of a phase was made, if it is another one than the first.
 
         Raises:
-            ConfigError: as for the first one.
+            ConfigError: the run records actions alone, which are too few for this environment.
         """
-        self.options.for_environment(maker)
+        # The run has begun: it cannot record whole steps instead, with a warning.
+        replace(self.options, on_error="raise").for_environment(maker)
         with self.lock:
             if not self.closed:
                 self._loop_run.own_makers[phase] = maker

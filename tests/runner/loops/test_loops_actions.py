@@ -307,10 +307,11 @@ def test_actions_alone_need_an_environment_that_can_be_made_again(record, why, t
     assert not rec.run.summary["steps_recorded"]
 
 
-def test_actions_alone_need_an_environment_for_evaluation_that_can_be_made_again(tmp_path):
+@pytest.mark.parametrize("on_error", ["raise", "warn"])
+def test_actions_alone_need_an_environment_for_evaluation_that_can_be_made_again(tmp_path, on_error):
     pole = gymnasium.make("CartPole-v1")
     with (
-        runner.record(pole, tmp_path, steps="actions") as rec,
+        runner.record(pole, tmp_path, steps="actions", on_error=on_error) as rec,
         pytest.raises(ConfigError, match="argument func"),
     ):
         runner.record(TransformReward(gymnasium.make("CartPole-v1"), abs), into=rec, phase="eval")
