@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from runner.errors import ConfigError, RunnerError
+from runner.errors import ConfigError
 from runner.loops.step_buffer import StepBuffer
 from runner.loops.values import as_array, numbers_of
 from runner.recording import schema
@@ -184,11 +184,11 @@ class PendingExtras:
         """Put down further values of the last step of the phase that is recorded now.
 
         Raises:
-            RunnerError: there is no such step, or it cannot be extended any more.
+            ConfigError: there is no such step, or it cannot be extended any more.
         """
         step = self._taken[phase] + rows.pending - self._n
         if step <= self._final[phase]:
-            raise RunnerError(
+            raise ConfigError(
                 "note_step: found no step that can be extended, expected one of this phase that was taken "
                 "after the last step of the other phase."
             )

@@ -150,13 +150,14 @@ class Loop:
         """Record values with the last step of a phase.
 
         Raises:
-            RunnerError: there is no such step any more, or the loop is closed.
+            ConfigError: there is no such step any more.
+            RunnerError: the loop is closed.
         """
         with self.lock:
             if not self.records():
                 return
             if self.position and self.active is not rows:
-                raise RunnerError(
+                raise ConfigError(
                     "note_step: found that the last step was one of another phase, expected one of this phase"
                 )
             self.extras.extend(phase, rows, values)

@@ -278,6 +278,14 @@ def test_steps_after_the_end_do_not_end_the_loop(tmp_path):
     assert only_run(tmp_path).status == "finished"
 
 
+def test_values_without_a_step_are_left_out(tmp_path):
+    with runner.record(Odd(until=10**9), tmp_path, on_error="warn") as rec:
+        with pytest.warns(RuntimeWarning, match="a value was left out: note_step: found no step"):
+            rec.note_step(value=1.0)
+        assert train(rec) == 40
+    assert only_run(tmp_path).status == "finished"
+
+
 def test_vectors(tmp_path):
     base = SyncVectorEnv([lambda: Odd(until=5), lambda: Odd(until=5)])
     with runner.record_vector(base, tmp_path, on_error="warn") as envs:
