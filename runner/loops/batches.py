@@ -66,6 +66,11 @@ class RecordedBatches(Recorded):
         if isinstance(envs, VectorEnv):
             self._open(envs)
 
+    @property
+    def should_stop(self) -> bool:
+        """As of every recording; False before the first batch of named environments."""
+        return self._is_open and super().should_stop
+
     def __getattr__(self, name: str) -> object:
         if name in ("_loop", "_messages", "_rows"):
             raise RunnerError(

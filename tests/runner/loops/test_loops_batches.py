@@ -233,8 +233,10 @@ def test_resets_and_modes_are_checked(tmp_path):
 def test_a_recorder_that_fails_does_not_end_the_training_if_that_is_wished(tmp_path):
     wrong = (BATCH[0], np.zeros((5, 3), int), *BATCH[2:])
     with runner.record_batches("A", tmp_path, autoreset_mode="NextStep", on_error="warn") as rec:
+        assert not rec.should_stop
         rec.reset(BATCH[0][0])
         rec.batch(*BATCH)
+        assert not rec.should_stop
         with pytest.warns(RuntimeWarning, match=r"recording stopped at step 10.*shape \(5, 3\)"):
             rec.batch(*wrong)
         rec.batch(*BATCH)
