@@ -145,7 +145,11 @@ class RecordedVector(Recorded, _Wrapper):
             mask = options["reset_mask"]
             given = {key: value for key, value in options.items() if key != "reset_mask"} or None
         environments = np.flatnonzero(np.ones(n) if mask is None else mask).tolist()
-        seeds = [seed + i for i in range(n)] if isinstance(seed, int) else list(seed or ())
+        seeds: list[int | None] = []
+        if isinstance(seed, int | np.integer):
+            seeds = [seed + i for i in range(n)]
+        elif seed is not None:
+            seeds = list(seed)
         return self._reset(seeds, environments, given, {"seed": seed, "options": options})
 
     def record_reset(self, observations: object, infos: Info | Sequence[Info]) -> None:

@@ -14,7 +14,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.lib.recfunctions import structured_to_unstructured
 
 import runner
+from runner.errors import ConfigError
 from runner.execution.verify import verify
+from runner.loops.actions import parsed_action
 from tests.runner.loops.making import dualtaxi
 
 GIVEN = (0.8, -0.4)
@@ -181,3 +183,26 @@ def test_an_end_in_a_step_that_only_resets_is_recorded_and_not_counted(tmp_path)
         assert recording.train.episodes.array()["length"].tolist() == [2]
         assert len(recording.train.episode_steps(0)) == 2
     assert verify(rec.run.recording).finding == ""
+
+
+@pytest.mark.parametrize(
+    ("space", "fraction", "whole"),
+    [
+        (spaces.MultiDiscrete([3, 3]), [1.5, 0], [1.0, 0]),
+        (spaces.MultiBinary(2), np.array([0.9, 1]), (True, False)),
+        (spaces.Tuple([spaces.MultiDiscrete([3, 3])]), "[[1.5, 0]]", "[[1, 0]]"),
+    ],
+)
+def test_a_fraction_is_no_whole_number_of_an_action(space, fraction, whole):
+    recorded = space.sample()
+    assert parsed_action(space, whole, recorded, ()) in space
+    with pytest.raises(ConfigError, match="expected numbers separated by commas, of Multi"):
+        parsed_action(space, fraction, recorded, ())
+
+
+@pytest.mark.parametrize("seed", [np.int64(3), np.arange(3, 5)])
+def test_a_vector_gets_the_seeds_of_numpy_that_it_takes(seed, tmp_path):
+    with runner.record_vector(HalvingVector(), tmp_path) as envs:
+        envs.reset(seed=seed)
+    with runner.open_recording(envs.run.recording) as recording:
+        assert recording.train.resets.array()["seed"].tolist() == [3, 4]
