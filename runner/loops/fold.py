@@ -13,6 +13,7 @@ import json
 import shutil
 import tempfile
 import time
+from array import array
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -353,19 +354,21 @@ class _Fold:
         if topic in schema.ROW_TOPICS or topic.message in (schema.EXTRA, schema.EXTRA_COLUMNS):
             return
         spool.seek(0)
-        places: list[tuple[int, int, int, int]] = []
+        positions, sizes = array("q"), array("q")  # a run may have many millions of logged values
         for source in self._sources:
             if topic not in source.recording.topics:
                 continue
             for position, payload in self._messages(source, topic):
-                places.append((position, len(places), spool.tell(), len(payload)))
+                positions.append(position)
+                sizes.append(len(payload))
                 spool.write(payload)
-        for position, _, offset, length in sorted(places):
-            spool.seek(offset)
-            self._recorder.append(topic, spool.read(length), position)
+        starts = np.cumsum(sizes) - sizes
+        for k in np.argsort(positions, kind="stable"):
+            spool.seek(starts[k])
+            payload = spool.read(sizes[k])
+            self._recorder.append(topic, payload, positions[k])
             if topic == schema.SCALAR_TOPIC:
-                spool.seek(offset)
-                fields = decode(schema.SCALAR, spool.read(length))
+                fields = decode(schema.SCALAR, payload)
                 self._outcomes.take_logged(fields["name"], fields["value"])
 
     def _messages(self, source: Source, topic: Topic) -> Iterator[tuple[int, bytes]]:
