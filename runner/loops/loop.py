@@ -366,10 +366,17 @@ class Flusher:
 
     def clear(self) -> None:
         """Forget all loops and the thread, and replace the lock."""
-        self.loops: weakref.WeakSet[Loop] = weakref.WeakSet()
+        self._loops: weakref.WeakSet[Loop] = weakref.WeakSet()
         self._to_flush: weakref.WeakSet[Loop] = weakref.WeakSet()
         self._thread: threading.Thread | None = None
-        self._lock = threading.Lock()  # for `_to_flush` and `_thread`: a loop is added, or the thread ends
+        # For all of these: loops are added and listed by any thread, and the thread ends. Reentrant: a signal
+        # may interrupt the thread that holds it, and lists the loops.
+        self._lock = threading.RLock()
+
+    def loops(self) -> list[Loop]:
+        """Return the loops that still exist, also closed ones."""
+        with self._lock:
+            return list(self._loops)
 
     def add(self, loop: Loop) -> None:
         """Flush a loop from now on, as long as its `flush` returns True; close it before SIGTERM ends it."""
@@ -378,7 +385,7 @@ class Flusher:
             with contextlib.suppress(ValueError):  # not the main interpreter
                 signal.signal(signal.SIGTERM, _end_by_signal)
         with self._lock:
-            self.loops.add(loop)
+            self._loops.add(loop)
             self._to_flush.add(loop)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._flush_all, name="recording-flush", daemon=True)
@@ -404,7 +411,7 @@ FLUSHER = Flusher()
 
 def open_loops() -> list[Loop]:
     """Return the loops that this process records, the oldest first."""
-    loops = [loop for loop in FLUSHER.loops if not loop.closed and not loop.is_foreign]
+    loops = [loop for loop in FLUSHER.loops() if not loop.closed and not loop.is_foreign]
     return sorted(loops, key=lambda loop: loop.started)
 
 
@@ -422,23 +429,22 @@ def _end_by_signal(number: int, _frame: object) -> None:
     os.kill(os.getpid(), number)
 
 
-_mask: set[int] = set()
-"""The signals that were blocked before the last fork."""
+_fork = threading.local()
+"""`blocked`: the signals that a thread had blocked before its fork."""
 
 
 def _before_fork() -> None:
     """Keep SIGTERM waiting for a forked process until it has no handler: before, it would be lost."""
-    global _mask  # noqa: PLW0603 - passed between the hooks of one fork
-    _mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+    _fork.blocked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
 
 
 def _unblock() -> None:
-    signal.pthread_sigmask(signal.SIG_SETMASK, _mask)
+    signal.pthread_sigmask(signal.SIG_SETMASK, _fork.blocked)
 
 
 def _after_fork() -> None:
     """In a forked process: it has no such thread, and the recordings belong to the other process."""
-    loops = list(FLUSHER.loops)
+    loops = list(FLUSHER._loops)  # without the lock, which another thread may have held
     FLUSHER.clear()
     if signal.getsignal(signal.SIGTERM) is _end_by_signal:
         signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -6,9 +6,12 @@ import os
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 
 import pytest
 
+from runner.loops.loop import Flusher, open_loops
 from runner.recording.integrity import check_integrity
 from runner.recording.reader import open_recording
 from runner.runs.run import list_runs
@@ -136,3 +139,39 @@ def test_an_uncaught_exception_is_the_error_of_the_run(tmp_path, end, status, te
     with open_recording(run.recording) as recording:
         assert len(list(recording.train.transitions())) == 1
     check_integrity(run.recording)
+
+
+class Idle:
+    """A loop that needs no flush."""
+
+    closed = is_foreign = False
+    started = 0.0
+
+    def flush(self) -> bool:
+        return False
+
+
+def test_loops_can_be_listed_while_others_begin(monkeypatch):
+    """Another thread adds a loop in the middle of the list."""
+    interval = sys.getswitchinterval()
+    flusher = Flusher()
+    monkeypatch.setattr("runner.loops.loop.FLUSHER", flusher)
+    kept, is_over = [], threading.Event()
+
+    def begin_loops():
+        while not is_over.is_set():
+            kept.append(Idle())
+            flusher.add(kept[-1])
+            del kept[:-1000]
+
+    thread = threading.Thread(target=begin_loops)
+    sys.setswitchinterval(1e-6)
+    thread.start()
+    try:
+        end = time.monotonic() + 0.5
+        while time.monotonic() < end:
+            open_loops()
+    finally:
+        sys.setswitchinterval(interval)
+        is_over.set()
+        thread.join()
