@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, Literal, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -16,7 +16,7 @@ from runner.environments.gym_types import AnyVectorEnv, Space
 from runner.errors import ConfigError, RunnerError
 from runner.loops.loop import Loop
 from runner.loops.makers import NAME_MAKE, checked_make, vector_maker_of
-from runner.loops.options import Options, RunOptions, options_of
+from runner.loops.options import Arguments, Options, RunOptions, options_of
 from runner.loops.recorded import Recorded
 from runner.loops.values import as_array, check_phase
 from runner.loops.vector import autoreset_mode_of, described_vector, first_of
@@ -171,7 +171,7 @@ class RecordedBatches(Recorded):
         extras: Mapping[str, object],
     ) -> None:
         """Record T steps, from the arguments of `batch`."""
-        paid = np.asarray(as_array(rewards))
+        paid = as_array(rewards)
         if paid.ndim != 2 or not paid.size or paid.dtype.kind not in "biuf":
             raise ConfigError(f"rewards: found {paid.dtype} of shape {paid.shape}, expected numbers [T, N]")
         steps, _ = paid.shape
@@ -236,13 +236,9 @@ class RecordedBatches(Recorded):
                 "within the step: pass final_observations to record them. This warning is given once."
             )
 
-    def close(self, **kwargs: object) -> None:
-        """Close the recording as finished, and environments that were given."""
+    def _end(self, arguments: Arguments, *ending: str) -> None:
         if self._is_open:
-            super().close(**kwargs)
-
-    def __exit__(self, *raised: object) -> Literal[False]:
-        return super().__exit__(*raised) if self._is_open else False
+            super()._end(arguments, *ending)
 
 
 def record_batches(

@@ -45,10 +45,6 @@ _Values = Array | list[Any]
 """Values of a name: numbers as an array, else a list of texts, or of arrays of different lengths."""
 
 
-class _OtherValues(KeyError):
-    """A value that does not fit into its column."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Column:
     """The values of one name that the recorder does not have yet."""
@@ -330,16 +326,16 @@ class PendingExtras:
         """Return a value as it is put into a row of its column; count the bytes of values of varying size.
 
         Raises:
-            _OtherValues: it has another dtype or shape than the column.
+            KeyError: it has another dtype or shape than the column.
             ConfigError: it cannot be recorded.
         """
         column, description, batch = self._columns[name], self._writer.described[name], self._batch
         values = _values(name, value, batch)
         if column.dtype is not None:
             if isinstance(values, list) or values.shape != column.shape:
-                raise _OtherValues(name)
+                raise KeyError(name)
             if not np.can_cast(values.dtype, column.dtype):
-                raise _OtherValues(name)
+                raise KeyError(name)
             return values
         items = _listed(values, batch)
         item_type = item_dtype(description)

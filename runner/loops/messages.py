@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -34,6 +34,8 @@ from runner.util.jsonable import as_json, as_mapping, exact_json, is_exact, is_p
 from runner.util.packing import MAX_CHUNK_BYTES
 from runner.util.values import Json, flatten, is_utf8
 
+ScalarEncoder = Callable[[float, int, int], bytes]
+"""Returns the message for a logged number, the step and the episode."""
 MAX_ARRAY_BYTES: Final = MAX_CHUNK_BYTES - (1 << 16)
 MAX_INFO_BYTES: Final = 4 << 20
 """The most bytes of JSON for the info of one step."""
@@ -72,15 +74,6 @@ class LoopState(Protocol):
         """Warn the user of something once."""
 
 
-class _Series(NamedTuple):
-    """The numbers that are logged under one name in one phase."""
-
-    name: str
-    rows: StepBuffer
-    encode: Callable[[float, int, int], bytes]
-    """Returns the message for a value, step and episode."""
-
-
 class Messages:
     """Records the messages of a loop; its methods may be called from any thread."""
 
@@ -99,9 +92,10 @@ class Messages:
         self._options = options
         self.has_logged = False
         """Whether anything was logged."""
-        self._series: dict[tuple[str, str], _Series] = {}
-        self._numbers: list[tuple[_Series, float, int, int, int]] = []
-        """Logged numbers that the recorder does not have yet, with position, step and episode."""
+        self._series: dict[tuple[str, str], tuple[StepBuffer, ScalarEncoder]] = {}
+        """The rows and the encoder of numbers, by phase and name."""
+        self._numbers: list[tuple[int, str, float, ScalarEncoder, int, int]] = []
+        """Position, name, value, encoder, step and episode of numbers that the recorder does not have yet."""
 
     def log(self, phase: str, name: str, value: object) -> None:
         """Record a number, a text, an array, a picture or a histogram under a name, at this moment."""
@@ -123,14 +117,14 @@ class Messages:
                 self.has_logged = True
                 if len(self._series) == _MAX_SERIES:  # a loop with names without end
                     self._series.clear()
-                series = _Series(name, self._loop.rows(phase), scalar_encoder(name, phase))
+                series = self._loop.rows(phase), scalar_encoder(name, phase)
                 self._series[phase, name] = series
         loop = self._loop
         with loop.lock:
             if loop.is_foreign and not loop.records():
                 return
-            step, episode = series.rows.progress
-            self._numbers.append((series, value, loop.position, step, episode))
+            rows, encode_number = series
+            self._numbers.append((loop.position, name, value, encode_number, *rows.progress))
             if len(self._numbers) == _MAX_WAITING or len(name) > _LONG_NAME:
                 self.commit()
 
@@ -138,10 +132,9 @@ class Messages:
         """Hand logged numbers to the recorder. The caller holds the lock."""
         numbers, self._numbers = self._numbers, []
         if numbers:
-            payloads = [series.encode(value, step, episode) for series, value, _, step, episode in numbers]
-            positions = [position for _, _, position, _, _ in numbers]
-            self._recorder.extend(schema.SCALAR_TOPIC, payloads, positions)
-            for name, value in {series.name: value for series, value, *_ in numbers}.items():
+            payloads = [encode_number(value, *at) for _, _, value, encode_number, *at in numbers]
+            self._recorder.extend(schema.SCALAR_TOPIC, payloads, [position for position, *_ in numbers])
+            for name, value in {name: value for _, name, value, *_ in numbers}.items():
                 self._outcomes.take_logged(name, value)
 
     def _log_text(self, name: str, text: str) -> None:

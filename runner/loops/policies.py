@@ -86,8 +86,10 @@ def play_checkpoint(
     """
     with open_recording(run.recording) as recording:
         maker = recording.eval.maker_of()
-    if maker is None or (reason := why_not_alone(maker)):
-        raise CannotRedo(reason if maker else why_not_made(None, trust))
+    if maker is None:
+        raise CannotRedo(why_not_made(None, trust))
+    if reason := why_not_alone(maker):
+        raise CannotRedo(reason)
     with trusting(run.recording, maker, trust) as is_trusted:
         if reason := why_not_made(maker, is_trusted):
             raise CannotRedo(reason)

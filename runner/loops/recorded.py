@@ -135,8 +135,8 @@ class Recorded:
         N arrays or texts; with several agents it is a mapping of names for each agent.
 
         Raises:
-            ConfigError: a name or a value cannot be recorded.
-            RunnerError: no step of this phase was taken since the last step of the other phase.
+            ConfigError: a name or a value cannot be recorded, or no step of this phase was taken since the
+                last step of the other phase.
         """
         try:
             self._loop.note(self._phase, self._rows, self._extras_by_name({**(values or {}), **more}))
@@ -179,22 +179,22 @@ class Recorded:
 
     def close(self, **kwargs: object) -> None:
         """Close the environment, and the recording as finished unless it belongs to another environment."""
-        try:
-            self.env.close(**kwargs)
-        finally:
-            if self._owner is None:
-                self._loop.close()
+        self._end(kwargs)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *raised: object) -> Literal[False]:
+        self._end({}, *ending_of(raised[1]))
+        return False
+
+    def _end(self, arguments: Arguments, *ending: str) -> None:
+        """Close the environment with some arguments, and the recording with a status and an error."""
         try:
-            self.env.close()
+            self.env.close(**arguments)
         finally:
             if self._owner is None:
-                self._loop.close(*ending_of(raised[1]))
-        return False
+                self._loop.close(*ending)
 
     def _enter(self, phase: str) -> None:
         self._phase = phase

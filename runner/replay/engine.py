@@ -244,7 +244,7 @@ class Rerun:
             whole.rows[index],
             [(row, reset) for row, (_, reset) in zip(places, resets, strict=True)],
             whole.got[index],
-            [Start(row, *start[1:]) for row, start in zip(places, starts, strict=False)],
+            [start._replace(row=row) for row, start in zip(places, starts, strict=False)],
             [whole.frames[row // n] for row in pictures],
             done,
             whole.error,

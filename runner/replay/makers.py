@@ -162,14 +162,12 @@ def why_not_made(maker: EnvironmentMaker | None, trust: bool) -> str:
 
     Nothing is imported or made.
     """
-    if maker is None:
+    if maker is None or not (maker.make or maker.spec or maker.reason):
         return "The recording does not state how its environment was made."
     if maker.make and trust:
         return why_not_imported(maker.make, trust)
-    if maker.make and (maker.reason or not maker.spec):
-        return f"The environment is made by {maker.make}. {advice()}"
     if maker.reason or not maker.spec:
-        return maker.reason or "The recording does not state how its environment was made."
+        return f"The environment is made by {maker.make}. {advice()}" if maker.make else maker.reason
     try:
         return next(filter(None, (why_not_imported(module, trust) for module in modules_of(maker))), "")
     except CannotRedo as error:
