@@ -24,7 +24,7 @@ from runner.recording.messages import Message, encode
 from runner.recording.schema import Topic
 
 _MAX_WAITING: Final = 1 << 18
-"""The most messages that wait for a recorder; no more samples of the machine are taken then."""
+"""The most messages that wait for a recorder; those beyond are left out."""
 
 
 class Observer:
@@ -44,8 +44,6 @@ class Observer:
         self.console = None if console is None else ConsoleLog(console)
         self._seen: deque[tuple[Topic, bytes]] = deque()
         self._needs_thread = host or console is not None
-        if self._needs_thread:
-            _thread.add(self)
 
     def take(self, is_last: bool = False) -> list[tuple[Topic, bytes]]:
         """Return the messages since the last call, and the time if that is due.
@@ -53,6 +51,8 @@ class Observer:
         The first call begins the session; after the last one nothing more is watched.
         """
         is_first = self._stopwatch.begin()
+        if self._needs_thread and is_first:  # not earlier: a resumed run may end without a session
+            _thread.add(self)
         if self._needs_thread and is_last:
             _thread.remove(self)
             self.see_console(time.monotonic(), is_last=True)

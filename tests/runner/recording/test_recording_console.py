@@ -17,6 +17,7 @@ from nbclient import NotebookClient
 
 import runner
 from runner.errors import RecordingError
+from runner.execution.resume import resume
 from runner.execution.verify import verify
 from runner.export.mcap import export_mcap
 from runner.recording import console, machine, observer, schema
@@ -27,7 +28,7 @@ from runner.recording.reader import open_recording
 from runner.runs.run import list_runs
 from tests.runner.altering import altered
 from tests.runner.loops.making import make
-from tests.runner.recording.making import TAXIS, make_run
+from tests.runner.recording.making import TAXIS, copy_of, make_run, stopping_after
 from tests.waiting import until
 
 
@@ -262,6 +263,14 @@ def test_a_job_has_what_its_process_prints(tmp_path, capsys):
     assert lines_of(run) == []
     with open_recording(run.recording) as recording:
         assert recording.config["recording"]["console"]
+
+
+def test_a_resumed_job_that_stops_before_it_has_new_steps_leaves_the_streams_as_they_were(tmp_path):
+    run = copy_of(make_run(tmp_path, TAXIS, episodes=2000), tmp_path / "cut", summary={})
+    os.truncate(run.recording, int(0.97 * run.recording.stat().st_size))
+    before = vars(sys.stdout).get("write"), vars(sys.stderr).get("write")
+    assert resume(run, stop=stopping_after(1)).status == "interrupted"
+    assert (vars(sys.stdout).get("write"), vars(sys.stderr).get("write")) == before
 
 
 def test_a_line_of_no_stream_is_refused(tmp_path):
