@@ -19,12 +19,14 @@ from runner.config.model import Job
 from runner.errors import StorageError
 from runner.execution.session import run_job
 from runner.recording import pipeline, schema
-from runner.recording.layout import layout_of
+from runner.recording.layout import layout_of, lone_message
 from runner.recording.reader import open_recording
 from runner.recording.writer import RecordingFile
 from runner.runs.resolve import find_run
 from runner.runs.run import create_run
+from runner.util.packing import Packing
 from tests.runner.recording.making import LAKE, TAXIS, experiment, make_run
+from tests.waiting import until
 
 LONG_RUN = """
 import resource, sys
@@ -180,6 +182,20 @@ def test_an_error_while_packing_ends_the_run(threads, tmp_path, monkeypatch):
     with pytest.raises(MemoryError):
         run_job(Job(config, 0), run, threads=threads)
     assert json.loads((run.folder / "run.json").read_text())["status"] == "failed"
+
+
+def test_an_error_of_what_is_called_every_second_is_raised_where_messages_are_sent(monkeypatch):
+    def broken():
+        raise ValueError("no heartbeat")
+
+    monkeypatch.setattr(pipeline, "_BEAT_SECONDS", 0.01)
+    sender = pipeline.Pipeline(None, Packing(), broken)
+    until(bool, lambda: sender.failure, seconds=10)
+    for _ in range(2 * pipeline.MAX_PENDING):  # the thread still takes them
+        sender.send(schema.LOG_TOPIC, *lone_message(schema.LOG_TOPIC, 0, b""))
+    sender.close()
+    with pytest.raises(ValueError, match="no heartbeat"):
+        sender.raise_failure()
 
 
 def test_a_recording_is_never_overwritten(tmp_path):
