@@ -22,6 +22,7 @@ from msgspec import Meta
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.digest import combined_digest
+from runner.recording.marks import MARKS_FILE
 from runner.recording.schema import MessageType
 from runner.util.files import hash_of
 from runner.util.stored import stored_as
@@ -77,6 +78,10 @@ TOPICS: Final = {
     "reset_states.parquet": ("/train/reset_state", "/eval/reset_state"),
 }
 """The tables of messages in the order in which they are written, without Q-tables, and their topics."""
+_OWN_FILES: Final = frozenset(
+    {*TOPICS, Q_TABLES, RUN, TRANSITIONS, STATES, ACTIONS, METADATA, MANIFEST, MARKS_FILE}
+)
+"""The files of archives whose names no attachment can have."""
 FIELDS: Final[Mapping[MessageType, tuple[str, ...]]] = {
     schema.STEP: schema.STEP_COLUMNS,
     schema.EPISODE: schema.EPISODE_COLUMNS,
@@ -209,6 +214,11 @@ def read_manifest(data: bytes, where: str) -> Manifest:
     if manifest.to_json() != data:
         raise RecordingError(f"{where}: does not match its seal: it was changed, and the archive is damaged.")
     return manifest
+
+
+def is_attachment(name: str) -> bool:
+    """Return whether an archive can have an attachment of this name: it is not that of another file."""
+    return is_inside(name) and name not in _OWN_FILES and not name.startswith(CONTENTS)
 
 
 def is_inside(name: str) -> bool:

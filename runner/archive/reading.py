@@ -23,7 +23,7 @@ from blake3 import blake3
 from runner.archive import layout
 from runner.archive.batches import bytes_of, records_of
 from runner.archive.columns import Shape, Table, numbers
-from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, is_inside, read_manifest
+from runner.archive.layout import MAX_MANIFEST_BYTES, Entry, Manifest, is_attachment, read_manifest
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.description import RunDescription
@@ -87,8 +87,8 @@ class Archive(RunDescription):
         for name, expected in self.manifest.files.items():
             path = self.folder / name
             try:
-                found = Entry(*hash_of(path)) if path.stat().st_size == expected.size else None
                 size = path.stat().st_size
+                found = Entry(*hash_of(path)) if size == expected.size else None
             except OSError as error:
                 raise RecordingError(
                     f"{path}: cannot be read ({error.strerror}); the archive is damaged."
@@ -113,7 +113,9 @@ class Archive(RunDescription):
     def attachments(self) -> list[tuple[str, str]]:
         """Name and media type of the recording's attachments, in order."""
         named = self._description.attachments
-        if strange := [name for name, _ in named if not is_inside(name) or name not in self.manifest.files]:
+        if strange := [
+            name for name, _ in named if not is_attachment(name) or name not in self.manifest.files
+        ]:
             raise RecordingError(f"{self.folder}: has no attachment {strange[0]!r}.")
         return named
 

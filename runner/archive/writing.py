@@ -21,7 +21,7 @@ from blake3 import blake3
 from runner.archive import layout
 from runner.archive.batches import Batches
 from runner.archive.columns import Shape, Table
-from runner.archive.layout import Entry, Manifest, entries_of, is_inside
+from runner.archive.layout import Entry, Manifest, entries_of, is_attachment
 from runner.environments.mdp import Mdp
 from runner.environments.naming import actions_in_words, states_in_words
 from runner.errors import RecordingError
@@ -154,9 +154,10 @@ class _ArchiveWriter:
         recording = self._recording
         attachments = []
         for name, media_type, data in recording.file.attachments():
-            if not is_inside(name):
+            if not is_attachment(name):
                 raise RecordingError(
-                    f"{self._where}: found an attachment {name!r}, whose name is not a relative path."
+                    f"{self._where}: found an attachment {name!r}, expected a relative path that is not one of "
+                    "an archive's own files."
                 )
             attachments.append([name, media_type])
             path = self._folder / name

@@ -14,6 +14,7 @@ from runner.archive.writing import write_archive
 from runner.errors import RecordingError
 from runner.recording import schema
 from runner.recording.reader import open_recording
+from runner.recording.rewriting import rewrite
 from tests.runner.altering import altered
 from tests.runner.recording.making import TAXIS, make_run
 
@@ -101,4 +102,17 @@ def test_a_recording_that_is_not_what_its_result_says_is_refused(run, tmp_path):
         open_recording(path) as recording,
         pytest.raises(RecordingError, match=r"/train/step: found .* expected .* by its result"),
     ):
+        write_archive(recording, tmp_path / "archive")
+
+
+@pytest.mark.parametrize("name", ["run.parquet", "manifest.json", "metadata.json", "checkpoints/ab"])
+def test_an_attachment_with_the_name_of_a_file_of_archives_is_refused(run, tmp_path, name):
+    path = tmp_path / "recording.mcap"
+
+    def attach(file):
+        file.add_attachment(name, "text/plain", b"other content")
+
+    rewrite(run.recording, path, lambda _, entries: entries, add=attach)
+    (tmp_path / "archive").mkdir()
+    with open_recording(path) as recording, pytest.raises(RecordingError, match=f"an attachment '{name}'"):
         write_archive(recording, tmp_path / "archive")
