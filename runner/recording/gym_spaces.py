@@ -353,7 +353,7 @@ class _Numbers(RecordedSpace[Space]):
         return self.batch([data])[0]
 
     def batch(self, values: Value) -> Value:
-        return np.array(_numbers_in(values), self.space.dtype).reshape(-1, *self.dtype.shape)
+        return np.array(_numbers_in(values), self.space.dtype).reshape(len(values), *self.dtype.shape)
 
     def describe(self) -> Description:
         layout = {"dtype": self.dtype.base.str, "shape": list(self.dtype.shape)}

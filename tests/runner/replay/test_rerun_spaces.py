@@ -93,3 +93,7 @@ def test_a_branch_takes_an_action_as_json(tmp_path, monkeypatch):
 def sequence() -> varied.Varied:
     """Return the environment whose actions are sequences."""
     return varied.Varied("sequence")
+
+
+def test_an_action_without_numbers_comes_back_from_its_text():
+    assert value_of(spaces.Box(-1, 1, (0,)), "[]").shape == (0,)
