@@ -123,8 +123,7 @@ class _Resets:
 
     def before(self, step: int) -> Iterator[Records]:
         """Yield the next resets in blocks, up to the first at this step or a later one."""
-        while len(self.left) or len(block := next(self._blocks, self.left)):
-            resets = self.left if len(self.left) else block
+        while len(resets := self.left if len(self.left) else next(self._blocks, self.left)):
             stop = int(np.argmax(np.append(resets["step"] >= step, True)))
             self.left = resets[stop:]
             yield resets[:stop]

@@ -97,9 +97,8 @@ class ExtraLayout:
 
     def is_declared_in(self, index: Index) -> bool:
         """Return whether a file has its schema and channels."""
-        schemas, channels, *_ = self.beginning
-        return all(index.schemas.get(schema.id) == schema for schema in schemas) and all(
-            index.channels.get(channel.id) == channel for channel in channels
+        return all(index.schemas.get(schema.id) == schema for schema in self.beginning.schemas) and all(
+            index.channels.get(channel.id) == channel for channel in self.beginning.channels
         )
 
     @property

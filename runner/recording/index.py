@@ -17,7 +17,6 @@ from typing import BinaryIO, Final, NamedTuple, TypeVar
 import numpy as np
 from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     AttachmentIndex,
@@ -38,6 +37,7 @@ from runner.recording.records import (
     MAX_NAME_BYTES,
     MAX_NAMED,
     MAX_UNPACKED_RATIO,
+    UNREADABLE,
     ChunkEntry,
     Place,
     RawRecord,
@@ -226,11 +226,11 @@ class Index:
             case Opcode.SCHEMA:
                 schema = _parse(Schema, raw)
                 _add_once(self.schemas, schema.id, schema, "schema")
-                self.schema_records += RECORD_HEAD.pack(*raw[:2]) + raw.body
+                self.schema_records += RECORD_HEAD.pack(raw.kind, raw.length) + raw.body
             case Opcode.CHANNEL:
                 channel = _parse(Channel, raw)
                 _add_once(self.channels, channel.id, channel, "channel")
-                self.channel_records += RECORD_HEAD.pack(*raw[:2]) + raw.body
+                self.channel_records += RECORD_HEAD.pack(raw.kind, raw.length) + raw.body
             case Opcode.STATISTICS:
                 self.message_counts = dict(_parse(Statistics, raw).channel_message_counts)
             case Opcode.HEADER if raw.offset != len(MAGIC):
@@ -481,7 +481,7 @@ def _chunk_index(entry: ChunkEntry) -> bytes:
 def _parse(kind: type[T], raw: RawRecord) -> T:
     try:
         return kind.read(ReadDataStream(BytesIO(raw.body)))  # type: ignore[attr-defined, no-any-return]
-    except (McapError, struct.error, UnicodeDecodeError, ValueError) as error:
+    except UNREADABLE as error:
         raise RecordingError(f"the {kind.__name__} record at {raw.offset} cannot be read") from error
 
 

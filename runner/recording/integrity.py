@@ -138,7 +138,8 @@ def _check_beginning(raw: RawRecord, contents: Index, layout: Layout) -> None:
     Raises:
         RecordingError: they differ.
     """
-    expected = beginning_of(layout)[2:]
+    beginning = beginning_of(layout)
+    expected = beginning.schema_records, beginning.channel_records
     is_whole = (contents.schema_records, contents.channel_records) == expected
     if not is_whole or raw.offset != contents.header_end + sum(map(len, expected)):
         raise RecordingError(

@@ -1,6 +1,6 @@
 """The records of an open recording: read, unpacked, compared with their checksums; the last few are cached.
 
-Reading is safe from several threads, so the next chunks are unpacked while one is in use.
+Threads of its own unpack the next chunks while one is in use; otherwise it is for one thread at a time.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class MessageType:
     fields: tuple[Field, ...]
     package: str = "dualtaxi"
     varies: bool = False
-    """Whether its messages vary in size although each of its fields may not: values of another one do."""
+    """Whether its messages are encoded one by one: values of some message of the run vary in size."""
 
     @property
     def full_name(self) -> str:

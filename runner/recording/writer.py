@@ -126,7 +126,7 @@ class RecordingFile:
         """Append chunks of one topic each with their message indexes: all of them, or none if that fails."""
         for channel in {chunk.entry.channel for chunk in chunks} - self._index.channels.keys():
             beginning = self._later.get(channel)
-            if beginning is not None and channel not in self._index.channels:
+            if beginning is not None and channel not in self._index.channels:  # nor written with another one
                 self.begin(beginning)
         start, _ = self._append(b"".join(part for chunk in chunks for part in (chunk.record, chunk.index)))
         for chunk in chunks:
