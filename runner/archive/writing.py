@@ -156,8 +156,8 @@ class _ArchiveWriter:
         for name, media_type, data in recording.file.attachments():
             if not is_attachment(name):
                 raise RecordingError(
-                    f"{self._where}: found an attachment {name!r}, expected a relative path that is not one of "
-                    "an archive's own files."
+                    f"{self._where}: found an attachment {name!r}, expected a relative path that is not "
+                    "the path of an archive's own file."
                 )
             attachments.append([name, media_type])
             path = self._folder / name
