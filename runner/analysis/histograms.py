@@ -184,7 +184,7 @@ def _steps(recording: Recording, moments: Positions, notes: list[str]) -> Iterat
                 values["reward", line] = block["rewards"][:, i]
         for part, numbers in _parts(recording, block["action"], notes).items():
             values["action", part] = numbers
-        yield moments.at(block["episode"], block["step"] + 1), values
+        yield moments.at(block["episode"] + 1, block["step"] + 1), values
 
 
 def _parts(recording: Recording, actions: Array, notes: list[str]) -> dict[str, Array]:

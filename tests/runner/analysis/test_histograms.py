@@ -102,6 +102,15 @@ def test_a_job_has_the_counts_of_its_steps_and_episodes(taxis):
     )
 
 
+def test_steps_are_counted_in_the_stretch_of_their_episode(taxis):
+    with open_recording(taxis.recording) as recording:
+        found, _ = histograms(recording, EPISODES)
+        lengths = recording.train.episodes.array()["length"]
+    (rewards, *_) = (histogram for histogram in found if histogram.quantity == "reward")
+    edges = np.array(rewards.edges[:-1], int)
+    assert list(map(sum, rewards.counts)) == np.add.reduceat(lengths, edges).tolist()
+
+
 def test_named_and_started_actions_of_a_loop_are_counted(tmp_path):
     actions = recorded(
         tmp_path,
