@@ -65,7 +65,8 @@ def code_changes(a: Recording, b: Recording) -> list[FileChange]:
         elif commits[0] == commits[1] and parts[0].get(path) != parts[1].get(path):
             lines = _patches(parts[0].get(path), parts[1].get(path))
         if lines:
-            signs = Counter(line[:1] for line in lines if not line.startswith(("+++", "---")))
+            first = next((i for i, line in enumerate(lines) if line.startswith("@@ ")), 0)
+            signs = Counter(line[:1] for line in lines[first:])  # the lines before also begin with signs
             kept_lines = lines[: MAX_LINES if len(changes) < MAX_FILES else 0]
             changes.append(FileChange(path, signs["+"], signs["-"], kept_lines, len(lines) - len(kept_lines)))
     return changes

@@ -46,6 +46,7 @@ def test_git_applies_changes_since_a_commit_that_one_run_has(tmp_path):
     committed, changed = {"lib.py": "1\n-- 2\n"}, {"lib.py": "1\n++ 3\n4\n"}
     for k, (before, after) in enumerate([(changed, committed), (committed, changed)]):
         (change,) = code_changes(runs[k], runs[1 - k])
+        assert (change.added, change.removed) == [(1, 2), (2, 1)][k]
         apply(tmp_path / str(k), before, change.lines)
         assert files_in(tmp_path / str(k)) == after
 
