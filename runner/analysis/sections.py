@@ -314,4 +314,4 @@ def html(sections: Sequence[Section]) -> str:
 
 
 def _row(cells: tuple[str, ...]) -> str:
-    return "| " + " | ".join(re.sub(r"([|*<])", r"\\\1", cell).replace("\n", " ") for cell in cells) + " |"
+    return "| " + " | ".join(re.sub(r"([\\|*<])", r"\\\1", cell).replace("\n", " ") for cell in cells) + " |"

@@ -28,6 +28,11 @@ def test_names_ids_and_empty_columns_are_text(cells):
     assert Grid(("x",), [(cell,) for cell in cells]).numeric == (False,)
 
 
+def test_markdown_keeps_the_signs_of_a_cell():
+    (*_, row, _) = markdown([Section("", grids=[Grid(("path",), [(r"C:\|*",)])])])
+    assert row == r"| C:\\\|\* |"
+
+
 def test_markdown_and_html_align_columns_alike():
     made = [
         Section("A", grids=[Grid(("name", "value"), [("one", "1"), ("two", "-20")]), Grid(("none",), [])])
