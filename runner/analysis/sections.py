@@ -26,8 +26,8 @@ NOT_DRAWN: Final = "`dualtaxi serve` draws the charts."
 class Figure(NamedTuple):
     """A picture in a page."""
 
-    svg: str
-    """The picture: SVG, or an element `img`."""
+    picture: str
+    """SVG, or an element `img`."""
     caption: str = ""
     """A text below it."""
     title: str = ""
@@ -305,7 +305,7 @@ def html(sections: Sequence[Section]) -> str:
         is_row = "split" in section.layout
         figures = [
             f'<figure style="flex: 1; max-width: {22 if is_row and not figure.is_wide else 46}em">'
-            f"{figure.svg}</figure>"
+            f"{figure.picture}</figure>"
             for figure in section.figures
         ]
         if figures:

@@ -251,7 +251,7 @@ class WhatIf(Answer):
             Figure(self.picture("" if base else svg.STYLE)),
             Figure(self.matrix(base), _MATRIX_CAPTION, is_wide=True),
         )
-        figures = [figure for figure in drawn if figure.svg]
+        figures = [figure for figure in drawn if figure.picture]
         notes = [] if base else list(map(sentence, self.notes))
         grid = replace(self.grid, links=list(map(self._page, self.actions)))
         return [

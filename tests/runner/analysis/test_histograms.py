@@ -55,7 +55,7 @@ def found_in(folder, axis=STEPS):
     (run,) = runner.list_runs(folder)
     with open_recording(run.recording) as recording:
         found, notes = histograms(recording, axis)
-    maps = "".join(plot.svg for plot in heatmap_plots(found))
+    maps = "".join(plot.picture for plot in heatmap_plots(found))
     drawn = [each for each in found if 1 < len(each.names) < 10]
     assert all(f">{name}</text>" in maps for each in drawn for name in each.names)
     return {(each.quantity, each.line): each for each in found}, notes
@@ -67,7 +67,7 @@ def test_a_constant_is_a_sentence_and_no_picture(tmp_path):
     with open_recording(run.recording) as recording:
         found, _ = histograms(recording, STEPS)
     assert constants_in(found) == ["Rewards in training: always 1."]
-    assert not any("Rewards in training" in plot.svg for plot in heatmap_plots(found))
+    assert not any("Rewards in training" in plot.picture for plot in heatmap_plots(found))
 
 
 def counted(histogram, start, stop, value):

@@ -37,9 +37,9 @@ def host_of(gpus=0, **values):
 )
 def test_only_what_is_known_is_drawn(host, titles):
     plots = [*machine_plots(CLOCK, host)]
-    drawn = [re.search(r'aria-label="([^"]*)"', plot.svg)[1] for plot in plots]
+    drawn = [re.search(r'aria-label="([^"]*)"', plot.picture)[1] for plot in plots]
     assert drawn == ["Steps a second", *titles]
-    assert all("nan" not in plot.svg for plot in plots)
+    assert all("nan" not in plot.picture for plot in plots)
 
 
 def test_a_run_that_took_no_time_has_no_charts():

@@ -78,7 +78,7 @@ def test_maps_are_svg_at_every_stage_with_arrows_after_learning(scene, recording
     assert len(rows) == movers + (len(learners) if movers == 2 else 0)
     for row in rows:
         assert row.ramp[0] <= row.ramp[1]
-        roots = [ElementTree.fromstring(figure.svg) for figure in row.figures]
+        roots = [ElementTree.fromstring(figure.picture) for figure in row.figures]
         arrows = [sum(e.get("class") == "m-arrow" for e in root.iter()) for root in roots]
         assert arrows[0] == 0
         assert arrows[-1] > 0 or recording.run["name"] not in ("taxi", "cliff")
@@ -90,7 +90,7 @@ def test_an_arrow_points_to_the_action_of_the_highest_value(pictured):
     with open_recording(pictured("cliff").recording) as opened:
         mdp, stage = opened.mdp, stages_of(opened)[-1]
         (row,) = maps_of(mdp, opened.agents, [stage], 36)
-    picture = row.figures[0].svg
+    picture = row.figures[0].picture
     table = stage.tables[0]
     angles = {"up": 0, "right": 90, "down": 180, "left": 270}
     names = [action["name"] for action in mdp.scene["actions"]]

@@ -175,7 +175,7 @@ def test_parameters_that_an_algorithm_does_not_use_spend_no_trials(changes, tmp_
     rows = {row[-3]: row[-2] for row in results.sections()[0].grids[0].rows}
     assert rows["q_learning"] == "–"
     drawn = drawn_trials(results)
-    assert "nan" not in "".join(plot.svg for plot in parameters_section(drawn).figures).lower()
+    assert "nan" not in "".join(plot.picture for plot in parameters_section(drawn).figures).lower()
 
 
 def test_an_old_sweep_without_repeats_may_repeat_values(tmp_path):
