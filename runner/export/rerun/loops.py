@@ -89,7 +89,7 @@ class LoopTracks:
                         named = member._replace(name="") if member.agent else member
                         yield self._line(named, "length", times, episodes["length"][:, np.newaxis])
         recording = self._recording
-        is_each_step = frames_every(self._recording) == 1
+        is_each_step = frames_every(recording) == 1
         for frame in self._of_phase.frames.decoded():
             environment, _ = frame_place(frame)
             later = recording.environments - 1 - environment

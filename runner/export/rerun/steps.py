@@ -401,9 +401,8 @@ class MapTracks:
         self._origins = centres + offsets[:, None]
         """[agents, pixels, 2]."""
         actions = mdp.own_actions.T if is_joint else [np.arange(mdp.action_counts[learner])]
-        padded_actions = np.pad(
-            actions, ((0, 0), (0, 1)), constant_values=-1
-        )  # the last for pixels without a state
+        # The last action stands for pixels without a state.
+        padded_actions = np.pad(actions, ((0, 0), (0, 1)), constant_values=-1)
         self._arrows = scene.own_moves[padded_actions] * np.float32(_ARROW_SCALE)
         self._letters = labels.stops[np.array(agents)[:, None], padded_actions]
         height, width = placements.height, placements.width

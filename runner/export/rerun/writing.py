@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import rerun as rr
@@ -38,6 +38,8 @@ from runner.util.arrays import Records, in_blocks
 from runner.util.files import new_file
 
 _BATCH_BYTES: Final = 64 << 20
+Maker = LoopTracks | StepTracks | ValueTracks | MapTracks
+"""Makes tracks of a phase: those that are `still`, and those `of` a batch of steps."""
 
 
 class RunReader:
@@ -50,10 +52,9 @@ class RunReader:
         self._recording = recording
         self._is_job = recording.has_tables
         scene = self._scene = scene_of(recording.mdp) if recording.tabular else None
-        self._makers: dict[str, list[Any]] = {
-            phase: [] if self._is_job else [LoopTracks(writer, phase)] for phase in spans
-        }
-        """Makers of the tracks of each phase: of the steps, and of the Q-values at them."""
+        self._loops = {} if self._is_job else {phase: LoopTracks(writer, phase) for phase in spans}
+        self._makers: dict[str, list[Maker]] = {phase: [loop] for phase, loop in self._loops.items()}
+        """Makers of the tracks of each phase with any: of the steps, and of the Q-values at them."""
         self._labels: GridLabels | None = None
         self._edges: set[int] = set()
         """First steps of the stretches of time that were sent, and the steps after their last ones."""
@@ -64,7 +65,7 @@ class RunReader:
         largest = max((float(np.abs(q.values).max()) for q in recording.snapshots()), default=0.0)
         labels = self._labels = GridLabels(recording.mdp, scene, recording.agents, largest)
         for phase in filter(spans.get, spans):
-            makers = self._makers[phase]
+            makers = self._makers.setdefault(phase, [])
             makers.append(StepTracks(phase, writer.title, labels))
             if self._is_job:
                 makers.append(ValueTracks(phase, labels))
@@ -111,8 +112,8 @@ class RunReader:
         if labels:  # all texts are known now
             yield labels.track()
         if not is_job:
-            for maker, *_ in self._makers.values():
-                yield from maker.drawn()
+            for loop in self._loops.values():
+                yield from loop.drawn()
         elif scene and labels:
             yield from self._notice(scene.columns / 2, scene.rows / 2)
 
