@@ -25,7 +25,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,25 +244,21 @@ def source_of_recorded(recording: Recording, phase: str, episode: int | None) ->
     return PictureSource.OBSERVATION if has_image else PictureSource.VALUES
 
 
-class Painting(NamedTuple):
-    """The painted states of an episode."""
+def paint(
+    recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0
+) -> tuple[PictureSource, str, bool, Painted]:
+    """Paint the states of an episode from number `first` on, of the best source that works.
 
-    source: PictureSource
-    reason: str
-    """Why the environment does not draw them, as a sentence; empty if it does, or has no need to."""
-    has_failed: bool
-    """Whether it turned out not to draw them, although it could be made again."""
-    pictures: Painted
-
-
-def paint(recording: Recording, phase: str, episode: int, trust: bool = False, first: int = 0) -> Painting:
-    """Return the painted states of an episode from number `first` on, of the best source that works."""
+    Returns:
+        the source; why the environment does not draw them, as a sentence, empty if it does or has no need to;
+        whether it turned out not to draw them, although it could be made again; and the pictures.
+    """
     source, reason = source_of(recording, phase, trust, episode)
     has_failed = False
     if source is PictureSource.REDRAWN:
         redrawn = paint_redrawn(recording, phase, episode, trust, first)
         try:
-            return Painting(source, "", has_failed, _continued(next(redrawn), redrawn))
+            return source, "", has_failed, _continued(next(redrawn), redrawn)
         except CannotRedo as error:
             redrawn.close()
             source = source_of_recorded(recording, phase, episode)
@@ -278,7 +274,7 @@ def paint(recording: Recording, phase: str, episode: int, trust: bool = False, f
             painted = paint_observation(recording, seen)
         case _:
             painted = paint_values(recording, phase, episode, seen)
-    return Painting(source, reason, has_failed, painted)
+    return source, reason, has_failed, painted
 
 
 def _continued(first: Pixels, painted: Painted) -> Painted:

@@ -17,7 +17,6 @@ import numpy as np
 
 from runner.analysis import statistics
 from runner.analysis.compare.moments import (
-    Measured,
     Moment,
     Seed,
     few_seeds,
@@ -195,7 +194,8 @@ def _notes(groups: Sequence[Group], metrics: Sequence[tuple[str, str]], moment: 
 def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> MetricResult:
     notes: list[str] = []
     by_label = {group.label: measured(group, metric, line, moment, groups, notes) for group in groups}
-    present = {label: values for label, values in by_label.items() if values.by_seed}
+    run_ids = {label: ids for label, (by_seed, ids) in by_label.items() if by_seed}
+    present = {label: by_label[label][0] for label in run_ids}
     title, unit = title_of(metric)
     better = higher_is_better(metric, groups)
     if moment.kind == "last":
@@ -204,13 +204,13 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         better = False
         title = f"{title}: first at {moment.level:g}"
         unit = moment.axis.label
-        for label, values in present.items():
-            reached = sum(value < statistics.NEVER for value in values.by_seed.values())
-            notes.append(f"{label}: {reached} of {len(values.by_seed)} seeds reach it")
+        for label, by_seed in present.items():
+            reached = sum(value < statistics.NEVER for value in by_seed.values())
+            notes.append(f"{label}: {reached} of {len(by_seed)} seeds reach it")
     if moment.kind == "last" and (episodes := last_episodes(metric, groups)):
         title = f"{title}, {episodes}"
     sign = -1.0 if better is False else 1.0
-    numbers = {value for values in present.values() for value in values.by_seed.values()}
+    numbers = {value for by_seed in present.values() for value in by_seed.values()}
     finite = sorted(value for value in numbers if abs(value) < statistics.NEVER)
     # Evenly spaced levels from the worst value to the best; few where there are few values.
     levels = np.linspace(finite[0], finite[-1], THRESHOLDS) if len(finite) > 1 else np.array(finite)
@@ -221,24 +221,25 @@ def _metric(groups: Sequence[Group], metric: str, line: str, moment: Moment) -> 
         title=title,
         unit=unit,
         higher_is_better=better,
-        groups=[_group(label, values, thresholds, sign) for label, values in present.items()],
-        pairs=[
-            _pair(a, present[a].by_seed, b, present[b].by_seed, sign)
-            for a, b in itertools.combinations(present, 2)
+        groups=[
+            _group(label, by_seed, run_ids[label], thresholds, sign) for label, by_seed in present.items()
         ],
+        pairs=[_pair(a, present[a], b, present[b], sign) for a, b in itertools.combinations(present, 2)],
         thresholds=thresholds.tolist(),
         notes=notes,
     )
 
 
-def _group(label: str, values: Measured, thresholds: Floats, sign: float) -> GroupResult:
-    numbers = np.array(list(values.by_seed.values()))
+def _group(
+    label: str, by_seed: Mapping[Seed, float], run_ids: list[str], thresholds: Floats, sign: float
+) -> GroupResult:
+    numbers = np.array(list(by_seed.values()))
     reached = sign * numbers >= sign * thresholds[:, np.newaxis]
     shares = statistics.bootstrap_means(reached.astype(np.float64))
     return GroupResult(
         label=label,
-        seeds=list(values.by_seed),
-        run_ids=values.run_ids,
+        seeds=list(by_seed),
+        run_ids=run_ids,
         values=[statistics.bounded(value) for value in numbers.tolist()],
         median=statistics.median(numbers),
         iqm=statistics.interquartile_mean(numbers),

@@ -34,16 +34,6 @@ def higher_is_better(metric: str, groups: Sequence[Group]) -> bool | None:
 
 
 @dataclass(frozen=True)
-class Measured:
-    """The values of one group of runs at a moment."""
-
-    by_seed: dict[Seed, float]
-    """Seed to the mean over its runs, in the order of the seeds."""
-    run_ids: list[str]
-    """The runs with a value, in the order of the seeds."""
-
-
-@dataclass(frozen=True)
 class Moment:
     """A moment, or a way to reduce a curve to one number.
 
@@ -199,8 +189,11 @@ def seed_order(seed: Seed) -> tuple[bool, Seed]:
 
 def measured(
     group: Group, metric: str, line: str, moment: Moment, groups: Sequence[Group], notes: list[str]
-) -> Measured:
-    """Return the value of each seed of a group; `notes` gets the runs that are left out."""
+) -> tuple[dict[Seed, float], list[str]]:
+    """Return the mean value of each seed of a group, and its runs with a value, both by seed, ascending.
+
+    `notes` gets the runs that are left out.
+    """
     runs_of: dict[Seed, list[tuple[str, float]]] = {}
     without: dict[str, list[str]] = {}
     for run in group.runs:
@@ -221,8 +214,7 @@ def measured(
         notes.append(
             f"{group.label}: {len(run_ids)} runs of {len(seeds)} seeds, each seed with the mean of its runs"
         )
-    means = {seed: float(np.mean([value for _, value in runs_of[seed]])) for seed in seeds}
-    return Measured(means, run_ids)
+    return {seed: float(np.mean([value for _, value in runs_of[seed]])) for seed in seeds}, run_ids
 
 
 def value_of(

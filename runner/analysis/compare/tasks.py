@@ -211,7 +211,8 @@ def _values(
     """Yield each environment of a group with the values of its seeds, in the order of the seeds."""
     for task in dict.fromkeys(run.environment for run in group.runs):
         in_task = replace(group, label=f"{group.label} in {task}", runs=tuple(_runs([group], [task])))
-        if by_seed := measured(in_task, *metric, moment, groups, notes).by_seed:
+        by_seed, _ = measured(in_task, *metric, moment, groups, notes)
+        if by_seed:
             yield task, np.array(list(by_seed.values()))
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -39,16 +38,6 @@ from runner.util.humanize import UNKNOWN, capitalised, number
 from runner.util.processes import Tell
 
 
-class ReportedRun(NamedTuple):
-    """A run on the page."""
-
-    article: Section
-    """What it is and achieved, and all about it but its learning curves."""
-    row: dict[str, str]
-    """Its row in the table of runs, by heading."""
-    notes: list[str]
-
-
 def require_packages() -> None:
     """Check that the packages that a report needs are installed."""
     templates()
@@ -68,24 +57,27 @@ def render_report(
     """
     require_packages()
     series: list[RunSeries] = []
-    runs: list[ReportedRun] = []
+    articles: list[Section] = []
+    runs: list[dict[str, str]] = []
+    notes: list[str] = []
     for count, path in enumerate(recordings, 1):
         progress(f"reading run {count} of {len(recordings)}")
         with open_recording(path) as recording:
             series.append(read_series(recording, axis))
-            runs.append(_run(recording, references, progress))
+            article, run = _run(recording, references, progress, notes)
+            articles.append(article)
+            runs.append(run)
     progress("drawing")
     groups = groups_of(series)
     legend = [LegendEntry("", group.described) for group in groups]
     curves = curves_section(groups, style, legend if len(legend) > 1 else [])
-    articles = [run.article for run in runs]
     first, *others = articles[0].parts
     lead = articles[0].sentences
     sections = [first, curves, *others]
     source = "recording"
     if len(runs) > 1:
-        headings = tuple(dict.fromkeys(heading for run in runs for heading in run.row))
-        rows = [tuple(run.row.get(heading, UNKNOWN) for heading in headings) for run in runs]
+        headings = tuple(dict.fromkeys(heading for run in runs for heading in run))
+        rows = [tuple(run.get(heading, UNKNOWN) for heading in headings) for run in runs]
         links = [f"#{article.anchor}-{i}" for i, article in enumerate(articles, 2)]
         summary = Section(
             "Summary", ["The last evaluation of each run."], [Grid(headings, rows, links=links)]
@@ -93,10 +85,9 @@ def render_report(
         lead = []
         sections = [summary, curves, *articles]
         source = "recordings"
-    ids = ", ".join(f"run {run.row['run']}" for run in runs)
-    notes = [note for run in runs for note in run.notes]
+    ids = ", ".join(f"run {run['run']}" for run in runs)
     page = render(
-        _title([run.row for run in runs]),
+        _title(runs),
         lead,
         sections,
         f"the {source} of {ids}. The replay rounds numbers "
@@ -107,12 +98,18 @@ def render_report(
     return page, [*notes, *values_left_out(series)]
 
 
-def _run(recording: Recording, references: Sequence[EpisodeRef], progress: Tell) -> ReportedRun:
+def _run(
+    recording: Recording, references: Sequence[EpisodeRef], progress: Tell, notes: list[str]
+) -> tuple[Section, dict[str, str]]:
+    """Return all about a run but its learning curves, and its row in the table of runs, by heading.
+
+    `notes` gets what is missing from the page.
+    """
     details = describe_recording(run_at(recording.path), recording)
     records = details.evaluations
     episodes = _episodes(recording, references)
     player = _player(recording, episodes, progress)
-    notes = shortcomings(recording)
+    notes += shortcomings(recording)
     if not recording.has_actions:
         notes.append(
             f"No episode of run {recording.run_id} can be replayed, as there are no steps: "
@@ -149,7 +146,7 @@ def _run(recording: Recording, references: Sequence[EpisodeRef], progress: Tell)
         row |= {heading: texts[0] for heading, texts in metric_columns([last], is_narrow=True).items()}
     title = f"{recording.title} ({recording.run_id})"
     lead = " ".join(_lead(recording, last))
-    return ReportedRun(Section(title, [lead], parts=sections, is_article=True), row, notes)
+    return Section(title, [lead], parts=sections, is_article=True), row
 
 
 def _lead(recording: Recording, last: EvaluationRecord | None) -> Iterator[str]:
