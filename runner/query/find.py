@@ -41,6 +41,7 @@ from runner.query.episode_index import (
 )
 from runner.query.sql import MEMORY_MB, Database, QueryFailed
 from runner.query.sql_views import Recordings, SelectedRuns
+from runner.recording import schema
 from runner.recording.marks import Mark, read_marks
 from runner.runs.catalogue.columns import IndexRow
 from runner.runs.catalogue.filters import parse
@@ -51,7 +52,6 @@ from runner.util.processes import Tell
 from runner.util.values import Json, is_whole
 
 LIMIT: Final = 20
-PHASES: Final = ("train", "eval")
 _WORDS: Final = re.compile(r"[\w\s-]+")
 """Words to search for in names and tags, if they are no condition."""
 _OF_CONDITIONS: Final = frozenset({"ret", "length", "not", "and", "or", *ENDS})
@@ -124,7 +124,7 @@ class Found:
 
     @property
     def sentence(self) -> str:
-        """Say how many episodes match."""
+        """How many episodes match, in words."""
         if not self.runs and are_words(self.expression):
             return (
                 f"No run has {self.expression!r} in its id, name, tags or note; a condition on the steps of "
@@ -201,7 +201,7 @@ def find(
     """
     if limit is not None and not is_whole(limit, 1, 2**53):
         raise RunnerError(f"limit: found {limit!r}, expected a whole number from 1, or None for all.")
-    if phase not in (None, *PHASES):
+    if phase not in (None, *schema.PHASES):
         raise RunnerError(f"phase: found {phase!r}, expected train or eval.")
     run_filter = parse(runs)
     condition = expression.strip()

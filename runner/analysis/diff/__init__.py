@@ -1,8 +1,8 @@
 """What differs between two runs: one object, from which text, JSON, Markdown and HTML are rendered.
 
 with open_recording(path_a) as a, open_recording(path_b) as b:
-difference = diff(a, b)
-print(difference.divergence, difference.cause)
+    difference = diff(a, b)
+    print(difference.divergence, difference.cause)
 """
 
 from __future__ import annotations

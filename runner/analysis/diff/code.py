@@ -40,7 +40,7 @@ class FileChange:
 
     @property
     def words(self) -> str:
-        """Return what differs: `14 lines of ppo.py`."""
+        """What differs, in words: `14 lines of ppo.py`."""
         return f"{counted(self.added + self.removed, 'line')} of `{self.path}`"
 
 

@@ -261,24 +261,19 @@ def bars_chart(title: str, rows: list[tuple[str, Estimate]]) -> Chart:
     chart = Chart(x, Scale(len(rows) - 0.5, -0.5, bottom, 24.0), _WIDTH, bottom + 18, title)
     chart.text(5, 14, title, size=9.5, bold=True)
     chart.x_ticks()
+    zero = x.at(0)
     for row, (name, share) in enumerate(rows):
         middle = chart.y.at(row)
-        zero = x.at(0)
         end = x.at(share.value)
         corners = [(zero, middle - 6), (end, middle - 6), (end, middle + 6), (zero, middle + 6)]
         chart.shape(corners, fill=series_colour(0), opacity=0.75 if share.excludes_zero else 0.3)
         if math.isfinite(share.low):
-            chart.shape(
-                [(x.at(share.low), middle), (x.at(share.high), middle)], stroke=palette.INK, width=1.2
-            )
-            for end_of_interval in (x.at(share.low), x.at(share.high)):
-                chart.shape(
-                    [(end_of_interval, middle - 3), (end_of_interval, middle + 3)],
-                    stroke=palette.INK,
-                    width=1.2,
-                )
+            low, high = x.at(share.low), x.at(share.high)
+            serifs = ([(at, middle - 3), (at, middle + 3)] for at in (low, high))
+            for line in ([(low, middle), (high, middle)], *serifs):
+                chart.shape(line, stroke=palette.INK, width=1.2)
         chart.text(_NAMES - 8, middle + 3, _short(name), "end")
-    chart.shape([(x.at(0), 24), (x.at(0), bottom)], stroke=palette.INK)
+    chart.shape([(zero, 24), (zero, bottom)], stroke=palette.INK)
     return chart
 
 
