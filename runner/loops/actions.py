@@ -186,7 +186,7 @@ def _parsed_parts(space: Space, given: object, recorded: Value, where: str) -> o
             key: _parsed(space[key], values[str(key)], recorded[key], (), f"{where}[{key!r}]") for key in keys
         }
     assert isinstance(space, spaces.Tuple)
-    if not isinstance(values, Sequence) or len(values) != len(space.spaces):
+    if isinstance(values, str) or not isinstance(values, Sequence) or len(values) != len(space.spaces):
         raise ConfigError(f"{where}: found {_short(values)}, expected a list of {len(space.spaces)} parts")
     return tuple(
         _parsed(part, values[i], recorded[i], (), f"{where}[{i}]") for i, part in enumerate(space.spaces)

@@ -206,3 +206,9 @@ def test_a_vector_gets_the_seeds_of_numpy_that_it_takes(seed, tmp_path):
         envs.reset(seed=seed)
     with runner.open_recording(envs.run.recording) as recording:
         assert recording.train.resets.array()["seed"].tolist() == [3, 4]
+
+
+def test_a_text_is_no_list_of_actions():
+    space = spaces.Tuple([spaces.Discrete(3), spaces.Discrete(3)])
+    with pytest.raises(ConfigError, match="found '12', expected a list of 2 parts"):
+        parsed_action(space, '"12"', (0, 0), ())
