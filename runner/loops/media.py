@@ -43,6 +43,8 @@ class Picture:
                 f"picture: found {shape[0]:,} frames of {shape[1]:,} x {shape[2]:,} pixels, expected at most "
                 f"{_MAX_PIXELS:,} pixels, and 16,383 a side: take fewer frames, or make them smaller"
             )
+        if not isinstance(self.fps, int | float | np.number) or not self.fps > 0:
+            raise ConfigError(f"picture: found {self.fps!r} frames per second, expected a number above 0")
 
     @property
     def nbytes(self) -> int:

@@ -252,7 +252,7 @@ class Messages:
             if not self._loop.records():
                 return
             pixels = np.array(image)
-            if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3:
+            if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or not pixels.size:
                 raise ConfigError(
                     f"frames: found {pixels.dtype} of shape {list(pixels.shape)} from render(), expected "
                     "uint8 of [height, width, 3]."

@@ -185,7 +185,9 @@ def test_a_second_environment_without_pictures_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "picture", [None, np.ones((4, 4, 3)), np.zeros((4, 4), np.uint8)], ids=["nothing", "floats", "flat"]
+    "picture",
+    [None, np.ones((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((0, 4, 3), np.uint8)],
+    ids=["nothing", "floats", "flat", "empty"],
 )
 def test_a_frame_that_is_not_a_picture_is_refused(tmp_path, monkeypatch, picture):
     monkeypatch.setattr(Rooms, "render", lambda _: picture)

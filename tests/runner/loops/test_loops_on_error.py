@@ -17,6 +17,7 @@ from making import Leaving, dualtaxi
 import runner
 from runner.analysis.contents import shortcomings
 from runner.errors import RunnerError
+from runner.loops.media import Video
 from runner.recording.reader import open_recording
 from runner.runs.run import list_runs
 
@@ -274,6 +275,16 @@ def test_steps_after_the_end_do_not_end_the_loop(tmp_path):
     rec.step(0)
     rec.close()
     with pytest.warns(RuntimeWarning, match="is closed"):
+        assert train(rec) == 40
+    assert only_run(tmp_path).status == "finished"
+
+
+@pytest.mark.parametrize("fps", ["30", float("nan"), -1])
+def test_a_film_that_cannot_be_written_is_left_out(tmp_path, fps):
+    film = np.zeros((2, 3, 8, 8), np.uint8)
+    with runner.record(Odd(until=10**9), tmp_path, on_error="warn") as rec:
+        with pytest.warns(RuntimeWarning, match="a value was left out: picture: found .* frames per second"):
+            rec.log("film", Video(film, fps=fps))
         assert train(rec) == 40
     assert only_run(tmp_path).status == "finished"
 
