@@ -246,12 +246,12 @@ class RecordedParallel(RecordedAlone):
     ) -> GameStepResult:
         """Take a step of all agents, and record it, with values of your own by agent and name."""
         given = as_given(actions)
-        result = self.env.step(actions)
+        result: GameStepResult = self.env.step(actions)
         try:
             observations, rewards, terminated, truncated, infos = result
             with self._loop.lock:
                 if not self._loop.activate(self._rows):
-                    return result  # type: ignore[no-any-return]
+                    return result
                 over = not self.env.agents
                 self._rows.take_game(given, observations, rewards, terminated, truncated, over)
                 if extras is not None:
@@ -262,7 +262,7 @@ class RecordedParallel(RecordedAlone):
                 self._record_frame(is_over=over)
         except Exception as error:
             self._loop.fail(error)
-        return result  # type: ignore[no-any-return]
+        return result
 
     def is_over(self, terminated: object, truncated: object) -> bool:  # noqa: ARG002 - agents may leave
         """Return whether no agent is left."""

@@ -234,7 +234,7 @@ def calls(resets: Iterable[RecordedReset]) -> Iterator[list[RecordedReset]]:
 def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int | None) -> Iterator[Piece]:
     """Yield the pieces of one phase; one ends where steps of the other phase come between its own."""
     table = recording.phase(phase).steps
-    known = environment_count(recording)
+    environments = environment_count(recording)
     resets = resets_of(recording, phase, start_time, None if stop_time is None else stop_time - 1)
     waiting = next(resets, None)
     blocks = aligned(_blocks(recording, phase, start_time, stop_time), recording.environments)
@@ -253,8 +253,9 @@ def _pieces_of(recording: Recording, phase: str, start_time: int, stop_time: int
         yield from _without_steps(phase, early, nothing)
         here = []
         while waiting is not None and waiting.step < first + len(block):
-            is_within = waiting.step > table.round_of(waiting.step).start  # a round
-            if waiting.step < first or is_within or waiting.environment >= known:
+            # Environments step in rounds, and a reset comes before a whole round.
+            is_within_round = waiting.step > table.round_of(waiting.step).start
+            if waiting.step < first or is_within_round or waiting.environment >= environments:
                 raise RecordingError(
                     f"{recording.path}: /{phase}/reset {waiting.number}: out of order, or of no environment."
                 )

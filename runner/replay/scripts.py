@@ -172,9 +172,13 @@ def _only_defines(statement: ast.stmt) -> bool:
 def _is_constant(statement: ast.stmt) -> bool:
     """Return whether a statement assigns a value that nothing can change."""
     value: ast.expr | None = getattr(statement, "value", None)
-    with contextlib.suppress(TypeError, ValueError):
-        return value is not None and bool([hash(ast.literal_eval(value))])
-    return False
+    if value is None:
+        return False
+    try:
+        hash(ast.literal_eval(value))
+    except (TypeError, ValueError):  # it can be changed, or is no literal
+        return False
+    return True
 
 
 def _bound(node: ast.AST) -> set[str]:

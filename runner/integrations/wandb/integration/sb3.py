@@ -76,7 +76,8 @@ class WandbCallback(Recording):
 
     def release(self) -> None:
         """Record no more steps."""
-        self.__exit__(None, None, None)
+        self._stays_open = False
+        self._end()
 
     def record_evaluations(self, envs: VecEnv) -> None:
         """Record the environments of an `EvalCallback`, if the training is recorded."""
