@@ -84,7 +84,7 @@ class Loop:
             self._recorder,
             self._loop_run.outcomes,
             options,
-            options.join.folder if options.join else self.run.folder,
+            (options.join or self.run).folder,
         )
         FLUSHER.add(self)
 

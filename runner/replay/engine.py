@@ -225,8 +225,11 @@ class Rerun:
         n = self._recording.environments
         rows = piece.rows
         first = piece.first
-        resets = [reset for reset in piece.resets if environment in (ALL, reset.environment)]
-        resets = [reset for reset in resets if reset.time <= self._last_step_time]
+        resets = [
+            reset
+            for reset in piece.resets
+            if environment in (ALL, reset.environment) and reset.time <= self._last_step_time
+        ]
         if environment == ALL:
             return rows, [((reset.step - first) // n, reset) for reset in resets]
         index, places = _of_environment(rows, [reset.step - first for reset in resets], environment)
