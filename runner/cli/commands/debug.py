@@ -304,6 +304,7 @@ def explain_command(
       dualtaxi explain tutorial_cooperative tutorial_text_cooperative --at 5000
       dualtaxi explain k3v9m2xq x7b2c4da --metric mean_length --seeds 40
     """
+    from runner.api import interruptible
     from runner.debugging.explain import explain
     from runner.debugging.explanation import sections
 
@@ -316,6 +317,7 @@ def explain_command(
         with (
             contextlib.redirect_stdout(sys.stderr),  # Ray prints messages about workers that died
             total_line() as report,
+            interruptible(second=signal.SIG_DFL) as interrupt,
         ):
             explanation = explain(
                 a,
@@ -328,6 +330,7 @@ def explain_command(
                 recordings=recordings,
                 report=report,
                 planned=planned,
+                stop=interrupt,
                 trust=trust,
             )
     except _Planned as stopped:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import signal
 import subprocess
 import sys
 
@@ -31,6 +32,7 @@ from runner.debugging.explanation import (
 from runner.debugging.mixtures import mix
 from runner.errors import RunnerError
 from runner.runs.run import UNLISTED, label, list_runs
+from runner.sweep import workers
 
 LAKE = {
     "env": {"id": "FrozenLake-v1", "kwargs": {"is_slippery": False}},
@@ -316,6 +318,26 @@ def test_the_command_plans_answers_and_prints_json(tmp_path):
     assert typed("--markdown").stdout.startswith("## a (A) and b (B)")
     assert "nothing to train" in typed("--dry-run").stdout
     assert "expected one that evaluations of both have" in typed("--metric", "nothing", code=2).stderr
+
+
+def test_ctrl_c_while_a_worker_starts_lets_it_start_first(tmp_path, monkeypatch):
+    """Else the worker finds no pipe, and prints a traceback."""
+    (tmp_path / "a.yaml").write_text(json.dumps(LAKE))
+    (tmp_path / "b.yaml").write_text(json.dumps(LAKE | PLANTED))
+    monkeypatch.chdir(tmp_path)
+    started = []
+
+    def start_process(*args, **keywords):
+        signal.raise_signal(signal.SIGINT)
+        started.append(workers_start(*args, **keywords))
+        return started[-1]
+
+    workers_start = workers.start_process
+    monkeypatch.setattr(workers, "start_process", start_process)
+    done = CliRunner().invoke(cli, ["explain", "a.yaml", "b.yaml", "--workers", "1"])
+    assert (done.exit_code, len(started)) == (130, 1)
+    assert "What was trained is kept" in done.stderr
+    assert not started[0].is_alive()
 
 
 def test_a_run_is_explained_by_its_configuration_and_seed(tmp_path):
