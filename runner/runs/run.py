@@ -513,13 +513,13 @@ def run_at(path: Path) -> Run:
 
 
 def run_in(folder: Path) -> Run | None:
-    """Return the run in a folder, from its recording when `run.json` is gone; None if there is none."""
+    """Return the run in a folder, from its recording when `run.json` is gone; None if none can be read."""
     with contextlib.suppress(OSError, ValueError):
         facts = read_object(folder / RUN_FILE, MAX_RUN_FILE_BYTES)
         if _is_run(facts):
             return Run(folder, facts)
-    if (folder / RECORDING_FILE).is_file():
-        with contextlib.suppress(RecordingError):
+    with contextlib.suppress(PermissionError, RecordingError):
+        if (folder / RECORDING_FILE).is_file():
             return _from_recording(folder / RECORDING_FILE)
     return None
 

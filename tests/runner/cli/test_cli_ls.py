@@ -1,7 +1,9 @@
 """`dualtaxi ls`."""
 
+import errno
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -73,6 +75,22 @@ def test_a_folder_whose_files_cannot_be_read_is_named(command, tiny):
         done = command("ls", *form)
         assert done.exit_code == 0
         assert f"{run.folder}: neither run.json nor recording.mcap can be read as a run." in done.stderr
+
+
+def test_a_run_in_a_folder_without_rights_is_not_found(command, tiny, monkeypatch):
+    run = create_run(command.recordings, experiment_of(tiny), 3)
+    (run.folder / RUN_FILE).unlink()
+    stat = Path.stat
+
+    def refused(path, **keywords):
+        if path == run.recording:
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return stat(path, **keywords)
+
+    monkeypatch.setattr(Path, "stat", refused)  # root may read every folder
+    done = command("show", run.run_id)
+    assert done.exit_code == 2
+    assert f"no run '{run.run_id}'" in done.stderr
 
 
 def test_values_of_the_wrong_kind_make_a_damaged_run(command, tiny):
