@@ -45,9 +45,10 @@ def bind(settings: ServiceSettings) -> socket.socket:
     try:
         return socket.create_server((settings.host, settings.port), family=family, backlog=BACKLOG)
     except OSError as error:
+        reason = str(error.strerror).partition(" (while ")[0]  # Python repeats the address
         raise RunnerError(
-            f"{settings.host}:{settings.port}: cannot listen there ({error.strerror}); choose another by "
-            "--port (0 for any free one) or --host."
+            f"{settings.host}:{settings.port}: cannot listen there ({reason}); choose another by --port (0 "
+            "for any free one) or --host."
         ) from error
 
 

@@ -218,6 +218,6 @@ def test_a_used_port_and_a_served_folder_are_reported(recordings):
             for where, folder in ((port, elsewhere), ("0", recordings))
         )
     assert (taken.exit_code, twice.exit_code) == (2, 2)
-    assert "cannot listen there" in taken.stderr
+    assert f"127.0.0.1:{port}: cannot listen there (Address already in use); choose" in taken.stderr
     assert "served by another process" in twice.stderr
     assert "Traceback" not in taken.stderr + twice.stderr
