@@ -175,7 +175,7 @@ class QueryResult:
             yield from map(list, zip(*columns, strict=True))
 
     def write_parquet(self, file: Path | BinaryIO) -> int:
-        """Write the rows into a file of Parquet; return their number."""
+        """Write the rows into a Parquet file; return their number."""
         count = 0
         with pq.ParquetWriter(file, self.columns, compression="zstd") as writer:
             for batch in self.batches():

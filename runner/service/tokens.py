@@ -174,10 +174,8 @@ class Tokens:
         """
         matching = [token for token in self.all() if name in (token.id, token.name)]
         if len(matching) != 1:
-            names = ", ".join(f"{token.id} ({token.name})" for token in self.all()) or "none"
-            raise RunnerError(
-                f"token: found {len(matching)} named {name!r}, expected one; there are: {names}."
-            )
+            found = "several tokens have" if matching else "no token has"
+            raise RunnerError(f"{found} the id or name {name!r}. `dualtaxi token ls` lists them.")
         self._file.change(lambda tokens: [token for token in tokens if token.id != matching[0].id])
         return matching[0]
 

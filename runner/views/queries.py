@@ -115,7 +115,7 @@ def find(
     def say_how_many() -> None:
         progress.say(result.sentence)
         if len(result.hits) < result.count:
-            progress.say(f"Shown are the first {len(result.hits):,}; --limit 0 shows all.")
+            progress.say(f"Showing the first {len(result.hits):,}; --limit 0 shows all.")
         if marked is not None:
             had = sum(bool(hit.replay) for hit in result.hits) - marked
             progress.say(f"Marked {counted(marked, 'episode')}; {had:,} had this mark.")
@@ -173,7 +173,7 @@ class Rows(Answer):
         rows = [tuple(map(cell_of, row)) for row in islice(self._result.rows(), MAX_ROWS + 1)]
         yield Section("", grids=[Grid(tuple(self._result.columns.names), rows[:MAX_ROWS])])
         if len(rows) > MAX_ROWS:
-            self._say(f"Shown are the first {MAX_ROWS:,} rows; --csv and --json print all.")
+            self._say(f"Showing the first {MAX_ROWS:,} rows; --csv and --json print all.")
 
     def write(self, stream: BinaryIO) -> None:
         """Write the rows as Parquet."""
@@ -195,7 +195,7 @@ def sql(
     runs: str = ONLY_HERE,
     timeout: int = view_input(
         "timeout",
-        f"Limit of time.  [default: {_SECONDS}]",
+        f"Time limit.  [default: {_SECONDS}]",
         kind=int,
         default=_SECONDS,
         minimum=1,
@@ -203,7 +203,7 @@ def sql(
     ),
     memory: int = view_input(
         "memory",
-        f"Limit of memory.  [default: {_MEGABYTES}]",
+        f"Memory limit.  [default: {_MEGABYTES}]",
         kind=int,
         default=_MEGABYTES,
         minimum=1,
@@ -220,7 +220,7 @@ def sql(
       evaluations  a row for each evaluation: mean_return, success_percent, mean_length, ...
       episodes     a row for each episode that ended: phase, episode, length, return, n_EVENT, ...
       steps        a row for each step: phase, step, episode, t, state, action, reward, observation_0, ...
-      extras       a row for each step with values of a loop's own: phase, step, extra_NAME
+      extras       a row for each step with values that a loop recorded: phase, step, extra_NAME
       scalars      a row for each value that a loop logged: phase, step, episode, name, value
       marks        a row for each mark: ref, phase, episode, t, text, tags
 
@@ -257,5 +257,5 @@ SQL: Final = View(
     forms=("csv", "json", "markdown"),
     file_ending=".parquet",
     file_flags=("--parquet",),
-    file_help="Write a file of Parquet.",
+    file_help="Write a Parquet file.",
 )

@@ -433,5 +433,5 @@ CODE: Final = View(
     code,
     has_default=True,
     file_ending=".patch",
-    file_help="Write a patch for `git apply` that makes this code of the commit.",
+    file_help="Write a patch for `git apply` that turns the commit into this code.",
 )

@@ -174,7 +174,7 @@ class Listing(Answer):
         if self._listed < self._total:
             end = self._offset + self._listed
             more_runs = f", --offset {end} the next" if self._listed > 0 and end < self._total else ""
-            yield f"Shown are {self._listed:,} of {self._total:,} runs; --limit 0 shows all{more_runs}."
+            yield f"Showing {self._listed:,} of {self._total:,} runs; --limit 0 shows all{more_runs}."
         elif not self._listed and self._filter.condition is not None:
             yield f"No run in {folders} matches."
         elif not self._listed and not self._problems:

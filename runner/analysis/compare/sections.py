@@ -129,7 +129,7 @@ def unpaired(pairs: Sequence[PairResult]) -> list[str]:
                     f"{against} {listed(run_ids)} of {label}: only runs with a seed can be paired"
                 )
             if numbers := [str(seed) for seed in seeds if not isinstance(seed, str)]:
-                sentences.append(f"{against} seed {listed(numbers)}, which {label} has and {other} has not")
+                sentences.append(f"{against} seed {listed(numbers)}, which {label} has and {other} lacks")
     return sentences
 
 

@@ -293,8 +293,8 @@ def explain_command(
 
     A and B are runs, or configurations: files, or names of shipped ones. The same seeds and draws are
     trained with the settings of A and of B mixed: all mixtures of up to 8 settings; of up to 12, those that
-    delta debugging needs. Shown are the share of each setting, which settings need each other, the smallest
-    set that makes the difference, and the first step that the strongest setting changed.
+    delta debugging needs. The answer is the share of each setting, which settings need each other, the
+    smallest set that makes the difference, and the first step that the strongest setting changed.
 
     Two short runs are recorded, to show the first step that differs. All results are kept: after an
     interruption the same command continues, and with more --seeds it trains only the new ones.

@@ -176,17 +176,17 @@ def film_command(
         "--width",
         type=Number(160, 4096),
         metavar="PIXELS",
-        help="Width of the film.  [default: about that of the pictures]",
+        help="Width of the film.  [default: about the pictures' width]",
     ),
     trust: bool = trust_option,
     to: Writing = writing_options("exports/NAME-RUN.mp4"),
 ) -> Reply:
     """Make a film of a recorded episode of RUN; the ending of the file chooses the format.
 
-    Each frame has step, action, rewards and events written below it. What it shows is the best that there
-    is: the scene of a tabular environment; recorded frames; pictures that the environment draws when it is
-    made again and repeats the recorded actions, compared with the recording as it goes; observations that
-    are images; or else the observation's numbers as bars.
+    Each frame has step, action, rewards and events written below it. The picture is the first of these
+    that the run has: the scene of a tabular environment; recorded frames; pictures that the environment draws
+    when it is made again and repeats the recorded actions, compared with the recording as it goes;
+    observations that are images; or else the observation's numbers as bars.
 
     By default it is the typical trial of the last evaluation: the median by success, return and length; of
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
@@ -288,9 +288,9 @@ def parquet(
 ) -> Reply:
     """Export RUN as Parquet: steps.parquet, episodes.parquet and metrics.parquet in a folder.
 
-    Columns are named as the recording's fields; each agent's action and reward has its own. For a loop there
-    are resets.parquet, reset_options.parquet and infos.parquet too, and each number of an observation or
-    action has a column; an array of more than 64 is one column of bytes.
+    Columns are named like the recording's fields; each agent's action and reward has its own. For a loop
+    there are resets.parquet, reset_options.parquet and infos.parquet too, and each number of an observation
+    or action has a column; an array of more than 64 is one column of bytes.
 
     Examples:
       dualtaxi export parquet @latest
@@ -309,7 +309,7 @@ def csv(
 ) -> Reply:
     """Export RUN as CSV: steps.csv, episodes.csv and metrics.csv in a folder.
 
-    Columns are named as the recording's fields; each agent's action and reward has its own. metrics.csv has
+    Columns are named like the recording's fields; each agent's action and reward has its own. metrics.csv has
     a row for each value of a metric. A loop has resets.csv, reset_options.csv and infos.csv too,
     and a column for each number of an observation or action. Numbers are written with all their digits.
 

@@ -73,8 +73,8 @@ def play_command(
     your own loop the first trial of its last evaluation; of a run without evaluations the last training
     episode. --best and --worst choose among the trials of all evaluations, or else the training episodes. The
     space bar pauses, the arrow keys (or b and n) step back and forward, r restarts, and q quits; the last
-    step stays until a key is pressed. Where stdout is no terminal, the frames come one after another, without
-    waiting. --json prints one line for each step.
+    step stays until a key is pressed. Where stdout is not a terminal, the frames come one after another,
+    without waiting. --json prints one line for each step.
 
     `dualtaxi export film` writes the pictures of an episode.
 

@@ -109,7 +109,7 @@ def rerecord_command(run: Run = found_run, trust: bool = trust_option) -> Reply:
         with job_progress("", run.episodes_to_do or 0) as (report, interrupt):
             run = rerecord(run, report, interrupt, trust=trust)
     if had_steps:
-        note = f"Run {run.run_id} leaves no steps out; there is nothing to do."
+        note = f"Run {run.run_id} has all its steps already; there is nothing to do."
         return Reply(run_as_json(run), notes=[note])
     proof = "the content digest is the one that the run had"
     return run_reply(run, {"proof": proof, "next": command_for(run, "play")})

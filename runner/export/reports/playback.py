@@ -223,7 +223,7 @@ def titled(playback: Playback, names: Sequence[str]) -> Playback:
     names_text = " and ".join(names)
     title = playback.title
     length = len(playback.reward)
-    part = "" if length == playback.length else f" Shown are the first {length:,} steps."
+    part = "" if length == playback.length else f" The first {length:,} steps are shown."
     return replace(
         playback,
         title=f"{capitalised(names_text)}: {title[0].lower()}{title[1:]}",

@@ -114,7 +114,7 @@ def test_filters_sorting_columns_and_paging(command, make):
     assert command("ls", "-q", "--sort", "-age").stdout.split() == by_size
     result = command("ls", "-q", "--limit", 2, "--offset", 1)
     assert result.stdout.split() == [run.run_id for run in runs[1:3]]
-    assert "Shown are 2 of 5 runs" in result.stderr
+    assert "Showing 2 of 5 runs" in result.stderr
     assert "--offset 3" in result.stderr
     assert command("ls", "-q", 'age > "2.5d"').stdout.split() == [run.run_id for run in runs[3:]]
     values = command.json("ls", "--columns", "id,config.episodes,bytes", "--limit", 1)["runs"]

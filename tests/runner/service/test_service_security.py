@@ -358,7 +358,7 @@ def test_the_command_creates_lists_and_revokes_tokens(monkeypatch, tmp_path):
     assert secret not in token_command("ls").stdout
     refused = token_command("revoke", "nobody")
     assert refused.exit_code == 2
-    assert "found 0 named 'nobody', expected one; there are: " in refused.stderr
+    assert "no token has the id or name 'nobody'. `dualtaxi token ls` lists them." in refused.stderr
     assert token_command("revoke", "laptop").exit_code == 0
     with pytest.raises(Unauthorized, match="was revoked"):
         kept.find(secret)
