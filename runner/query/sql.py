@@ -108,7 +108,9 @@ class Database:
         return rows
 
     def close(self) -> None:
-        """End the query."""
+        """End the query; ending it again does nothing."""
+        if self._runs.is_stopped:
+            return
         self._runs.is_stopped = True
         last = self._thread.submit(bool)  # comes after what the thread does now
         while not last.done():  # DuckDB forgets an interrupt that comes between two calls
@@ -156,8 +158,10 @@ class QueryResult:
         """Yield the rows, thousands at a time.
 
         Raises:
-            RunnerError: the query fails, or exceeds its time or memory.
+            RunnerError: the query fails, exceeds its time or memory, or has ended.
         """
+        if self._runs.is_stopped:
+            raise RunnerError("sql: found no rows, as the query has ended; rows are read once, so ask again.")
         with contextlib.closing(self):
             batch, self._first = self._first, None
             while batch is not None:

@@ -25,7 +25,7 @@ from runner.analysis.series import RunSeries, read_series, values_left_out
 from runner.analysis.summary import describe_recording, random_policy_sentence
 from runner.drawing import svg
 from runner.environments.naming import spoken
-from runner.errors import RecordingError
+from runner.errors import RecordingError, RunnerError
 from runner.export.pictures import Thumbnails, picture_note, thumbnails
 from runner.export.plots.curves import PLAIN, CurveStyle, curves_section
 from runner.export.reports.maps import learned_section, start_of
@@ -54,7 +54,13 @@ def render_report(
 
     The chosen episodes are shown in addition to those that are always shown; `progress` is called with the
     next stage of the work; axis and style are those of the plots.
+
+    Raises:
+        RecordingError: a recording cannot be read, or does not have the axis or an episode.
+        RunnerError: there is no recording.
     """
+    if not recordings:
+        raise RunnerError("report: found no runs, expected at least one.")
     require_packages()
     series: list[RunSeries] = []
     articles: list[Section] = []

@@ -19,6 +19,7 @@ from runner.analysis.episodes import last_whole_evaluation, ranked
 from runner.cli import cli
 from runner.drawing.svg import SvgDrawing, trail_points, transform
 from runner.environments.naming import agent_actions_in_words, states_in_words
+from runner.errors import RunnerError
 from runner.export.reports.report import render_report
 from runner.integrations.tensorboard import SummaryWriter
 from runner.recording.reader import open_recording
@@ -279,3 +280,8 @@ def test_a_run_of_values_alone_is_introduced_as_such(tmp_path):
     page, _ = render_report([writer.run.recording])
     assert "Logged values, recorded by" in page
     assert "over <b>none" not in page
+
+
+def test_a_report_needs_a_run():
+    with pytest.raises(RunnerError, match="found no runs"):
+        render_report([])

@@ -192,6 +192,14 @@ def test_small_views(folder):
     assert row == {"mark": mark.id, "ref": "3:1", "episode": 3, "t": 1, "text": mark.text, "tags": ["x"]}
 
 
+def test_rows_that_were_read_are_not_read_again(folder):
+    result = runner.sql("SELECT run FROM runs", recordings=folder)
+    with contextlib.closing(result):
+        assert result.arrow().num_rows
+        with pytest.raises(RunnerError, match="rows are read once"):
+            result.arrow()
+
+
 def test_forms_of_a_result(folder, tmp_path):
     query = "SELECT run, count(*) AS n, sum(length) AS steps FROM episodes GROUP BY run ORDER BY run"
     table = runner.sql(query, recordings=folder).arrow()
