@@ -195,16 +195,17 @@ def _selected(
     batches: Iterator[pa.RecordBatch], phase: str | None, numbers: Ints | None, keys: list[int] | None
 ) -> Iterator[pa.RecordBatch]:
     """Yield the rows of a phase and of the episodes of these numbers and `keys`, see `_keys_of`."""
+    in_phase, in_environment = (None if ids is None else pa.array(ids, pa.int64()) for ids in (numbers, keys))
     for batch in batches:
         rows = batch if phase is None else batch.filter(pc.equal(batch["phase"], phase))
         names = set(rows.schema.names)
-        if numbers is not None and "episode" in names:
-            selected, episode = numbers.tolist(), rows["episode"].cast(pa.int64())
+        if in_phase is not None and "episode" in names:
+            selected, episode = in_phase, rows["episode"].cast(pa.int64())
             # The row of an ended episode, with its length, has its number in the phase.
-            if keys is not None and "environment" in names and "length" not in names:
+            if in_environment is not None and "environment" in names and "length" not in names:
                 environment = pc.shift_left(rows["environment"].cast(pa.int64()), _ENVIRONMENT_BITS)
-                selected, episode = keys, pc.bit_wise_or(environment, episode)
-            is_selected = pc.is_in(episode, pa.array(selected, pa.int64()))
+                selected, episode = in_environment, pc.bit_wise_or(environment, episode)
+            is_selected = pc.is_in(episode, selected)
             rows = rows.filter(pc.and_(is_selected, rows["taken"]) if "taken" in names else is_selected)
         if rows.num_rows:
             yield rows
