@@ -141,8 +141,8 @@ def _parsed(space: Space, given: object, recorded: Value, names: Sequence[str], 
     try:
         values = given.split(",") if isinstance(given, str) else given
         array = np.asarray(values, np.asarray(recorded).dtype).reshape(np.shape(recorded))
-        has_fractions = values is given and (array != np.asarray(given).reshape(array.shape)).any()
-        if array.dtype.kind != "f" and has_fractions:
+        numbers = np.asarray(values).reshape(array.shape)
+        if array.dtype.kind != "f" and numbers.dtype.kind == "f" and (array != numbers).any():
             raise ValueError("fractions would be cut off")
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(f"{where}: found {_short(given)}, expected {space_in_words(space)}") from error

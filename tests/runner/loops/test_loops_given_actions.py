@@ -189,6 +189,7 @@ def test_an_end_in_a_step_that_only_resets_is_recorded_and_not_counted(tmp_path)
     ("space", "fraction", "whole"),
     [
         (spaces.MultiDiscrete([3, 3]), [1.5, 0], [1.0, 0]),
+        (spaces.MultiDiscrete([3, 3]), ["1.5", "0"], ["1", "0"]),
         (spaces.MultiBinary(2), np.array([0.9, 1]), (True, False)),
         (spaces.Tuple([spaces.MultiDiscrete([3, 3])]), "[[1.5, 0]]", "[[1, 0]]"),
     ],
