@@ -101,7 +101,12 @@ def repair(path: Path, report: Report = lambda *_: None, stated: Summary | None 
             while (free := path.with_name(f"{path.stem}.damaged-{number}{path.suffix}")).exists():
                 number += 1
             done.original = path.rename(free)
-        fresh.replace(path)
+        try:
+            fresh.replace(path)
+        except OSError:
+            if done.original is not None:
+                done.original.rename(path)
+            raise
     except OSError as error:
         raise StorageError(f"{fresh}: cannot be written ({error.strerror}); {path} is as it was.") from error
     finally:

@@ -16,7 +16,7 @@ import pytest
 import zstandard
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from runner.errors import RecordingError, RunnerError
+from runner.errors import RecordingError, RunnerError, StorageError
 from runner.execution.verify import verify
 from runner.recording import schema
 from runner.recording.description import recorded_facts
@@ -408,3 +408,21 @@ def test_an_array_of_an_impossible_shape_is_refused(shape):
 def test_options_that_cannot_be_restored_are_refused(options):
     with pytest.raises(RecordingError, match="options of a reset"):
         decode_reset_options(encode(schema.RESET_OPTIONS, {"json": json.dumps(options), "resets": 1}))
+
+
+def test_a_repair_that_cannot_replace_the_file_leaves_it_where_it_was(lake, tmp_path, monkeypatch):
+    path = tmp_path / "recording.mcap"
+    data = bytearray(lake.recording.read_bytes())
+    chunks = [(start, end) for opcode, start, end in records_of(bytes(data)) if opcode == CHUNK]
+    start, end = chunks[len(chunks) // 2]
+    data[start + 20 : end] = bytes(end - start - 20)
+    path.write_bytes(data)
+
+    def fail(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with pytest.raises(StorageError, match="is as it was"):
+        repair(path)
+    assert path.read_bytes() == data
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
