@@ -33,6 +33,7 @@ from runner.recording.records import ReadChunk, check_constants
 from runner.recording.schema import MessageType
 from runner.recording.spaces import Description, encode_bytes, encode_text, leaf_dtype, leaves_of, row_dtype
 from runner.recording.spaces import decode as decode_value
+from runner.recording.steps import EpisodeSteps
 from runner.recording.topic_chunks import FOREVER, TopicChunks
 from runner.recording.writer import RecordingFile
 from runner.util.arrays import Array, DType, Ints, MaskedArray, Records, zeros
@@ -223,17 +224,17 @@ class Extras(Mapping[str, DType]):
 
     Args:
         parts: each layout, and the chunks of the phase that have it.
-        steps_of: returns the numbers of an episode's steps.
+        episode: returns the steps of an episode.
     """
 
     def __init__(
         self,
         parts: Sequence[tuple[ExtraLayout, TopicChunks]],
-        steps_of: Callable[[int], Ints],
+        episode: Callable[[int], EpisodeSteps],
         where: str,
     ) -> None:
         self.parts = parts
-        self._steps_of = steps_of
+        self._episode = episode
         self._where = where
         self._values = parts[-1][0].values if parts else np.dtype([])
         self.columns: Mapping[str, Description] = parts[-1][0].columns if parts else {}
@@ -295,7 +296,9 @@ class Extras(Mapping[str, DType]):
         Raises:
             RecordingError: there is no such episode, or it is too long for an array.
         """
-        return self.at(self._steps_of(episode))
+        steps = self._episode(episode)
+        self._check_size(len(steps) * self._values.itemsize, len(steps))  # before numbers take as much
+        return self.at(steps.numbers())
 
     def at(self, steps: Ints) -> dict[str, MaskedArray]:
         """Return the extras of steps, given by their numbers, ascending; as `of_episode`.
@@ -304,7 +307,7 @@ class Extras(Mapping[str, DType]):
             RecordingError: they cannot be read, or take more than 134 MB.
         """
         n = len(steps)
-        size = len(steps) * self._values.itemsize
+        size = n * self._values.itemsize
         self._check_size(size, n)
         values = {name: zeros((n,), dtype) for name, dtype in self.items()}
         given = {name: np.zeros(n, np.bool_) for name in self}

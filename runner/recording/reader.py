@@ -417,7 +417,7 @@ class Phase:
             places = table.places[channels == channel]
             chunks = TopicChunks(table.file, schema.TOPIC_OF[channel], places, layout.message)
             parts.append((layout, chunks))
-        return Extras(parts, lambda episode: self.episode(episode).numbers(), where)
+        return Extras(parts, self.episode, where)
 
     @property
     def has_metrics(self) -> bool:

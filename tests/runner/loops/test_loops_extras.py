@@ -25,9 +25,10 @@ from runner.recording import schema
 from runner.recording.extras import ExtraNames
 from runner.recording.layout import message_record
 from runner.recording.messages import encode
-from runner.recording.reader import open_recording
+from runner.recording.reader import Phase, open_recording
 from runner.recording.records import ReadChunk, encode_chunk
 from runner.recording.rewriting import whole_records
+from runner.recording.steps import EpisodeSteps
 from runner.recording.writer import RecordingFile
 from runner.util.packing import Packing
 from tests.runner.loops.making import Leaving, dualtaxi, make, play
@@ -347,3 +348,15 @@ def forge(source: Path, path: Path, payload: bytes) -> None:
             else:
                 file.copy(record)
         file.finish()
+
+
+def test_an_episode_too_long_for_arrays_is_refused_before_its_steps_are_numbered(tmp_path, monkeypatch):
+    record_pole(tmp_path, steps=50)
+
+    def endless(phase, _):
+        return EpisodeSteps(phase.steps, 0, 10**12 - 1, 10**12)
+
+    monkeypatch.setattr(Phase, "episode", endless)
+    (path,) = tmp_path.glob("*/recording.mcap")
+    with open_recording(path) as recording, pytest.raises(RecordingError, match="read them in blocks"):
+        recording.train.extras.of_episode(0)
