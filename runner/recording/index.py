@@ -209,19 +209,19 @@ class Index:
                 self.chunks.set_channel(int.from_bytes(raw.body[:2], "little"))
             case Opcode.CHUNK_INDEX:
                 entry = _chunk_entry(raw)
-                self._place("chunk", entry)
+                self._place_in_data("chunk", entry)
                 self.chunks.append(entry)
             case Opcode.METADATA:
                 self.add_metadata(_text(raw, 0)[0], raw.place)
             case Opcode.METADATA_INDEX:
                 metadata = _parse(MetadataIndex, raw)
-                self.add_metadata(metadata.name, self._place("metadata", metadata))
+                self.add_metadata(metadata.name, self._place_in_data("metadata", metadata))
             case Opcode.ATTACHMENT:
                 name, at = _text(raw, 16)
                 self.add_attachment(name, raw.place, _text(raw, at)[0])
             case Opcode.ATTACHMENT_INDEX:
                 attachment = _parse(AttachmentIndex, raw)
-                place = self._place("attachment", attachment)
+                place = self._place_in_data("attachment", attachment)
                 self.add_attachment(attachment.name, place, attachment.media_type)
             case Opcode.SCHEMA:
                 schema = _parse(Schema, raw)
@@ -245,7 +245,7 @@ class Index:
         _add_once(self.attachments, name, place, "attachment")
         self.media_types[name] = media_type
 
-    def _place(self, what: str, entry: ChunkEntry | MetadataIndex | AttachmentIndex) -> Place:
+    def _place_in_data(self, what: str, entry: ChunkEntry | MetadataIndex | AttachmentIndex) -> Place:
         """Return the place that an entry of the index states, within the data."""
         offset, length = entry.offset, entry.length
         if offset < len(MAGIC) or length < RECORD_HEAD.size or offset + length > self.end:
@@ -294,7 +294,7 @@ class Index:
             raise RecordingError(f"found {end - start} stray bytes at {start}, expected a record")
         return True
 
-    def declare(self, beginning: Beginning) -> None:
+    def add_beginning(self, beginning: Beginning) -> None:
         """Add schemas and channels that are written."""
         self.schemas |= {schema.id: schema for schema in beginning.schemas}
         self.channels |= {channel.id: channel for channel in beginning.channels}

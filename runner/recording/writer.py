@@ -83,7 +83,7 @@ class RecordingFile:
     def begin(self, beginning: Beginning) -> None:
         """Append schemas and channels; the schemas and channels of the run come first."""
         self._append(beginning.schema_records + beginning.channel_records)
-        self._index.declare(beginning)
+        self._index.add_beginning(beginning)
 
     def declare(self, beginning: Beginning) -> None:
         """State schemas and channels; they are written before the first chunk of one of the channels."""
