@@ -62,7 +62,9 @@ class ResponseCache:
             self.keep(key, done.result())
 
     def keep(self, key: Hashable, body: bytes) -> None:
-        """Keep the response of a key."""
+        """Keep the response of a key; one that is larger than the cache would only drop all others."""
+        if len(body) > self._max_bytes:
+            return
         self._bytes += len(body) - len(self._responses.pop(key, b""))
         self._responses[key] = body
         while self._bytes > self._max_bytes:

@@ -216,3 +216,12 @@ def test_a_response_is_made_until_nobody_waits_for_it():
         assert await cache.get_or_await("key", quickly) == b"made"
 
     asyncio.run(abandon())
+
+
+def test_a_response_that_is_larger_than_the_cache_drops_no_others():
+    cache = ResponseCache(10)
+    cache.keep("small", b"1234")
+    cache.keep("large", b"12345678901")
+    assert (cache.get("small"), cache.get("large")) == (b"1234", None)
+    cache.keep("other", b"1234567")
+    assert (cache.get("small"), cache.get("other")) == (None, b"1234567")
