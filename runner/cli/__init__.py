@@ -195,20 +195,15 @@ def _system_error(error: Exception) -> RunnerError | None:
     return found
 
 
-class ViewGroup(CommandGroup):
-    """A group of which some commands are views."""
+def view_command(name: str) -> click.Command:
+    """Return the command of a view."""
+    from runner.cli.views import command_of
+    from runner.views import view_named
 
-    plugins = VIEWS
-
-    def plugin(self, name: str) -> click.Command:
-        """Return the command of a view."""
-        from runner.cli.views import command_of
-        from runner.views import view_named
-
-        return command_of(view_named(f"{self.prefix}{name}"))
+    return command_of(view_named(name))
 
 
-class LazyGroup(ViewGroup):
+class LazyGroup(CommandGroup):
     """The commands of `COMMANDS`, each imported when it is invoked."""
 
     def shipped(self) -> list[str]:
@@ -221,7 +216,7 @@ class LazyGroup(ViewGroup):
         if cmd_name not in modules:
             return super().get_command(ctx, cmd_name)
         if modules[cmd_name] == _VIEW:
-            return self.plugin(cmd_name)
+            return view_command(cmd_name)
         module = importlib.import_module(f"runner.cli.commands.{modules[cmd_name]}")
         command: click.Command = getattr(module, f"{cmd_name}_command")
         return command
@@ -272,6 +267,8 @@ class LazyGroup(ViewGroup):
 
 @click.group(
     cls=LazyGroup,
+    plugins=VIEWS,
+    plugin=view_command,
     epilog=_EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )

@@ -12,7 +12,8 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, Final
+from types import MappingProxyType
+from typing import Any, Final
 
 import click
 
@@ -133,18 +134,29 @@ class Command(click.Command):
 
 
 class CommandGroup(click.Group):
-    """A group of such commands, which suggests the nearest name for an unknown one."""
+    """A group of such commands, which suggests the nearest name for an unknown one.
+
+    Args:
+        plugins: the entry points by which installed packages add commands; empty for none.
+        plugin: imports a command that is not defined here: of a view, or of another package.
+        views: short help of the group's views, by the name of the command.
+        prefix: prefix of the names of views in this group: `sweep ` for the view `sweep show`.
+    """
 
     command_class = Command
-    plugins = ""
-    """The entry points by which installed packages add commands; empty for none."""
-    prefix = ""
-    """Prefix of the names of views in this group: `sweep ` for the view `sweep show`."""
-    views: ClassVar[Mapping[str, str]] = {}
-    """Short help of the group's views, by the name of the command."""
 
-    def __init__(self, name: str | None, **attributes: Any) -> None:
+    def __init__(
+        self,
+        name: str | None,
+        *,
+        plugins: str = "",
+        plugin: Callable[[str], click.Command] | None = None,
+        views: Mapping[str, str] = MappingProxyType({}),
+        prefix: str = "",
+        **attributes: Any,
+    ) -> None:
         super().__init__(name, **attributes)
+        self.plugins, self.plugin, self.views, self.prefix = plugins, plugin, views, prefix
         self.help = _with_examples(self.help)
 
     def shipped(self) -> list[str]:
@@ -162,18 +174,15 @@ class CommandGroup(click.Group):
             and name not in self.shipped()
         }
 
-    def plugin(self, name: str) -> click.Command:
-        """Import a command that is not defined here: of a view, or of another package."""
-        raise NotImplementedError
-
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """Return the names, those that other packages add last."""
         return [*self.shipped(), *self.installed()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command."""
-        if (command := super().get_command(ctx, cmd_name)) is None and cmd_name in self.list_commands(ctx):
-            return self.plugin(cmd_name)
+        command = super().get_command(ctx, cmd_name)
+        if command is None and self.plugin is not None and cmd_name in self.list_commands(ctx):
+            return self.plugin(f"{self.prefix}{cmd_name}")
         return command
 
     def resolve_command(

@@ -40,32 +40,27 @@ if TYPE_CHECKING:
     from runner.recording.reader import Recording
 
 
-class ExportGroup(CommandGroup):
-    """The exports, with those that installed packages add."""
+def _installed_command(name: str) -> Command:
+    """Return the command of an export that an installed package adds."""
+    added = installed_export(name)
 
-    plugins = EXPORTS
+    def call(run: Run, to: Writing) -> Reply:
+        from runner.recording.reader import open_recording
 
-    def plugin(self, name: str) -> Command:
-        """Return the command of an export that an installed package adds."""
-        added = installed_export(name)
+        path = to.path(run)
+        with (
+            new_file(path, to.force) as temporary,
+            open_recording(run.recording) as recording,
+            stage_line(f"exporting {run.run_id}"),
+        ):
+            added.write(recording, temporary)
+        return written(path_and_size(path), path)
 
-        def call(run: Run, to: Writing) -> Reply:
-            from runner.recording.reader import open_recording
-
-            path = to.path(run)
-            with (
-                new_file(path, to.force) as temporary,
-                open_recording(run.recording) as recording,
-                stage_line(f"exporting {run.run_id}"),
-            ):
-                added.write(recording, temporary)
-            return written(path_and_size(path), path)
-
-        to = writing_options(f"NAME-RUN{added.ending}", f"FILE{added.ending}")
-        return Command(name, call, {"run": recorded_run, "to": to}, help=added.help)
+    to = writing_options(f"NAME-RUN{added.ending}", f"FILE{added.ending}")
+    return Command(name, call, {"run": recorded_run, "to": to}, help=added.help)
 
 
-@click.group("export", cls=ExportGroup)
+@click.group("export", cls=CommandGroup, plugins=EXPORTS, plugin=_installed_command)
 def export_command() -> None:
     """Export a run for other programs.
 

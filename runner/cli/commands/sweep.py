@@ -8,12 +8,12 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import click
 
-from runner.cli import ViewGroup
-from runner.cli.command import argument, option
+from runner.cli import view_command
+from runner.cli.command import CommandGroup, argument, option
 from runner.cli.options import (
     accept_changes_option,
     job_option,
@@ -26,6 +26,7 @@ from runner.cli.progress import seldom
 from runner.cli.runs import runs_folder
 from runner.errors import ExitCode
 from runner.runs.run import command_in
+from runner.util.extras import VIEWS
 from runner.util.humanize import UNKNOWN, amount, duration, size
 from runner.util.values import checked_name
 
@@ -35,18 +36,18 @@ if TYPE_CHECKING:
     from runner.sweep.trials import Trials
 
 
-class SweepGroup(ViewGroup):
-    """The commands of sweeps: `run`, and views."""
-
-    prefix = "sweep "
-    views: ClassVar = {
+@click.group(
+    "sweep",
+    cls=CommandGroup,
+    plugins=VIEWS,
+    plugin=view_command,
+    views={
         "show": "Rank the trials of the sweep NAME with intervals over seeds, and show which parameters "
         "mattered.",
         "ls": "List the sweeps of a recordings folder.",
-    }
-
-
-@click.group("sweep", cls=SweepGroup)
+    },
+    prefix="sweep ",
+)
 def sweep_command() -> None:
     """Run an experiment with many values, and rank them.
 
