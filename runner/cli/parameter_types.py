@@ -143,18 +143,16 @@ def _shipped(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
     return {experiment.name: experiment.about for experiment in shipped().values()}
 
 
-class ExpressionText(Completed):
-    """An expression; completes the names in it, each with its meaning."""
+def expression_text(name: str, words: Mapping[str, str]) -> Completed:
+    """Return the type of an expression, which completes the words in it, each with its meaning."""
 
-    def __init__(self, name: str, words: Mapping[str, str]) -> None:
-        super().__init__(name, lambda _ctx, incomplete: self._completed(incomplete))
-        self.words = words
-
-    def _completed(self, incomplete: str) -> Mapping[str, str]:
+    def complete(_ctx: click.Context, incomplete: str) -> Mapping[str, str]:
         before = re.sub(r"[\w.]*$", "", incomplete)
-        if "status" in self.words and re.search(r"\bstatus *[!=]= *[\"']$", before):
+        if "status" in words and re.search(r"\bstatus *[!=]= *[\"']$", before):
             return {f"{before}{status}{before[-1]}": "" for status in columns.STATUSES}
-        return {before + word: meaning for word, meaning in self.words.items()}
+        return {before + word: meaning for word, meaning in words.items()}
+
+    return Completed(name, complete)
 
 
 def _settings(_ctx: click.Context, _incomplete: str) -> Mapping[str, str]:
@@ -209,7 +207,7 @@ def _trial(text: str) -> EpisodeRef:
 
 SHIPPED: Final = Completed("name", _shipped)
 SETTING: Final = Completed("setting", _settings)
-FILTER_WORD: Final = ExpressionText(
+FILTER_WORD: Final = expression_text(
     "filter",
     {name: field.meaning for name, field in columns.FIELDS.items()}
     | {columns.SETTING: "a value of the configuration, such as config.discount"},

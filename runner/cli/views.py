@@ -31,7 +31,7 @@ from runner.cli.options import (
     trust_option,
 )
 from runner.cli.output import Part, Remark, Reply, files_written, path_and_size, require_page, say
-from runner.cli.parameter_types import FILE, PATH, ExpressionText, Number, Parsed
+from runner.cli.parameter_types import FILE, PATH, Number, Parsed, expression_text
 from runner.cli.progress import bytes_line, count_line, progress_line, stage_line, steps_line
 from runner.cli.runs import (
     all_recorded_runs,
@@ -162,7 +162,7 @@ def _declared(name: str, given: Input, view: View) -> Declared:
             raise RunnerError(f"{view.name}: found {name!r} with ONLY_HERE, expected one of {expected}.")
         return _ONLY_HERE[name]
     if given.required:
-        return argument(metavar=given.name.upper(), type=ExpressionText(given.name, view.words))
+        return argument(metavar=given.name.upper(), type=expression_text(given.name, view.words))
     return option_of(given)
 
 
