@@ -47,7 +47,7 @@ from runner.service.jobs.checking import SWEEP_KEYS, BranchQuestion, ExplainQues
 from runner.service.jobs.queue import JobQueue
 from runner.service.jobs.store import CheckedJob
 from runner.service.pages.rendering import Form, Page, StatusName, run_page, to_job, viewer_of
-from runner.service.problems import error_body, filled
+from runner.service.problems import HttpProblem, error_body, filled
 from runner.sweep.model import SweepFile
 from runner.util.values import Json, JsonView
 
@@ -173,16 +173,6 @@ class _Options(BaseModel):
     workers: Workers = None
 
 
-class FormProblem(NamedTuple):
-    """A mistake in the submitted text."""
-
-    line: int | None
-    path: str | None
-    message: str
-    text: str
-    """The line's text."""
-
-
 class Key(NamedTuple):
     """A key of a configuration or a sweep, as the schema describes it."""
 
@@ -228,21 +218,25 @@ async def submit(request: Request, sent: Form, jobs: JobsOf) -> Response:
     return to_job(job.number)
 
 
-def _problems(request: Request, text: str, error: RunnerError) -> list[FormProblem]:
-    """Return the mistakes in a text, each with its line."""
+def _problems(request: Request, text: str, error: RunnerError) -> list[tuple[HttpProblem, str]]:
+    """Return the mistakes in a text, each with the text of its line."""
     body = error_body(error, request.app.state.settings)
     lines = dict(enumerate(text.splitlines(), 1))
-    problems = [FormProblem(p.line, p.path, p.message, lines.get(p.line or 0, "")) for p in body.problems]
-    return problems or [FormProblem(None, None, body.message, "")]
+    problems = body.problems or [HttpProblem(message=body.message)]
+    return [(problem, lines.get(problem.line or 0, "")) for problem in problems]
 
 
 def _submit_values(
     text: str,
     sent: Mapping[str, str] = MappingProxyType({}),
-    problems: Sequence[FormProblem] = (),
+    problems: Sequence[tuple[HttpProblem, str]] = (),
     checked: CheckedJob | None = None,
 ) -> dict[str, object]:
-    """Return the values of the page; `checked` is what the text means, if it was checked and is valid."""
+    """Return the values of the page.
+
+    `problems` are mistakes, each with the text of its line; `checked` is what the text means, if it was
+    checked and is valid.
+    """
     is_sweep = any(line.startswith(f"{key}:") for line in text.splitlines() for key in SWEEP_KEYS)
     return {
         "text": text,

@@ -67,13 +67,8 @@ class Heading(NamedTuple):
     """The address of the table sorted by it; empty if it cannot be."""
 
 
-class RunCell(NamedTuple):
-    """A cell of the table."""
-
-    text: str
-    address: str
-    note: str
-    """What a branch changed, shown after its name."""
+RunCell = tuple[str, str, str]
+"""Text and address of a cell, and what a branch changed, shown after its name."""
 
 
 @dataclass(frozen=True)
@@ -212,4 +207,4 @@ def _cell(row: IndexRow, column: str, runs: int) -> RunCell:
         note = as_text(row, "change") if column == "name" else ""
     elif column == "same_as" and row["same_as"]:
         address = f"/runs/{row['same_as']}"
-    return RunCell(text[:16] if column == "digest" else text, address, note)
+    return text[:16] if column == "digest" else text, address, note
