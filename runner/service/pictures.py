@@ -151,7 +151,7 @@ class PictureStream:
 
     def _put(self, made: bytes | str | RunnerError | None) -> None:
         self._made.append(made)
-        if not self._loop.is_closed():
+        with contextlib.suppress(RuntimeError):  # the service has ended, and its loop is closed
             self._loop.call_soon_threadsafe(self._arrived.set)
 
 

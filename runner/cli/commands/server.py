@@ -292,10 +292,11 @@ def push(
     for name in kept or names:
         run, url = kept.get(name, (None, None))
         try:
-            with server.client(url) as client, bytes_line(f"pushing {name}") as report:
+            with server.client(url) as client:
                 run = run or find_recorded(name, folder)
                 run_bytes = run.recording.stat().st_size  # a run leaves the outbox when it is delivered
-                status = deliver(run, client, report) if outbox else client.push(run, report)
+                with bytes_line(f"pushing {name}") as report:
+                    status = deliver(run, client, report) if outbox else client.push(run, report)
         except RunnerError as error:
             failure = Failure(error, name)
             failure.show()
