@@ -1,10 +1,12 @@
 """Commands as functions, whose parameters' defaults declare the arguments and options.
 
-@click.command("qtable", cls=Command)
-def qtable_command(
-run_name: str = argument(metavar="RUN"),
-step: int | None = option("--step", type=INDEX, help="After N training steps."),
-) -> None: ...
+The command `qtable`, for example:
+
+    @click.command("qtable", cls=Command)
+    def qtable_command(
+        run_name: str = argument(metavar="RUN"),
+        step: int | None = option("--step", type=INDEX, help="After N training steps."),
+    ) -> None: ...
 """
 
 from __future__ import annotations

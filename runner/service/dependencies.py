@@ -223,9 +223,9 @@ class Computation:
         """Return the dataclass whose fields a function returns as JSON."""
         return TypeAdapter(kind).validate_json(await self(function, *args))
 
-    async def json(self, function: Callable[..., bytes], *args: object, alone: bool = False) -> Response:
+    async def json(self, function: Callable[..., bytes], *args: object) -> Response:
         """Return the JSON that a function returns as a response."""
-        return json_response(await self(function, *args, alone=alone))
+        return json_response(await self(function, *args))
 
 
 async def computation_for(request: Request) -> Computation:

@@ -1,6 +1,8 @@
 """What is wrong with a request, in words that say what to do.
 
-{"error": {"message": "...", "problems": [{"path": "query.limit", "line": null, "message": "..."}]}}
+The body of a response about an error:
+
+    {"error": {"message": "...", "problems": [{"path": "query.limit", "line": null, "message": "..."}]}}
 """
 
 from __future__ import annotations
@@ -50,8 +52,6 @@ _STATUS: Final[dict[type[RunnerError], HTTPStatus]] = {
     RunNotFound: HTTPStatus.NOT_FOUND,
     StorageError: HTTPStatus.INSUFFICIENT_STORAGE,
 }
-
-
 _MAX_UNKNOWN: Final = 10
 """Unknown parameters that an error names."""
 _EXPECTED: Final = {

@@ -20,8 +20,8 @@ from runner.errors import RecordingError, RunnerError
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed
+from runner.service.api.files import OCTETS
 from runner.service.api.reading import RunName, RunNames, found_runs
-from runner.service.api.replay import OCTETS
 from runner.service.computed import AnswerForm, link, require_few
 from runner.service.dependencies import (
     CatalogueOf,

@@ -42,14 +42,14 @@ router = APIRouter(
     prefix="/runs/{run}",
     tags=["files"],
 )
-MEDIA: Final = "application/octet-stream"
+OCTETS: Final = "application/octet-stream"
 DRAW_SECONDS: Final = 120.0
 """Time for an export whose pictures an environment draws; then it is made without them."""
 BLOCK: Final = 256 << 10
 """Bytes of a file that are read at a time."""
 FILE: Final[dict[int | str, dict[str, object]]] = {
-    200: {"description": "All of it.", "content": {MEDIA: {}}},
-    206: {"description": "The requested ranges.", "content": {MEDIA: {}}},
+    200: {"description": "All of it.", "content": {OCTETS: {}}},
+    206: {"description": "The requested ranges.", "content": {OCTETS: {}}},
     304: {"description": "The client has it already."},
     416: {"description": "There is no such range.", "content": {"text/plain": {}}},
 }
@@ -200,7 +200,7 @@ async def installed(
 def attachment(body: bytes, name: str) -> Response:
     """Return a file to be saved under a name, which a browser never shows as a page of the service."""
     headers = {"content-disposition": f"attachment; filename*=utf-8''{quote(name)}"}
-    return Response(body, media_type=MEDIA, headers=headers)
+    return Response(body, media_type=OCTETS, headers=headers)
 
 
 def tag_of(run: Run) -> str:
@@ -219,7 +219,7 @@ def _file(path: pathlib.Path, name: str, tag: str, if_none_match: str | None) ->
     headers = {"etag": f'"{tag}"', "accept-ranges": "bytes"}
     if is_known(tag, if_none_match):
         return Response(status_code=HTTPStatus.NOT_MODIFIED, headers=headers)
-    response = FileResponse(path, media_type=MEDIA, filename=name, headers=headers)
+    response = FileResponse(path, media_type=OCTETS, filename=name, headers=headers)
     response.chunk_size = BLOCK
     return response
 

@@ -12,7 +12,6 @@ from anyio.to_thread import run_sync
 from fastapi import APIRouter, Depends, Header, HTTPException, Path, Query, Request, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import Field
-from starlette.concurrency import run_in_threadpool
 
 from runner.client.jobs import JobEvent, JobsPage, JobState, JobStatus
 from runner.config.document import write_yaml
@@ -271,4 +270,4 @@ async def queue_branch(run: Run, jobs: JobQueue, question: BranchQuestion) -> Qu
 
 
 async def _queue(jobs: JobQueue, checked: CheckedJob, workers: int | None = None) -> QueuedJob:
-    return await run_in_threadpool(jobs.add, write_yaml(checked.values), checked, workers)
+    return await run_sync(jobs.add, write_yaml(checked.values), checked, workers)

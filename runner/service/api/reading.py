@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Sequence
 from typing import Annotated, Final, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Response
-from fastapi import Path as InPath
 from pydantic import BaseModel, Field
 from starlette.concurrency import run_in_threadpool
 
@@ -42,7 +42,6 @@ router = APIRouter(
     tags=["reading"],
 )
 ARROW: Final = "application/vnd.apache.arrow.stream"
-OCTETS: Final = "application/octet-stream"
 SVG: Final = "image/svg+xml"
 Start = Annotated[int, Query(ge=0, le=START.maximum, description=START.help)]
 Stop = Annotated[int | None, Query(ge=0, le=STOP.maximum, description=STOP.help)]
@@ -216,7 +215,7 @@ RunNames = Annotated[
 RunName = Annotated[
     str, Field(max_length=200, description="A run: its id, the beginning of it, its name, ...")
 ]
-Part = Annotated[str, InPath(max_length=120)]
+Part = Annotated[str, Path(max_length=120)]
 
 
 class CurvesOfRuns(CurveOptions, frozen=True):
@@ -263,7 +262,7 @@ async def curves(
     catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[CurvesOfRuns, Query()]
 ) -> Response:
     """Return every metric over an axis, runs that differ in nothing but the seed as one curve with a band."""
-    paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
+    paths = await _recordings(catalogue, options.run)
     return await compute.json(curves_of, paths, options, options.lines)
 
 
@@ -277,7 +276,7 @@ async def curves_table(
     catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[CurvesOfRuns, Query()]
 ) -> Response:
     """Return the curves as a table: the axis, and each curve with its band and its runs."""
-    paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
+    paths = await _recordings(catalogue, options.run)
     return Response(await compute(curves_of, paths, options, options.lines, True), media_type=CSV)
 
 
@@ -291,8 +290,12 @@ async def curves_picture(
     catalogue: CatalogueOf, compute: ComputationOf, options: Annotated[FigureOfRuns, Query()]
 ) -> Response:
     """Return the figure that `dualtaxi plot` draws, of some metrics or all."""
-    paths = [run.recording for run in await run_in_threadpool(found_runs, catalogue, options.run)]
+    paths = await _recordings(catalogue, options.run)
     return Response(await compute(figure_of, paths, options), media_type=SVG)
+
+
+async def _recordings(catalogue: Catalogue, names: Sequence[str]) -> list[pathlib.Path]:
+    return [run.recording for run in await run_in_threadpool(found_runs, catalogue, names)]
 
 
 def found_runs(catalogue: Catalogue, names: Sequence[str], several: bool = False) -> list[Run]:

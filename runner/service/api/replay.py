@@ -21,7 +21,7 @@ from runner.export.reports.playback import Playback
 from runner.recording.reader import open_recording
 from runner.runs.run import Run
 from runner.service import computed
-from runner.service.api.files import IfNoneMatch, is_known, tag_of
+from runner.service.api.files import OCTETS, IfNoneMatch, is_known, tag_of
 from runner.service.dependencies import (
     EPISODES,
     CacheOf,
@@ -42,7 +42,6 @@ router = APIRouter(
 STEPS: Final = 500
 """Steps in a response by default."""
 MAX_STEPS: Final = 2000
-OCTETS: Final = "application/octet-stream"
 PICTURES: Final = 64
 """Pictures in a response by default."""
 
@@ -135,7 +134,7 @@ def _number_and_length(run: Run, at: EpisodeRef) -> tuple[int, int]:
         return number, len(recording.phase(at.phase).episode(number))
 
 
-MAX_ACTIONS = 1000
+MAX_ACTIONS: Final = 1000
 StepPath = Annotated[str, Path(max_length=60, description=EXPECTED, examples=["eval:3000:17:5"])]
 ActionPath = Annotated[str, Path(max_length=200, description="A joint action: its number or its name.")]
 

@@ -175,8 +175,6 @@ class JobChecker:
 
 
 Action = StrictStr | StrictInt | StrictFloat | list[StrictInt | StrictFloat]
-
-
 """An action in JSON: a name, a number, or the numbers of an array."""
 
 

@@ -195,10 +195,10 @@ class JobStore:
             except BaseException:
                 self._forget(number)
                 raise
+            self._jobs[number] = job
             over = [old.number for old in self._jobs.values() if old.is_over]
-            for number in over[: max(0, len(over) - self._max_over)]:
-                self._forget(number)
-            self._jobs[job.number] = job
+            for oldest in over[: max(0, len(over) - self._max_over)]:
+                self._forget(oldest)
             return job
 
     def update(self, number: int, **changes: Any) -> QueuedJob:

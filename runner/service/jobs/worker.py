@@ -84,10 +84,6 @@ class JobSpec:
         """How many processes may train at once; None for as many as the cluster has."""
         return self.job.workers if self.ray is None else None
 
-    def values(self) -> dict[str, object]:
-        """Return the configuration, sweep or question, with every value."""
-        return read_values(self.folder)
-
 
 @dataclass(frozen=True)
 class JobChannel:
@@ -266,7 +262,7 @@ def do_job(spec: JobSpec, channel: JobChannel) -> StateEvent:
 
 def run_config_job(spec: JobSpec, channel: JobChannel) -> None:
     """Run what is left of a configuration's seeds, one after the other."""
-    config = from_mapping(spec.values())
+    config = from_mapping(read_values(spec.folder))
     for seed in config.seeds:
         if channel.stop() or run_seed(spec, channel, config, seed) != "finished":
             raise KeyboardInterrupt
@@ -336,7 +332,7 @@ def run_episode_job(spec: JobSpec, channel: JobChannel) -> None:
     """Play the episode on, unless that is done, and log where it led."""
     from runner.debugging.branch import EpisodeBranch, branch_episode  # slow to import
 
-    values: Json = spec.values()
+    values: Json = read_values(spec.folder)
     parent = parent_in(spec, values.pop("run"))
     question = BranchQuestion.model_validate(values)
     ((seed, run_id),) = spec.job.run_ids.items()
@@ -383,7 +379,7 @@ def run_sweep_job(spec: JobSpec, channel: JobChannel) -> None:
 
 
 def _run_rest(spec: JobSpec, channel: JobChannel) -> None:
-    sweep = from_values(spec.values())
+    sweep = from_values(read_values(spec.folder))
     recordings = spec.recordings
     wait_for_owners(state.runs_of(sweep.name, recordings).values(), channel.stop)
     _, status = run_whole_sweep(
@@ -443,7 +439,7 @@ LINES: Final = {
 
 def run_explain_job(spec: JobSpec, channel: JobChannel) -> None:
     """Train what is left of an explanation, and store it."""
-    question = ExplainQuestion.model_validate(spec.values()).resolved(spec.recordings)
+    question = ExplainQuestion.model_validate(read_values(spec.folder)).resolved(spec.recordings)
     stages = set[str]()
 
     def report(done: int, total: int, what: str) -> None:
