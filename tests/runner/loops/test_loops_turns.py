@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from functools import partial
 from typing import Any
 
@@ -19,7 +20,10 @@ from tests.runner.loops.making import dualtaxi
 
 tictactoe = pytest.importorskip("pettingzoo.classic.tictactoe_v3")
 mpe = pytest.importorskip("mpe2.simple_spread_v3")
-cooperative = pytest.importorskip("pettingzoo.butterfly.knights_archers_zombies_v11")
+with pytest.MonkeyPatch.context() as patch:
+    # This module turns it off for good: pytest would compile all test modules that follow, each time.
+    patch.setattr(sys, "dont_write_bytecode", sys.dont_write_bytecode)
+    cooperative = pytest.importorskip("pettingzoo.butterfly.knights_archers_zombies_v11")
 
 GAMES = {
     "tictactoe": tictactoe.env,
