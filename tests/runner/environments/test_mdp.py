@@ -31,7 +31,7 @@ TABULAR = {
 }
 
 
-@pytest.fixture(params=TABULAR)
+@pytest.fixture(scope="module", params=TABULAR)
 def loaded(request):
     """Return an environment's arrays, and the environment made by Gymnasium alone."""
     env_id, kwargs = TABULAR[request.param]
