@@ -330,6 +330,7 @@ class EpisodeIndex:
 
         Raises:
             RunnerError: the run has no episodes, is damaged, or its archive cannot be reached.
+            StorageError: the cache cannot be written.
         """
         name = RUN_FILE if row["status"] == "archived" else RECORDING_FILE
         path = Path(row["root"], row["entry"], name)
@@ -338,8 +339,9 @@ class EpisodeIndex:
         start = f"{row['id']}-{_hash(path)}"
         stem = start + _hash([_VERSION, state.st_mtime_ns, state.st_size, state.st_ino])
         if stem not in self._files:
-            for older in [older for older in self._files if older.startswith(start)]:
-                self._files.pop(older).unlink(missing_ok=True)  # a search that reads it now begins again
+            with storage_errors(self.folder):
+                for older in [older for older in self._files if older.startswith(start)]:
+                    self._files.pop(older).unlink(missing_ok=True)  # a search that reads it now begins again
             self._files[stem] = self._make(row, runs, stem)
         self.read.add(self._files[stem])
         return self._files[stem]

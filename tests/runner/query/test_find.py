@@ -254,6 +254,18 @@ def test_a_finished_run_whose_recording_is_cut_off_is_left_out(tmp_path):
         assert "is cut off, though its run is finished" in result.left_out[0]
 
 
+def test_a_run_is_left_out_whose_older_index_cannot_be_removed(tmp_path, monkeypatch):
+    def refuse(path, missing_ok=False):
+        raise PermissionError(13, "Permission denied")
+
+    run = make_run(tmp_path, LAKE)
+    assert runner.find("length > 0", tmp_path).count
+    os.utime(run.recording)
+    monkeypatch.setattr("pathlib.Path.unlink", refuse)
+    (reason,) = runner.find("length > 0", tmp_path).left_out
+    assert "Permission denied" in reason
+
+
 def test_trials_of_an_evaluation_that_was_cut_off_are_found(tmp_path):
     run = make_run(tmp_path, LAKE, evaluation={"every": 6, "trials": 60_000}).update(status="interrupted")
     os.truncate(run.recording, run.recording.stat().st_size // 10)
