@@ -92,9 +92,12 @@ def write_dataset(
         | _description(recording, phase)
     )
     written = Written()
+    number = 0
 
     def buffers() -> Iterator[object]:
+        nonlocal number
         for episode in episodes_in(recording, phase, whole):
+            number = episode.number
             yield _buffer(episode, written.episodes)
             written.episodes += 1
             written.steps += len(episode.rewards)
@@ -107,7 +110,7 @@ def write_dataset(
             storage.update_episodes(chain([first], islice(remaining, _BATCH - 1)))
         except (TypeError, ValueError) as error:
             raise RecordingError(
-                f"{recording.path}: {phase} episode {written.episodes} cannot be stored by Minari ({error})."
+                f"{recording.path}: {phase} episode {number} cannot be stored by Minari ({error})."
             ) from error
     if not written.episodes:
         raise RecordingError(f"{recording.path}: found no {phase} episode that ended, expected at least one.")
@@ -215,6 +218,8 @@ def _environment_spec(
 class MinariEpisode:
     """The T steps of an episode that ended; observations and actions are nested as their spaces."""
 
+    number: int
+    """Its number in the phase."""
     observations: Value
     """T + 1 of them."""
     actions: Value
@@ -273,7 +278,7 @@ def _episode(recording: Recording, phase: str, number: int) -> MinariEpisode | N
         after = np.concatenate([np.array([first], after.dtype), after])
     fields = {"rewards", "terminated", "truncated", "acted"} & {*(steps.dtype.names or ())}
     outcomes: dict[str, Any] = {name: steps[name].copy() for name in fields}
-    return MinariEpisode(_nested(seen, after), _nested(done, actions), seed=seed, **outcomes)
+    return MinariEpisode(number, _nested(seen, after), _nested(done, actions), seed=seed, **outcomes)
 
 
 def _nested(description: Description, values: NDArray[Any] | list[Value]) -> Value:

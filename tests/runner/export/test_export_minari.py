@@ -71,6 +71,24 @@ def test_observations_and_actions_equal_those_of_the_loop(name, tmp_path, monkey
         assert dataset.recover_environment().spec.id == name
 
 
+def test_an_episode_that_minari_cannot_store_is_named_by_its_number(tmp_path, monkeypatch):
+    with runner.record(gymnasium.make("CartPole-v1"), tmp_path) as env:
+        for seed in range(4):
+            env.reset(seed=seed)
+            while not any(env.step(0)[2:4]):
+                pass
+
+    def refuse(storage, episodes):
+        next(episodes)
+        raise ValueError("it is too large")
+
+    monkeypatch.setattr("minari.dataset._storages.hdf5_storage.HDF5Storage.update_episodes", refuse)
+    call = ["export", "minari", str(env.run.recording), "-o", str(tmp_path / "minari"), "--episodes", "2..4"]
+    assert (
+        "train episode 2 cannot be stored by Minari (it is too large)" in CliRunner().invoke(cli, call).output
+    )
+
+
 def test_the_users_own_environment_of_no_listed_package_is_specified(tmp_path, monkeypatch):
     spec = gymnasium.envs.registration.EnvSpec("own/Rooms-v0", entry_point="tests.runner.loops.making:Rooms")
     monkeypatch.setitem(gymnasium.registry, "own/Rooms-v0", spec)
