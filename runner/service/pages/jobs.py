@@ -28,7 +28,7 @@ from runner.errors import RunnerError
 from runner.export.values import actions_at
 from runner.loops.actions import space_in_words
 from runner.recording.reader import Recording, open_recording
-from runner.recording.spaces import Description
+from runner.recording.spaces import Description, least_number
 from runner.replay.makers import why_not_rerun
 from runner.runs.run import Run
 from runner.service.api.files import list_uploads
@@ -49,7 +49,7 @@ from runner.service.jobs.store import CheckedJob
 from runner.service.pages.rendering import Form, Page, StatusName, run_page, to_job, viewer_of
 from runner.service.problems import HttpProblem, error_body, filled
 from runner.sweep.model import SweepFile
-from runner.util.values import Json, JsonView
+from runner.util.values import Json, JsonView, is_whole
 
 router = APIRouter(include_in_schema=False)
 
@@ -361,8 +361,10 @@ def _action_fields(recording: Recording, at: str) -> list[ActionField]:
 
 def _choices(description: Description, names: tuple[str, ...]) -> tuple[list[str], str]:
     """Return the actions to choose from, if they are discrete and not many, and what may be typed."""
-    first, count = description.get("start", 0), description["n"] if description["type"] == "Discrete" else 0
-    choices = list(names or map(str, range(first, first + count))) if count <= MAX_CHOICES else []
+    first, count = least_number(description), description.get("n") if description["type"] == "Discrete" else 0
+    choices: list[str] = []
+    if is_whole(count, 0, MAX_CHOICES):  # a recording of others may state anything
+        choices = list(names or map(str, range(first, first + count)))
     space = known_space(description)
     return choices, "" if space is None else space_in_words(space)
 

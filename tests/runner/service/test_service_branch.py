@@ -19,6 +19,8 @@ from runner.runs.run import Run, list_runs
 from runner.service.jobs.checking import BranchQuestion, check_branch
 from runner.service.jobs.store import JobStore
 from runner.service.jobs.worker import JobChannel, JobSpec, do_job, run_episode_job
+from runner.service.pages import jobs as pages
+from runner.service.pages.jobs import _choices
 from runner.service.settings import ServiceSettings
 from tests.waiting import until
 
@@ -264,3 +266,17 @@ def test_a_branch_reports_that_it_prepares(loop, recordings):
     assert trained == played == "preparing"
     assert whole == "60 of 60 episodes"
     assert all(text.endswith(" steps") for text in said[1][1:])
+
+
+@pytest.mark.parametrize("stated", [{}, {"n": "3"}, {"n": 3.0}, {"n": -1, "start": 0}, {"n": 10**12}])
+def test_a_form_offers_no_actions_of_a_space_that_is_not_sound(stated):
+    assert _choices({"type": "Discrete", **stated}, ()) == ([], "")
+
+
+def test_a_form_offers_the_actions_of_a_discrete_space(monkeypatch):
+    space = {"type": "Discrete", "n": 3, "start": 1}
+    assert _choices(space, ()) == (["1", "2", "3"], "1 to 3")
+    assert _choices(space | {"start": "1"}, ()) == (["0", "1", "2"], "1 to 3")
+    assert _choices(space, ("left", "stay", "right"))[0] == ["left", "stay", "right"]
+    monkeypatch.setattr(pages, "MAX_CHOICES", 2)
+    assert _choices(space, ()) == ([], "1 to 3")
