@@ -38,7 +38,7 @@ def qtable(
         kind=int,
         maximum=_MAX_STEP,
         label="After episode",
-        placeholder="number; that of the step",
+        placeholder="a number, instead of a step",
     ),
     state: str | None = view_input(
         "state",
@@ -166,7 +166,7 @@ WHEN: Final = View(
 
 _STEPS: Final = 30
 """Steps that the page lists."""
-_OF_STEP: Final = "number or name; that of the step"
+_OF_STEP: Final = "a number or name, else the step's"
 
 
 def why(
@@ -199,7 +199,7 @@ def why(
         metavar="STEP",
         max_length=60,
         label="Before step",
-        placeholder="EPISODE:T, step:N, eval:N:TRIAL:T, best or last; the end",
+        placeholder="EPISODE:T or eval:N:TRIAL:T; else the end",
     ),
     limit: int = view_input(
         "limit",
