@@ -14,17 +14,17 @@ import contextlib
 import queue
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Final
 
 import numpy as np
 
 from runner.recording.digest import ContentHash
-from runner.recording.layout import lone_message, message_record
+from runner.recording.layout import HEADER_BYTES, MESSAGE, MESSAGE_HEAD, RECORD_HEAD, lone_message
 from runner.recording.records import Chunk, encode_chunk
 from runner.recording.schema import ACTIONS, RESET, RESET_OPTIONS, RESET_STATE, STEP, TOPIC_OF, Topic
 from runner.recording.writer import RecordingFile, storage_error
@@ -273,41 +273,57 @@ def _rank(chunk: Chunk) -> int:
     return 1 if message in (STEP, ACTIONS) else 2
 
 
+@dataclass
+class _Batch:
+    """Message records of one topic that wait for a chunk."""
+
+    records: list[bytes] = field(default_factory=list)
+    times: list[int] = field(default_factory=list)
+    size: int = 0
+    """Bytes of the records."""
+
+
 class MessageBatches:
     """Messages of variable size that share chunks: some thousands of a topic, or some hundred kilobytes."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
-        self._waiting: defaultdict[Topic, list[tuple[int, bytes]]] = defaultdict(list)
-        """Log time and record of the messages that wait for a chunk."""
-        self._sizes = Counter[Topic]()
-        """Bytes of these records."""
+        self._batches: defaultdict[Topic, _Batch] = defaultdict(_Batch)
 
     def extend(self, topic: Topic, log_times: Sequence[int], payloads: Sequence[bytes]) -> None:
         """Add messages to their topic's batch."""
-        messages = zip(log_times, payloads, strict=True)
-        self.add(topic, log_times, [message_record(topic, time, payload) for time, payload in messages])
+        # As `message_record` does, without a call for each: a loop may log many values at each step.
+        pack = MESSAGE_HEAD.pack
+        channel = topic.channel
+        head = HEADER_BYTES - RECORD_HEAD.size
+        records = [
+            pack(MESSAGE, head + len(payload), channel, 0, time, time) + payload
+            for time, payload in zip(log_times, payloads, strict=True)
+        ]
+        self.add(topic, log_times, records)
 
     def add(self, topic: Topic, log_times: Sequence[int], records: Sequence[bytes]) -> None:
         """Add whole message records to their topic's batch, or to as many as they fill."""
         for log_time, record in zip(log_times, records, strict=True):
-            is_large = self._sizes[topic] + len(record) > MAX_BATCH_BYTES
-            if is_large or len(self._waiting[topic]) == MAX_BATCH_MESSAGES:
+            batch = self._batches[topic]
+            if batch.times and (
+                batch.size + len(record) > MAX_BATCH_BYTES or len(batch.times) == MAX_BATCH_MESSAGES
+            ):
                 self.flush_topic(topic)
-            self._waiting[topic].append((log_time, record))
-            self._sizes[topic] += len(record)
+                batch = self._batches[topic]
+            batch.records.append(record)
+            batch.times.append(log_time)
+            batch.size += len(record)
 
     def flush(self) -> None:
         """Send every batch."""
-        for topic in list(self._waiting):
+        for topic in list(self._batches):
             self.flush_topic(topic)
 
     def flush_topic(self, topic: Topic) -> None:
         """Send the batch of a topic, if it has one."""
-        if not (waiting := self._waiting.pop(topic, None)):
+        if (batch := self._batches.pop(topic, None)) is None:
             return
-        del self._sizes[topic]
-        log_times, records = zip(*waiting, strict=True)
-        sizes = np.array([*map(len, records)], np.uint64)
-        times = np.array(log_times, np.uint64)
-        self._send(topic, memoryview(b"".join(records)), times, np.cumsum(sizes) - sizes)
+        sizes = np.array([len(record) for record in batch.records], np.uint64)
+        times = np.array(batch.times, np.uint64)
+        self._send(topic, memoryview(b"".join(batch.records)), times, np.cumsum(sizes) - sizes)
