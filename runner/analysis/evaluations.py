@@ -13,7 +13,7 @@ from runner.environments.naming import event_in_words, spoken
 from runner.errors import NotInRecording
 from runner.recording import schema
 from runner.recording.messages import Message
-from runner.recording.metrics import METRICS, defined_metrics, is_usable
+from runner.recording.metrics import METRICS, TABLE_METRICS, defined_metrics, is_usable
 from runner.recording.reader import Recording
 from runner.recording.run_file import EvaluationMetrics, Summary
 from runner.util import humanize
@@ -36,18 +36,18 @@ class TrainingRecord:
     """None before the first episode ends."""
     reward_counts: tuple[tuple[float, int], ...]
     """Each reward of the last steps, and the number of steps that it was paid for."""
-    zero_cells: Mapping[str, int]
-    """By learner."""
-    percent_filled: Mapping[str, float]
-    """By learner."""
+    of_tables: Mapping[str, Mapping[str, float]]
+    """Fields of `TABLE_METRICS`, by learner, without measures that the recording is older than."""
     epsilon: float
     step_size: float
     discount: float
 
     def as_json(self) -> Json:
         """Return the record as JSON can hold it."""
+        values = {**vars(self), **self.of_tables}
+        del values["of_tables"]
         rewards = [{"reward": reward, "steps": steps} for reward, steps in self.reward_counts]
-        return {**vars(self), "reward_counts": rewards}
+        return {**values, "reward_counts": rewards}
 
 
 @dataclass(frozen=True)
@@ -202,6 +202,7 @@ def evaluation_records(recording: Recording) -> list[EvaluationRecord]:
 
 def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[str]) -> EvaluationRecord:
     """Return the record of a job's evaluation from its message, in which NaN stands for unknown."""
+    unknown = [None] * len(agents)  # of a measure that the recording is older than
     return EvaluationRecord(
         number=metrics["evaluation"],
         episode=metrics["episode"],
@@ -209,7 +210,7 @@ def evaluation_record(metrics: Message, agents: Sequence[str], events: Sequence[
         trials=metrics["trials"],
         successes=metrics["successes"] if metrics["successes"] >= 0 else None,
         values={
-            metric.name: dict(zip(agents, map(finite, metrics[metric.field]), strict=True))
+            metric.name: dict(zip(agents, map(finite, metrics[metric.field] or unknown), strict=True))
             if metric.per_agent
             else {"": finite(metrics[metric.field])}
             for metric in METRICS
@@ -257,8 +258,11 @@ def _training_record(metrics: Message, agents: Sequence[str]) -> TrainingRecord:
         step=metrics["step"],
         mean_length=finite(metrics["mean_length"]),
         reward_counts=tuple(zip(metrics["rewards"], metrics["reward_counts"], strict=True)),
-        zero_cells=dict(zip(agents, metrics["zero_cells"], strict=True)),
-        percent_filled=dict(zip(agents, metrics["percent_filled"], strict=True)),
+        of_tables={
+            metric.field: dict(zip(agents, values, strict=True))
+            for metric in TABLE_METRICS
+            if (values := metrics[metric.field])
+        },
         epsilon=metrics["epsilon"],
         step_size=metrics["step_size"],
         discount=metrics["discount"],
@@ -337,7 +341,7 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
         columns[heading.replace(" ", "\n", 1)] = cells
     events = [*columns][fixed:]
     spare = sorted(events, key=lambda heading: (heading != "pickup", -events.index(heading)))
-    filled = [list(record.training.percent_filled.values()) for record in records if record.training]
+    filled = _percent_filled(records)
     if filled:
         digits = 0 if len(filled[0]) > 1 else 1
         columns["filled\n%"] = [
@@ -345,6 +349,12 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
         ]
     rows = list(zip(*columns.values(), strict=True))
     return Grid(tuple(columns), rows, left=(), cut=(), spare=tuple(spare), gap=1)
+
+
+def _percent_filled(records: Sequence[EvaluationRecord]) -> list[list[float]]:
+    """Return the percent filled of each learner's table, [records, learners]; nothing for a loop."""
+    trainings = [record.training for record in records if record.training]
+    return [list(training.of_tables["percent_filled"].values()) for training in trainings]
 
 
 def evaluations_section(
@@ -361,7 +371,7 @@ def evaluations_section(
         "Each row: the evaluation episodes of the loop after that number of training episodes. Events are "
         "counted over all of them."
     )
-    filled = [record.training.percent_filled.values() for record in records if record.training]
+    filled = _percent_filled(records)
     if filled:
         columns.append(("filled %", ["/".join(map(humanize.number, shares)) for shares in filled]))
         explanation = (

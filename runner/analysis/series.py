@@ -23,7 +23,15 @@ from runner.environments.naming import event_in_words, spoken
 from runner.errors import RunnerError, shortened
 from runner.recording import schema
 from runner.recording.messages import Message
-from runner.recording.metrics import LARGEST, METRIC_OF, METRICS, SHARES, finite_mean, is_usable
+from runner.recording.metrics import (
+    LARGEST,
+    METRIC_OF,
+    METRICS,
+    SHARES,
+    TABLE_METRICS,
+    finite_mean,
+    is_usable,
+)
 from runner.recording.reader import Recording, open_recording
 from runner.recording.run_file import has_environment
 from runner.util.arrays import Floats
@@ -323,8 +331,11 @@ def training_readings(report: TrainingRecord) -> Readings:
         readings["training.mean_reward"] = {"": mean}
         readings[SHARES] = {f"{r:g}": 100 * count / steps for r, count in counts.items()}
     return readings | {
-        "training.percent_filled": dict(report.percent_filled),
-        "training.zero_cells": {agent: float(cells) for agent, cells in report.zero_cells.items()},
+        **{
+            metric.name: {agent: float(value) for agent, value in report.of_tables[metric.field].items()}
+            for metric in TABLE_METRICS
+            if metric.field in report.of_tables
+        },
         "training.schedule": {
             "epsilon": report.epsilon,
             spoken("step_size"): report.step_size,

@@ -39,7 +39,7 @@ from runner.archive.batches import Batches
 from runner.recording import schema
 from runner.recording.machine import read_clock
 from runner.recording.messages import Message
-from runner.recording.metrics import METRICS
+from runner.recording.metrics import METRICS, TABLE_METRICS
 from runner.recording.reader import Recording
 from runner.recording.schema import PHASES, SCALAR_TOPIC, STEP_NANOSECONDS
 from runner.util.arrays import Ints
@@ -241,7 +241,13 @@ def _write(path: Path, form: str, batches: Iterator[pa.RecordBatch], report: Cal
 
 # --- metrics as named numbers -------------------------------------------------------------------------
 
-_TRAINING: Final = ("mean_length", "zero_cells", "percent_filled", "epsilon", "step_size", "discount")
+_TRAINING: Final = (
+    "mean_length",
+    *(metric.field for metric in TABLE_METRICS),
+    "epsilon",
+    "step_size",
+    "discount",
+)
 _EVALUATION: Final = {
     **{name: name for name in ("trials", "successes", "terminations")},
     **{metric.name: metric.field for metric in METRICS},
@@ -348,7 +354,7 @@ def _named(row: Message, fields: Mapping[str, str], owners: Sequence[str]) -> di
     values: dict[str, float] = {}
     for name, field in fields.items():
         if isinstance(value := row.get(field), list):
-            parts = zip(owners, value, strict=True)
+            parts = zip(owners, value, strict=bool(value))  # older recordings lack a newer measure
             values |= _finite((f"{name}/{owner}", float(part)) for owner, part in parts)
         elif value is not None:
             values |= _finite([(name, float(value))])

@@ -19,6 +19,7 @@ from runner.learning.algorithms import ALGORITHMS, Memory, Rules, Tables
 from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
+from runner.recording.metrics import TABLE_METRICS
 from runner.util.arrays import Floats, Ints, Ints32, Records
 
 NEVER: Final = 2**62
@@ -202,7 +203,6 @@ class Learner:
         seen = counts > 0
         lengths = self._tally.recent_lengths[: min(self.episode, len(self._tally.recent_lengths))]
         tables = [self.table(i) for i in range(len(self.agents))]
-        zero_cells = [int(table.size - np.count_nonzero(table)) for table in tables]
         epsilon = float(schedule_value(self.rules.epsilon, self.episode, self.step))
         return {
             "step": self.step,
@@ -210,11 +210,7 @@ class Learner:
             "mean_length": float(lengths.mean()) if len(lengths) else float("nan"),
             "rewards": rewards[seen].tolist(),
             "reward_counts": counts[seen].tolist(),
-            "zero_cells": zero_cells,
-            "percent_filled": [
-                100.0 * (table.size - zero) / table.size
-                for table, zero in zip(tables, zero_cells, strict=True)
-            ],
+            **{metric.field: list(map(metric.of_table, tables)) for metric in TABLE_METRICS},
             "epsilon": 1.0 - epsilon if self.rules.epsilon_exploits else epsilon,
             "step_size": float(schedule_value(self.rules.step_size, self.episode, self.step)),
             "discount": float(schedule_value(self.rules.discount, self.episode, self.step)),

@@ -1,7 +1,8 @@
 """The metrics of a run: each measure of its evaluations and of its training, defined once, in one row.
 
 The schema, summaries, frames, plots, comparisons, exports, the index of runs, pages and commands read these
-tables: a new measure of an evaluation is a row of `METRICS`, and the rest follows from it.
+tables: a new measure of an evaluation is a row of `METRICS`, one of the Q-tables a row of `TABLE_METRICS`,
+and the rest follows from it.
 """
 
 from __future__ import annotations
@@ -39,6 +40,19 @@ class Metric:
     """Whether it has a value for each learner."""
     field: str = ""
     """Its field in a message of metrics; empty if it is derived from several."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableMetric(Metric):
+    """A value of each learner's Q-table, in every report of training."""
+
+    per_agent: bool = True
+    number: int
+    """Number of its field in `TrainMetrics` and `EvalMetrics`."""
+    is_count: bool = False
+    """Whether it is a whole number."""
+    of_table: Callable[[Floats], float]
+    """Returns the value of a table, [states, actions]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +151,27 @@ EXACT_METRICS: Final = (
 )
 """The measures of a greedy policy that are computed from the environment's transition table."""
 
+TABLE_METRICS: Final = (
+    TableMetric(
+        name="training.percent_filled",
+        title="Q-table filled",
+        unit="percent of its cells",
+        field="percent_filled",
+        number=7,
+        of_table=lambda table: 100.0 * int((table != 0).sum()) / table.size,
+    ),
+    TableMetric(
+        name="training.zero_cells",
+        title="Q-table cells still zero",
+        unit="cells",
+        field="zero_cells",
+        number=6,
+        is_count=True,
+        of_table=lambda table: int((table == 0).sum()),
+    ),
+)
+"""The measures of the Q-tables."""
+
 SHARES: Final = "training.reward"
 """The metric whose lines are shares of a whole."""
 TRAINING_METRICS: Final = (
@@ -155,14 +190,7 @@ TRAINING_METRICS: Final = (
         per_agent=True,
     ),
     Metric("training.mean_reward", "Reward in training", "per step, running mean", "higher"),
-    Metric(
-        "training.percent_filled",
-        "Q-table filled",
-        "percent of its cells",
-        per_agent=True,
-        field="percent_filled",
-    ),
-    Metric("training.zero_cells", "Q-table cells still zero", "cells", per_agent=True, field="zero_cells"),
+    *TABLE_METRICS,
     Metric("training.schedule", "Schedules", "value"),
     Metric(SHARES, "Training steps by reward", "percent of recent steps"),
 )

@@ -13,7 +13,7 @@ import numpy as np
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Pb
 
 from runner.recording.fields import Field
-from runner.recording.metrics import METRICS
+from runner.recording.metrics import METRICS, TABLE_METRICS
 
 FORMAT_VERSION: Final = 2
 PROFILE: Final = "dualtaxi"
@@ -144,27 +144,32 @@ EPISODE_COLUMNS: Final = (
     "events",
 )
 """The fields that episodes may have, in the order in which people read them."""
-_TRAINING_SIDE = _fields(
-    step=_SFIXED64,
-    episode=_SFIXED64,
-    mean_length=_DOUBLE,
-    rewards=[_DOUBLE],
-    reward_counts=[_SFIXED64],
-    zero_cells=[_SFIXED64],
-    percent_filled=[_DOUBLE],
-    epsilon=_DOUBLE,
-    step_size=_DOUBLE,
-    discount=_DOUBLE,
+_TRAINING_SIDE = (
+    *_fields(
+        step=_SFIXED64,
+        episode=_SFIXED64,
+        mean_length=_DOUBLE,
+        rewards=[_DOUBLE],
+        reward_counts=[_SFIXED64],
+    ),
+    *_fields(8, epsilon=_DOUBLE, step_size=_DOUBLE, discount=_DOUBLE),
+    *(
+        Field(metric.number, metric.field, _SFIXED64 if metric.is_count else _DOUBLE, repeated=True)
+        for metric in TABLE_METRICS
+    ),
 )
-TRAIN_METRICS = MessageType("TrainMetrics", _TRAINING_SIDE)
 _EVALUATION_SIDE = (
     *_fields(11, evaluation=_SFIXED64, trials=_SFIXED64, successes=_SFIXED64),
     Field(17, "terminations", _SFIXED64),
     Field(19, "events", _SFIXED64, repeated=True),
     *(Field(metric.number, metric.field, _DOUBLE, metric.per_agent) for metric in METRICS),
 )
-EVAL_METRICS = MessageType(
-    "EvalMetrics", (*_TRAINING_SIDE, *sorted(_EVALUATION_SIDE, key=lambda field: field.number))
+TRAIN_METRICS, EVAL_METRICS = (
+    MessageType(name, tuple(sorted(fields, key=lambda field: field.number)))
+    for name, fields in (
+        ("TrainMetrics", _TRAINING_SIDE),
+        ("EvalMetrics", (*_TRAINING_SIDE, *_EVALUATION_SIDE)),
+    )
 )
 OPTIMALITY = MessageType(
     "Optimality",
