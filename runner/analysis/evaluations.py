@@ -354,7 +354,7 @@ def evaluations_grid(records: Sequence[EvaluationRecord], success_events: Sequen
 def _percent_filled(records: Sequence[EvaluationRecord]) -> list[list[float]]:
     """Return the percent filled of each learner's table, [records, learners]; nothing for a loop."""
     trainings = [record.training for record in records if record.training]
-    return [list(training.of_tables["percent_filled"].values()) for training in trainings]
+    return [list(training.of_tables.get("percent_filled", {}).values()) for training in trainings]
 
 
 def evaluations_section(

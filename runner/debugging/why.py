@@ -68,6 +68,8 @@ _MAX_ROWS: Final = 12
 _STRETCHES: Final = 20
 """The most stretches of equally many episodes by which weights are summed."""
 STEPS_AT_ONCE: Final = 1 << 18
+_ROUNDING: Final = 1e-6
+"""The largest difference from the table's value that is taken for rounding, as a share of what is added."""
 _EXPLANATION: Final = (
     "This is a decomposition along the path that training took, not a counterfactual: `dualtaxi branch` "
     "shows what would have happened after another action or with other settings."
@@ -233,7 +235,8 @@ def why(
     Raises:
         ConfigError: there is no such state, action or agent, or the limit is too high.
         RecordingError: there is no such step, the steps were not recorded, or the recording is damaged.
-        RunnerError: the run was recorded from a loop, or its algorithm has no Q-values.
+        RunnerError: the run was recorded from a loop, or its algorithm has no Q-values or moves them in a way
+            that cannot be followed.
         StorageError: the folder of temporary files cannot be written.
     """
     with opened(run) as recording:
@@ -257,6 +260,14 @@ def why(
         initial = ValuePart(
             float(ledger.weights.sum()), float((ledger.weights * weights.initial_values).sum())
         )
+        total = rewarded.contribution + initial.contribution
+        scale = abs(weights.value) + abs(initial.contribution) + float(np.abs(ledger.episodes[:, 1]).sum())
+        if abs(total - weights.value) > _ROUNDING * scale:
+            raise RunnerError(
+                f"the parts of this value add up to {total:.9g}, but the table has {weights.value:.9g}: `why` "
+                "follows algorithms in which a step moves a value by a share of its distance to the target, and "
+                f"{recording.config['algorithm']} does not; choose a run of another one, such as q_learning."
+            )
         moves = tuple(_moves(mdp, ledger.outcomes, "" if is_joint else mdp.agents[cell.learner]))
         return Why(
             run_id=recording.run_id,
@@ -267,7 +278,7 @@ def why(
             action_in_words=str(names[cell.action]),
             step=stop,
             value=weights.value,
-            total=rewarded.contribution + initial.contribution,
+            total=total,
             counted=weights.counted,
             rewarded=rewarded,
             initial=initial,

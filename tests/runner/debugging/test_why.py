@@ -165,6 +165,14 @@ def test_values_that_many_steps_change_are_not_explained(tmp_path):
         runner.why(run, at=STEP)
 
 
+def test_an_update_that_cannot_be_followed_is_refused_and_not_called_rounding(tmp_path, monkeypatch):
+    run = make_run(tmp_path, PLAIN, {"algorithm": "n_step_q_learning"})
+    known = why.ALGORITHMS["n_step_q_learning"]
+    monkeypatch.setitem(why.ALGORITHMS, "n_step_q_learning", known._replace(remember=None))
+    with pytest.raises(RunnerError, match=r"add up to .*, but the table has .*n_step_q_learning does not"):
+        runner.why(run, at=STEP)
+
+
 def test_the_answer_says_whether_the_sum_is_the_value_and_leaves_out_episodes_without_weight(tmp_path):
     run = make_run(tmp_path, PLAIN)
     found = runner.why(run, at=STEP)
