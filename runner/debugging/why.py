@@ -264,9 +264,10 @@ def why(
         scale = abs(weights.value) + abs(initial.contribution) + float(np.abs(ledger.episodes[:, 1]).sum())
         if abs(total - weights.value) > _ROUNDING * scale:
             raise RunnerError(
-                f"the parts of this value add up to {total:.9g}, but the table has {weights.value:.9g}: `why` "
-                "follows algorithms in which a step moves a value by a share of its distance to the target, and "
-                f"{recording.config['algorithm']} does not; choose a run of another one, such as q_learning."
+                f"the parts of this value add up to {total:.9g}, but the table has {weights.value:.9g}. "
+                "`why` follows algorithms in which a step moves a value by a share of its distance to the "
+                f"target, and {recording.config['algorithm']} does not; choose a run of another one, such as "
+                "q_learning."
             )
         moves = tuple(_moves(mdp, ledger.outcomes, "" if is_joint else mdp.agents[cell.learner]))
         return Why(

@@ -37,7 +37,7 @@ from runner.recording.metadata import (
     write_description,
     write_result,
 )
-from runner.recording.metrics import METRICS, defined_metrics
+from runner.recording.metrics import METRICS, TABLE_METRICS, defined_metrics
 from runner.recording.observer import Observer
 from runner.recording.reader import Recording
 from runner.recording.recorder import Recorder
@@ -56,6 +56,7 @@ from runner.util.processes import Stop
 from runner.util.values import Json
 
 REPORT_SECONDS: Final = 0.2
+_OF_TABLES: Final = {metric.field: metric.of_table for metric in TABLE_METRICS}
 
 
 @dataclass
@@ -233,7 +234,7 @@ class Session:
             steps, episodes = learner.train(records, ends, until_episode, next_log)
             recorder.commit("train", steps, episodes)
             if learner.step == next_log:
-                self._measure(schema.TRAIN_METRICS_TOPIC, learner.training_metrics())
+                self._measure(schema.TRAIN_METRICS_TOPIC, learner.training_metrics(_OF_TABLES))
             self._report_progress()
         return True
 
@@ -310,7 +311,7 @@ def evaluation_metrics(learner: Learner, evaluation: int, trials: Records) -> Me
     """Return the metrics of an evaluation from its episode records, and of training at that moment."""
     has_success = bool(learner.mdp.success_events)
     successes = int(trials["success"].sum())
-    return learner.training_metrics() | {
+    return learner.training_metrics(_OF_TABLES) | {
         "evaluation": evaluation,
         "trials": len(trials),
         "successes": successes if has_success else -1,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -19,7 +19,6 @@ from runner.learning.algorithms import ALGORITHMS, Memory, Rules, Tables
 from runner.learning.kernel import Tally
 from runner.learning.model import Model, build_model
 from runner.learning.schedules import compile_schedule, schedule_value
-from runner.recording.metrics import TABLE_METRICS
 from runner.util.arrays import Floats, Ints, Ints32, Records
 
 NEVER: Final = 2**62
@@ -191,10 +190,13 @@ class Learner:
         self._mark_success(episodes[:ended])
         return filled, ended
 
-    def training_metrics(self) -> dict[str, object]:
+    def training_metrics(self, of_tables: Mapping[str, Callable[[Floats], float]]) -> dict[str, object]:
         """Return the measures of training at this moment, named as in the recording's metrics.
 
         They have the summed rewards of the last steps, ascending, and how often each came.
+
+        Args:
+            of_tables: by name, what is computed from each learner's table, [states, actions].
         """
         window = self._tally.recent_outcomes[: min(self.step, len(self._tally.recent_outcomes))]
         by_class = np.bincount(window, minlength=len(self.model.rewards))
@@ -210,7 +212,7 @@ class Learner:
             "mean_length": float(lengths.mean()) if len(lengths) else float("nan"),
             "rewards": rewards[seen].tolist(),
             "reward_counts": counts[seen].tolist(),
-            **{metric.field: list(map(metric.of_table, tables)) for metric in TABLE_METRICS},
+            **{name: list(map(measure, tables)) for name, measure in of_tables.items()},
             "epsilon": 1.0 - epsilon if self.rules.epsilon_exploits else epsilon,
             "step_size": float(schedule_value(self.rules.step_size, self.episode, self.step)),
             "discount": float(schedule_value(self.rules.discount, self.episode, self.step)),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from runner.learning.learner import Learner
+from runner.recording.metrics import TABLE_METRICS
 from tests.runner.learning.harness import SMALL, evaluate, experiment, train
 from tests.runner.learning.twin import Twin
 
@@ -24,6 +25,7 @@ CASES = {
         "quirks": {"epsilon_exploits": True},
     },
 }
+OF_TABLES = {metric.field: metric.of_table for metric in TABLE_METRICS}
 LOGS = [{"window": 1, "episodes": 1}, {"window": 70, "episodes": 3}, {"window": 10**5, "episodes": 10**4}]
 
 
@@ -35,7 +37,7 @@ def test_measures_count_the_last_steps_and_episodes(case, log):
     for step in (1, 69, 70, 71, 500, 1400):
         train(learner, 10**6, step, block=100)
         twin.train(10**6, step)
-        found, expected = learner.training_metrics(), twin.training_metrics()
+        found, expected = learner.training_metrics(OF_TABLES), twin.training_metrics()
         if expected["mean_length"] is None:
             assert math.isnan(found.pop("mean_length"))
             del expected["mean_length"]
@@ -44,7 +46,7 @@ def test_measures_count_the_last_steps_and_episodes(case, log):
 
 def test_before_the_first_step_there_is_nothing_to_count():
     config, mdp = experiment(SMALL, epsilon=0.25, step_size=0.5, discount=0.75)
-    measures = Learner(config, mdp, 0).training_metrics()
+    measures = Learner(config, mdp, 0).training_metrics(OF_TABLES)
     assert math.isnan(measures.pop("mean_length"))
     assert measures == {
         "step": 0,
@@ -68,10 +70,10 @@ def test_evaluating_and_measuring_leave_training_alone(case):
     for n, step in enumerate((130, 131, 700, 1000)):
         pieces.append(train(watched, 10**6, step, block=1000).steps)
         evaluate(watched, n * 3, 3, block=50)
-        watched.training_metrics()
+        watched.training_metrics(OF_TABLES)
     assert np.array_equal(np.concatenate(pieces), expected)
     assert watched.tables.q.tobytes() == plain.tables.q.tobytes()
-    assert watched.training_metrics() == plain.training_metrics()
+    assert watched.training_metrics(OF_TABLES) == plain.training_metrics(OF_TABLES)
 
 
 def test_greedy_trials_do_not_depend_on_when_training_stopped_within_an_episode():
