@@ -238,8 +238,10 @@ class _Fold:
             if any(errors):
                 result["error"] = truncated_message("; ".join(filter(None, errors)))
             write_result(file, _ending_of_run(self._run, unfolded), result)
-            before = self._run.file.summary.seconds or 0.0
-            return result | {"seconds": before + round(time.monotonic() - started, 3), "bytes": file.size}
+            result |= {"bytes": file.size}
+            if (before := self._run.file.summary.seconds) is not None:  # else killed: nobody knows how long
+                result["seconds"] = before + round(time.monotonic() - started, 3)
+            return result
 
     def _facts(self) -> dict[str, str]:
         shards = [

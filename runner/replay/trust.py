@@ -151,7 +151,8 @@ SERVED: Final = (
 
 def packages() -> tuple[str, ...]:
     """Return the packages with environments that are made without trust."""
-    return *PACKAGES, *filter(None, os.environ.get(MORE_PACKAGES, "").split(","))
+    listed = map(str.strip, os.environ.get(MORE_PACKAGES, "").split(","))
+    return *PACKAGES, *filter(None, listed)
 
 
 def advice() -> str:

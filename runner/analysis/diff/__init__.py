@@ -47,7 +47,6 @@ from runner.runs.checkpoints import read_checkpoints
 from runner.runs.run import Run
 from runner.util.arrays import Array
 from runner.util.differences import Change, changes_in, equal_values
-from runner.util.humanize import counted
 from runner.util.values import Json
 
 NOT_CONTENT: Final = ("name", "recording")
@@ -275,8 +274,8 @@ def _differing_checkpoints(a: Recording, b: Recording) -> list[str]:
     differing = [key for key in shared if ours[key] != theirs[key]]
     if not differing:
         return []
-    count = f"{len(differing):,} of {counted(len(shared), 'checkpoint')}"
-    return [f"{count} of both runs differ, the first of them {differing[0][1]}"]
+    count = f"of the checkpoints of both runs, {len(differing):,} of {len(shared):,} differ"
+    return [f"{count}, the first of them {differing[0][1]}"]
 
 
 def _left_out(name: str, recording: Recording) -> str:

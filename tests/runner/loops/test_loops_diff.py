@@ -330,4 +330,4 @@ def test_diff_compares_checkpoints_which_part_before_the_steps_do(tmp_path):
                 list(play(env, 20, 0))
                 env.checkpoint("agent", bytes([weights[number]]))
     text = dualtaxi(tmp_path, "diff", "one", "two").stdout
-    assert "2 of 3 checkpoints of both runs differ, the first of them agent@40" in text
+    assert "of the checkpoints of both runs, 2 of 3 differ, the first of them agent@40" in text

@@ -150,5 +150,5 @@ def environments(tmp_path, monkeypatch):
     }
     for name, code in codes.items():
         (tmp_path / f"{name}.py").write_text(code)
-    monkeypatch.setenv("DUALTAXI_PACKAGES", ",".join(codes))
+    monkeypatch.setenv("DUALTAXI_PACKAGES", ", ".join(codes))
     return {name: f"episodes: 1\nenv: {{id: '{name}:X-v0'}}\n" for name in codes}
