@@ -29,7 +29,7 @@ FINISHED = ("trials finished, of 200", lambda e: e.successes, 0)
 LENGTH = ("mean length", lambda e: e.value("mean_length"), 1)
 PENALTIES = ("mean penalties", lambda e: e.value("mean_penalties"), 1)
 RECENT = ("recent training length", lambda e: e.training.mean_length, 1)
-FILLED = ("filled, %", lambda e: min(e.training.percent_filled.values()), 2)
+FILLED = ("filled, %", lambda e: min(e.training.of_tables["percent_filled"].values()), 2)
 MEASURES: Final = (FINISHED, LENGTH, PENALTIES, RECENT, FILLED)
 
 PUBLISHED: Final[dict[str, dict[int, Sequence[float | None]]]] = {

@@ -218,7 +218,8 @@ def read_manifest(data: bytes, where: str) -> Manifest:
 
 def is_attachment(name: str) -> bool:
     """Return whether an archive can have an attachment of this name: it is not that of another file."""
-    return is_inside(name) and name not in _OWN_FILES and not name.startswith(CONTENTS)
+    folded = name.casefold()  # some systems take names that differ in case for one file
+    return is_inside(name) and folded not in _OWN_FILES and not folded.startswith(CONTENTS)
 
 
 def is_inside(name: str) -> bool:

@@ -83,7 +83,7 @@ NAMES = [
 
 def _record(events, episode=50_000, success=98.5, filled=(77.8, 78.1)):
     filled = {f"taxi_{i}": percent for i, percent in enumerate(filled, 1)}
-    training = TrainingRecord(episode, 10**6, 16.0, (), dict.fromkeys(filled, 0), filled, 0.1, 0.5, 0.9)
+    training = TrainingRecord(episode, 10**6, 16.0, (), {"percent_filled": filled}, 0.1, 0.5, 0.9)
     values = {
         "success_percent": {"": success},
         "mean_length": {"": 1500.0},
