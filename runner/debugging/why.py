@@ -261,14 +261,7 @@ def why(
             float(ledger.weights.sum()), float((ledger.weights * weights.initial_values).sum())
         )
         total = rewarded.contribution + initial.contribution
-        scale = abs(weights.value) + abs(initial.contribution) + float(np.abs(ledger.episodes[:, 1]).sum())
-        if abs(total - weights.value) > _ROUNDING * scale:
-            raise RunnerError(
-                f"the parts of this value add up to {total:.9g}, but the table has {weights.value:.9g}. "
-                "`why` follows algorithms in which a step moves a value by a share of its distance to the "
-                f"target, and {recording.config['algorithm']} does not; choose a run of another one, such as "
-                "q_learning."
-            )
+        _require_rounding(recording, weights, total)
         moves = tuple(_moves(mdp, ledger.outcomes, "" if is_joint else mdp.agents[cell.learner]))
         return Why(
             run_id=recording.run_id,
@@ -297,6 +290,22 @@ def why(
             moves=moves,
             note=_POLICY_NOTE if ALGORITHMS[recording.config["algorithm"]].draws_actions else "",
             picture=_picture(mdp, cell.state, moves),
+        )
+
+
+def _require_rounding(recording: Recording, weights: _Weights, total: float) -> None:
+    """Check that a sum is the table's value, but for rounding in what was added.
+
+    Raises:
+        RunnerError: it is not: the algorithm's update cannot be followed.
+    """
+    rewarded = np.abs(weights.largest["contribution"]).sum()
+    initial = np.abs(weights.ledger.weights * weights.initial_values).sum()
+    if abs(total - weights.value) > _ROUNDING * (abs(weights.value) + float(rewarded + initial)):
+        raise RunnerError(
+            f"the parts of this value add up to {total:.9g}, but the table has {weights.value:.9g}. `why` "
+            "follows algorithms in which a step moves a value by a share of its distance to the target, and "
+            f"{recording.config['algorithm']} does not; choose a run of another one, such as q_learning."
         )
 
 
